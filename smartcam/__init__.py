@@ -1,0 +1,1 @@
+"""smartcam: talk to industrial smart cameras."""

@@ -1,0 +1,309 @@
+"""Every error smartcam raises.
+
+::
+
+    SmartCamError
+    ├── ConfigurationError (ValueError)        what the user gave cannot work
+    │   ├── LayoutError                        a layout text, with the position of the mistake
+    │   ├── PluginError                        a plug-in: unknown, twice there, failed to load
+    │   └── MissingExtraError                  an optional part is not installed
+    ├── LinkError (ConnectionError)            host, port
+    │   ├── ConnectFailedError                 no session; each attempt and what came
+    │   ├── ConnectionLostError                the session ended by itself
+    │   ├── ConnectionTakenError               another client took the camera
+    │   └── ConnectionClosedError              closed by us
+    ├── ResponseTimeoutError (TimeoutError)    a wait in a session ran out
+    ├── CommandRejectedError                   the camera said no; what is active now
+    ├── UnsupportedError                       this dialect or device cannot do it
+    ├── CameraFaultError                       the camera reports System Error
+    ├── TriggerError                           a trigger that gave no result, and why
+    │   ├── OvertriggeredError
+    │   ├── NotRunningError
+    │   ├── CameraBusyError
+    │   ├── InputContainerError
+    │   └── TriggerTimeoutError (TimeoutError)
+    ├── ProtocolError
+    │   ├── LocalProtocolError                 we asked for what this state forbids
+    │   └── RemoteProtocolError                the peer broke the protocol
+    │       ├── FrameError                     magic, length: no frame can be cut
+    │       └── MessageError                   a frame whose body does not fit its message
+    └── InterpretationError (ValueError)       field, offset, expected, got; the link stays up
+        └── WrongApplicationError              the result is another application's: both ids
+
+All of them survive ``pickle``. Texts say what was tried, what came and what was expected; at most
+64 bytes of a peer's data stand in one.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "CameraBusyError",
+    "CameraFaultError",
+    "CommandRejectedError",
+    "ConfigurationError",
+    "ConnectFailedError",
+    "ConnectionClosedError",
+    "ConnectionLostError",
+    "ConnectionTakenError",
+    "FrameError",
+    "InputContainerError",
+    "InterpretationError",
+    "LayoutError",
+    "LinkError",
+    "LocalProtocolError",
+    "MessageError",
+    "MissingExtraError",
+    "NotRunningError",
+    "OvertriggeredError",
+    "PluginError",
+    "ProtocolError",
+    "RemoteProtocolError",
+    "ResponseTimeoutError",
+    "SmartCamError",
+    "TriggerError",
+    "TriggerTimeoutError",
+    "UnsupportedError",
+    "WrongApplicationError",
+    "hex_excerpt",
+]
+
+MAX_EXCERPT = 64
+"""Bytes of a peer's data that an error text or a log line shows at most."""
+
+
+def hex_excerpt(data: bytes | bytearray | memoryview) -> str:
+    """Return ``data`` as hex, cut after 64 bytes."""
+    shown = bytes(data[:MAX_EXCERPT]).hex(" ")
+    return f"{shown} ... ({len(data)} bytes)" if len(data) > MAX_EXCERPT else shown
+
+
+class SmartCamError(Exception):
+    """Root of all errors of this library.
+
+    Attributes of the subclasses are keyword arguments with defaults, which is what lets
+    ``pickle`` rebuild them from the text and then restore the attributes.
+    """
+
+
+class ConfigurationError(SmartCamError, ValueError):
+    """What the user gave (an address, an option, a scenario) cannot work."""
+
+
+class LayoutError(ConfigurationError):
+    """A layout text is wrong.
+
+    Attributes:
+        text: the layout text as given.
+        position: index of the character where the mistake is.
+    """
+
+    def __init__(self, message: str, *, text: str = "", position: int = 0) -> None:
+        super().__init__(message)
+        self.text = text
+        self.position = position
+
+
+class PluginError(ConfigurationError):
+    """A plug-in is unknown, provided twice, or failed to load.
+
+    Attributes:
+        name: the name that was asked for.
+    """
+
+    def __init__(self, message: str, *, name: str = "") -> None:
+        super().__init__(message)
+        self.name = name
+
+
+class MissingExtraError(ConfigurationError):
+    """A part of smartcam needs an extra that is not installed.
+
+    Attributes:
+        extra: name of the extra, as in ``pip install "smartcam[extra]"``.
+    """
+
+    def __init__(self, message: str, *, extra: str = "") -> None:
+        super().__init__(message)
+        self.extra = extra
+
+
+class LinkError(SmartCamError, ConnectionError):
+    """The link to the camera: could not be made, or is gone.
+
+    Attributes:
+        host: address of the camera.
+        port: its port.
+    """
+
+    def __init__(self, message: str, *, host: str = "", port: int = 0) -> None:
+        super().__init__(message)
+        self.host = host
+        self.port = port
+
+
+class ConnectFailedError(LinkError):
+    """No session could be made.
+
+    Attributes:
+        attempts: one text per attempt: what was tried and what came.
+    """
+
+    def __init__(
+        self, message: str, *, host: str = "", port: int = 0, attempts: tuple[str, ...] = ()
+    ) -> None:
+        super().__init__(message, host=host, port=port)
+        self.attempts = attempts
+
+
+class ConnectionLostError(LinkError):
+    """The session ended by itself; ``__cause__`` is the first reason."""
+
+
+class ConnectionClosedError(LinkError):
+    """We closed the session, or never opened it."""
+
+
+class ConnectionTakenError(LinkError):
+    """Another client took the camera; it serves one, and the newcomer wins."""
+
+
+class ResponseTimeoutError(SmartCamError, TimeoutError):
+    """A wait in a session ran out.
+
+    Attributes:
+        message_id: id of the request without an answer, None when a status was waited for.
+        waited: seconds.
+    """
+
+    def __init__(self, message: str, *, message_id: int | None = None, waited: float = 0.0) -> None:
+        super().__init__(message)
+        self.message_id = message_id
+        self.waited = waited
+
+
+class CommandRejectedError(SmartCamError):
+    """The camera refused a command.
+
+    Attributes:
+        message_id: id of the request.
+        code: the camera's status or result code.
+        active_application: id of the application that is active now.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        message_id: int = 0,
+        code: int = 0,
+        active_application: int | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.message_id = message_id
+        self.code = code
+        self.active_application = active_application
+
+
+class UnsupportedError(SmartCamError):
+    """This dialect or device cannot do it."""
+
+
+class CameraFaultError(SmartCamError):
+    """The camera reports System Error."""
+
+
+class TriggerError(SmartCamError):
+    """A trigger that gave no result."""
+
+
+class OvertriggeredError(TriggerError):
+    """The camera dropped a trigger; it cannot be told whose."""
+
+
+class NotRunningError(TriggerError):
+    """The application is stopped, so the camera takes no trigger."""
+
+
+class CameraBusyError(TriggerError):
+    """The camera does not wait for a trigger, and waiting was not wanted."""
+
+
+class InputContainerError(TriggerError):
+    """Input data and inspections are out of step (Input Container bit)."""
+
+
+class TriggerTimeoutError(TriggerError, TimeoutError):
+    """No result came in time.
+
+    Attributes:
+        waited: seconds.
+    """
+
+    def __init__(self, message: str, *, waited: float = 0.0) -> None:
+        super().__init__(message)
+        self.waited = waited
+
+
+class ProtocolError(SmartCamError):
+    """The protocol was broken, by one side or the other."""
+
+
+class LocalProtocolError(ProtocolError):
+    """We asked for what the protocol's state forbids; nothing was sent."""
+
+
+class RemoteProtocolError(ProtocolError):
+    """The peer broke the protocol.
+
+    Attributes:
+        offset: byte where the mistake is, counted from the start of the frame.
+        data: the first bytes of it, at most 64.
+    """
+
+    def __init__(
+        self, message: str, *, offset: int = 0, data: bytes | bytearray | memoryview = b""
+    ) -> None:
+        super().__init__(message)
+        self.offset = offset
+        self.data = bytes(data[:MAX_EXCERPT])
+
+
+class FrameError(RemoteProtocolError):
+    """No frame can be cut from these bytes: wrong magic or impossible length."""
+
+
+class MessageError(RemoteProtocolError):
+    """A whole frame whose body does not fit its message, or comes at the wrong time."""
+
+
+class InterpretationError(SmartCamError, ValueError):
+    """A result container does not fit what the user said about it; the link stays up.
+
+    Attributes:
+        field: name of the field, or "" where the whole container is meant.
+        offset: byte offset in the container's data.
+        expected: what was expected there.
+        got: what came.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        field: str = "",
+        offset: int = 0,
+        expected: object = None,
+        got: object = None,
+    ) -> None:
+        super().__init__(message)
+        self.field = field
+        self.offset = offset
+        self.expected = expected
+        self.got = got
+
+
+class WrongApplicationError(InterpretationError):
+    """A result came from another application than the one it was expected from.
+
+    ``expected`` and ``got`` are the two application ids.
+    """

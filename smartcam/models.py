@@ -1,0 +1,356 @@
+"""Public values: what the camera says and what comes of it.
+
+They are NamedTuples, slots dataclasses and an ``IntFlag``: cheap to make, immutable where many
+readers share them, and turned to JSON by :func:`jsonable` with their field names.
+Lengths are metres, angles radians, times seconds unless a name says otherwise.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+__all__ = [
+    "ApplicationChanged",
+    "ByteOrder",
+    "CameraEvent",
+    "Connected",
+    "Disconnected",
+    "Header",
+    "Localization",
+    "Pose",
+    "Position",
+    "Quaternion",
+    "Reconnected",
+    "Result",
+    "Statistics",
+    "Status",
+    "StatusChanged",
+    "SubscriberStatistics",
+    "jsonable",
+]
+
+ByteOrder = Literal["little", "big"]
+
+
+class Status(enum.IntFlag):
+    """The camera's status word. Bits not named here are kept.
+
+    Source: SC manual p. 30 and p. 33 (published) for the seven bits and their values; the bits
+    need not be reset by the client, when a state ends the camera sends a status without it.
+    """
+
+    OVERHEAT = 0x001
+    """Allowed temperature exceeded; inspections may get worse."""
+    SYSTEM_ERROR = 0x002
+    """Fatal: at least a reboot is needed."""
+    INPUT_CONTAINER = 0x004
+    """More input containers than inspections (one dropped) or fewer (one reused)."""
+    BUSY = 0x010
+    """Busy; set while the application is being switched."""
+    RUNNING = 0x080
+    """The camera is in run mode."""
+    OVERTRIGGERED = 0x100
+    """A trigger was dropped; transient."""
+    WAITING_FOR_TRIGGER = 0x200
+    """The camera would take a trigger now."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the set bits, lowest first; a bit without a name as ``0x40``."""
+        names: list[str] = []
+        for bit in range(self.value.bit_length()):
+            value = 1 << bit
+            if self.value & value:
+                member = Status._value2member_map_.get(value)
+                name = member.name if member is not None else None
+                names.append(name or f"{value:#x}")
+        return names
+
+    def describe(self) -> str:
+        """Return the set bits as text, ``"no bit set"`` for none."""
+        return " + ".join(self.names) or "no bit set"
+
+
+class Position(NamedTuple):
+    """A point, metres."""
+
+    x: float
+    y: float
+    z: float = 0.0
+
+
+class Quaternion(NamedTuple):
+    """An orientation: Hamilton quaternion of unit length, real part last."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    w: float = 1.0
+
+    @classmethod
+    def from_theta(cls, theta: float) -> Quaternion:
+        """Return the rotation by ``theta`` radians, counter-clockwise, about z."""
+        half = 0.5 * theta
+        return cls(0.0, 0.0, math.sin(half), math.cos(half))
+
+    @property
+    def theta(self) -> float:
+        """The rotation about z in radians, in (-pi, pi]."""
+        return math.atan2(
+            2.0 * (self.w * self.z + self.x * self.y), 1.0 - 2.0 * (self.y**2 + self.z**2)
+        )
+
+
+class Header(NamedTuple):
+    """Where and when a pose was seen.
+
+    Attributes:
+        seq: the client's count of results (:attr:`Result.number`).
+        stamp: time of arrival, UTC.
+        frame_id: name of the frame the pose is given in; the camera's name.
+    """
+
+    seq: int
+    stamp: datetime
+    frame_id: str
+
+
+class Pose(NamedTuple):
+    """Position and orientation in a frame."""
+
+    header: Header
+    position: Position
+    orientation: Quaternion
+
+
+class Localization(NamedTuple):
+    """One part that the camera found.
+
+    Attributes:
+        feature_id: name of the taught feature.
+        quality: 0 to 1.
+        photo_index: index of the photo it was found in.
+        pose: where it lies: x right, y up, theta counter-clockwise.
+    """
+
+    feature_id: str
+    quality: float
+    photo_index: int
+    pose: Pose
+
+
+class Result(NamedTuple):
+    """A decoded result container with its metadata.
+
+    Attributes:
+        camera: name of the camera.
+        application: id of the application that made it.
+        sequence: value of the layout's ``@sequence`` field, None without one.
+        number: the client's own count of containers, from 1.
+        triggered_at: when the trigger was sent, UTC; None for a result nobody had triggered.
+        received_at: when its last byte arrived, UTC.
+        latency: seconds from trigger to arrival (monotonic clock); None like ``triggered_at``.
+        raw: the container's bytes behind the application id.
+        value: what the interpreter made of them.
+    """
+
+    camera: str
+    application: int
+    sequence: int | None
+    number: int
+    triggered_at: datetime | None
+    received_at: datetime
+    latency: float | None
+    raw: bytes
+    value: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraEvent:
+    """Something happened to a camera.
+
+    Attributes:
+        camera: name of the camera.
+        at: when, UTC.
+    """
+
+    camera: str
+    at: datetime
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Connected(CameraEvent):
+    """The first session is there; ``url`` has what was found out pinned."""
+
+    url: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reconnected(CameraEvent):
+    """A later session is there."""
+
+    url: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Disconnected(CameraEvent):
+    """The session ended; ``reason`` says why, ``expected`` whether we closed it."""
+
+    reason: str
+    expected: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusChanged(CameraEvent):
+    """The camera sent a status that differs from the one before."""
+
+    status: Status
+    previous: Status | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ApplicationChanged(CameraEvent):
+    """Another application is active than the client knew."""
+
+    application: int
+    previous: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SubscriberStatistics:
+    """Account of one subscriber: ``offered == taken + dropped + queued``.
+
+    Attributes:
+        name: what is subscribed to: ``results``, ``statuses`` or ``events``.
+        policy: what happens when the queue is full: ``drop_oldest`` or ``error``.
+        offered: items that came while it was subscribed.
+        taken: items it took.
+        dropped: items lost to the policy or to ``min_interval``.
+        queued: items waiting.
+    """
+
+    name: str
+    policy: str
+    offered: int
+    taken: int
+    dropped: int
+    queued: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Statistics:
+    """Everything counted since the client was made.
+
+    Each result container that arrives has exactly one fate, so ``received == triggered +
+    streamed + late + wrong_application + uninterpretable + unclaimed``.
+
+    Attributes:
+        received: result containers that arrived.
+        triggered: outcome of a trigger of ours.
+        streamed: nobody had triggered it, and somebody was listening.
+        late: came after its trigger had given up.
+        wrong_application: from another application than expected; not interpreted.
+        uninterpretable: does not fit its layout.
+        unclaimed: nobody had triggered it and nobody was listening.
+        empty_slots: all-zero records skipped by interpreters.
+        overtriggers: times the Overtriggered bit rose.
+        sessions: sessions made.
+        frames_received: whole frames from the camera.
+        frames_sent: frames to the camera.
+        bytes_received: bytes from the camera.
+        bytes_sent: bytes to the camera.
+        ignored_frames: frames or datagrams that were dropped as broken.
+        unknown_ids: messages with an id that the dialect does not know.
+        unexpected_messages: answers nobody waited for any more.
+        long_bodies: known messages whose body was longer than documented.
+        last_error: text of the last error of the link, or None.
+        subscribers: accounts of the living subscribers.
+    """
+
+    received: int = 0
+    triggered: int = 0
+    streamed: int = 0
+    late: int = 0
+    wrong_application: int = 0
+    uninterpretable: int = 0
+    unclaimed: int = 0
+    empty_slots: int = 0
+    overtriggers: int = 0
+    sessions: int = 0
+    frames_received: int = 0
+    frames_sent: int = 0
+    bytes_received: int = 0
+    bytes_sent: int = 0
+    ignored_frames: int = 0
+    unknown_ids: int = 0
+    unexpected_messages: int = 0
+    long_bodies: int = 0
+    last_error: str | None = None
+    subscribers: list[SubscriberStatistics] = field(default_factory=list[SubscriberStatistics])
+
+
+def jsonable(value: object) -> Any:
+    """Return ``value`` as what ``json.dumps`` takes, with the models' field names.
+
+    Bytes become hex, times ISO 8601, a status the list of its bits' names, NaN and infinity null
+    (JSON has no word for them), numpy arrays lists (structured ones lists of objects).
+    """
+    if isinstance(value, Status):
+        return value.names
+    if isinstance(value, enum.Enum):
+        return value.value
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return bytes(value).hex()
+    return _jsonable_container(value)
+
+
+def _jsonable_container(value: Any) -> Any:
+    if hasattr(value, "_asdict"):
+        return {name: jsonable(item) for name, item in value._asdict().items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [jsonable(item) for item in value]
+    if hasattr(value, "isoformat"):
+        return value.isoformat()
+    numpy = sys.modules.get("numpy")  # never imported for JSON's sake
+    if numpy is not None and isinstance(value, numpy.ndarray):
+        return _jsonable_array(value)
+    if numpy is not None and isinstance(value, numpy.generic):
+        return jsonable(value.item())
+    if hasattr(value, "model_dump"):
+        return jsonable(value.model_dump())
+    return str(value)
+
+
+def _jsonable_array(array: Any) -> Any:
+    names = array.dtype.names
+    if names is None:
+        return [jsonable(item) for item in array.tolist()]
+    return [
+        {name: _text_or_hex(item) for name, item in zip(names, row, strict=True)}
+        for row in array.tolist()
+    ]
+
+
+def _text_or_hex(item: object) -> Any:
+    if isinstance(item, bytes):
+        try:
+            return item.decode()
+        except UnicodeDecodeError:
+            return item.hex()
+    return jsonable(item)

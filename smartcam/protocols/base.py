@@ -1,0 +1,257 @@
+"""What a protocol is made of: dialects as data, roles with their policies, the entry point.
+
+A :class:`Dialect` joins a header layout and a message table and compiles them to codecs. Who may do
+what with broken input is a :class:`Policy`, chosen by role and transport.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.exceptions import LocalProtocolError, MessageError, hex_excerpt
+from smartcam.models import Status
+from smartcam.protocols.framing import Frame, HeaderLayout
+from smartcam.protocols.messages import (
+    Message,
+    Request,
+    Sender,
+    StatusReport,
+    UnknownMessage,
+    Wire,
+    wire_fields,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["POLICIES", "Dialect", "MessageRow", "Policy", "Protocol", "Role", "Transport"]
+
+
+class Role(enum.Enum):
+    """Which side of the wire a machine plays."""
+
+    CLIENT = "client"
+    CAMERA = "camera"
+
+    @property
+    def sends(self) -> Sender:
+        """The sender of this side's messages."""
+        return Sender(self.value)
+
+    @property
+    def receives(self) -> Sender:
+        """The sender of the other side's messages."""
+        return Sender.CAMERA if self is Role.CLIENT else Sender.CLIENT
+
+
+class Transport(enum.Enum):
+    """What carries the frames: a stream of bytes, or a datagram each."""
+
+    TCP = "tcp"
+    UDP = "udp"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Policy:
+    """What one role does with broken input.
+
+    Attributes:
+        fail: a broken frame, a short body or a message at the wrong time ends the link; otherwise
+            it is dropped and counted.
+        exact_length: a known message must have exactly its documented length; otherwise a longer
+            body is accepted and counted.
+    """
+
+    fail: bool
+    exact_length: bool
+
+
+POLICIES: Mapping[tuple[Role, Transport], Policy] = {
+    (Role.CLIENT, Transport.TCP): Policy(fail=True, exact_length=False),
+    (Role.CLIENT, Transport.UDP): Policy(fail=False, exact_length=False),
+    # the camera ignores invalid messages silently (SC manual p. 28: published)
+    (Role.CAMERA, Transport.TCP): Policy(fail=False, exact_length=True),
+    (Role.CAMERA, Transport.UDP): Policy(fail=False, exact_length=True),
+}
+
+
+class MessageRow(NamedTuple):
+    """One row of a dialect's message table.
+
+    Attributes:
+        message_id: id on the wire.
+        type: the message.
+        title: the manual's name.
+        source: where it stands, with its grade.
+    """
+
+    message_id: int
+    type: type[Message]
+    title: str
+    source: str
+
+
+class _Codec:
+    """One message of one dialect, compiled."""
+
+    __slots__ = ("body", "data_field", "message_id", "names", "status_at", "type")
+
+    def __init__(self, row: MessageRow, word: str) -> None:
+        fields = wire_fields(row.type)
+        codes = {Wire.WORD: word, Wire.UINT32: "I"}
+        self.type = row.type
+        self.message_id = row.message_id
+        self.names = tuple(name for name, wire in fields if wire is not Wire.DATA)
+        self.data_field = next((name for name, wire in fields if wire is Wire.DATA), None)
+        self.body = struct.Struct(
+            "<" + "".join(codes[wire] for _, wire in fields if wire is not Wire.DATA)
+        )
+
+    def encode(self, message: Message) -> bytes:
+        body = self.body.pack(*[getattr(message, name) for name in self.names])
+        return body + getattr(message, self.data_field) if self.data_field else body
+
+    def decode(self, payload: bytes) -> Message:
+        size = self.body.size
+        values: dict[str, Any] = dict(zip(self.names, self.body.unpack_from(payload), strict=True))
+        if self.data_field:
+            values[self.data_field] = payload[size:] if size else payload
+        if self.type is StatusReport:
+            values["status"] = Status(values["status"])
+        return self.type(**values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dialect:
+    """One wire variant of a protocol, as data.
+
+    Args:
+        name: as in ``?dialect=``.
+        header: what a frame's header looks like.
+        word: ``struct`` code of the bodies' ordinary integers: ``I`` or ``H``.
+        table: its messages.
+        about: one line for people.
+        source: where it is described, with its grade.
+    """
+
+    name: str
+    header: HeaderLayout
+    word: str
+    table: tuple[MessageRow, ...]
+    about: str
+    source: str
+    _encoders: dict[type[Message], _Codec] = field(
+        init=False, repr=False, compare=False, default_factory=dict[type[Message], _Codec]
+    )
+    _decoders: dict[tuple[Sender, int], _Codec] = field(
+        init=False, repr=False, compare=False, default_factory=dict[tuple[Sender, int], _Codec]
+    )
+
+    def __post_init__(self) -> None:
+        for row in self.table:
+            codec = _Codec(row, self.word)
+            self._encoders[row.type] = codec
+            self._decoders[row.type.sender, row.message_id] = codec
+
+    def message_id(self, message: Message | type[Message]) -> int:
+        """Return the id of a message in this dialect."""
+        if isinstance(message, UnknownMessage):
+            return message.message_id
+        return self._encoders[message if isinstance(message, type) else type(message)].message_id
+
+    def message_type(self, sender: Sender, message_id: int) -> type[Message]:
+        """Return the message with this id from this sender, :class:`UnknownMessage` if none."""
+        codec = self._decoders.get((sender, message_id))
+        return codec.type if codec is not None else UnknownMessage
+
+    def answer_id(self, request_id: int) -> int | None:
+        """Return the id of the answer to a request, None if the camera never answers it.
+
+        An unknown request is expected to be answered under its own id.
+        """
+        request = self.message_type(Sender.CLIENT, request_id)
+        if not issubclass(request, Request):
+            return request_id
+        return self.message_id(request.answer) if request.answer is not None else None
+
+    def encode_frame(self, frame: Frame) -> bytes:
+        """Return a frame's bytes.
+
+        Raises:
+            LocalProtocolError: id or payload do not fit the header.
+        """
+        try:
+            return self.header.pack(frame.message_id, len(frame.payload)) + frame.payload
+        except struct.error as exc:
+            raise LocalProtocolError(
+                f"message {frame.message_id:#x} with {len(frame.payload)} bytes of payload does not"
+                f" fit the {self.name} header: {exc}"
+            ) from exc
+
+    def to_frame(self, message: Message) -> Frame:
+        """Return a message as a frame.
+
+        Raises:
+            LocalProtocolError: the dialect has no such message, or a field does not fit.
+        """
+        if isinstance(message, UnknownMessage):
+            return Frame(message.message_id, message.payload)
+        codec = self._encoders.get(type(message))
+        if codec is None:
+            raise LocalProtocolError(f"dialect {self.name} has no message {type(message).__name__}")
+        try:
+            return Frame(codec.message_id, codec.encode(message))
+        except struct.error as exc:
+            raise LocalProtocolError(f"{message} does not fit its fields: {exc}") from exc
+
+    def encode(self, message: Message) -> bytes:
+        """Return a message's bytes on the wire; raises as :meth:`to_frame`."""
+        return self.encode_frame(self.to_frame(message))
+
+    def surplus(self, sender: Sender, frame: Frame) -> int:
+        """Return how many bytes a known message's body is longer than documented."""
+        codec = self._decoders.get((sender, frame.message_id))
+        if codec is None or codec.data_field:
+            return 0
+        return len(frame.payload) - codec.body.size
+
+    def decode(self, sender: Sender, frame: Frame) -> Message:
+        """Return a frame's message; a longer body than documented is cut.
+
+        Raises:
+            MessageError: the body is shorter than its message.
+        """
+        codec = self._decoders.get((sender, frame.message_id))
+        if codec is None:
+            return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
+        if len(frame.payload) < codec.body.size:
+            raise MessageError(
+                f"{codec.type.__name__} ({frame.message_id:#04x}) came with {len(frame.payload)} "
+                f"bytes, it needs {codec.body.size}: {hex_excerpt(frame.payload)}",
+                offset=self.header.size,
+                data=frame.payload,
+            )
+        return codec.decode(frame.payload)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """A family of dialects under one name: what an entry point ``smartcam.protocols`` gives.
+
+    Attributes:
+        name: its name.
+        schemes: URL scheme to transport.
+        default_port: port where a URL names none.
+        models: camera models that speak it.
+        dialects: its dialects by name, the most probable first: the order in which a client that
+            was told none tries them.
+    """
+
+    name: str
+    schemes: Mapping[str, Transport]
+    default_port: int
+    models: tuple[str, ...]
+    dialects: Mapping[str, Dialect]

@@ -1,0 +1,345 @@
+"""The state machine of one link, in either role.
+
+Bytes go in, events come out; it imports no socket, loop or clock. Two rules: what is not in
+:data:`TRANSITIONS` is illegal, and bad input never raises out of ``receive_*``: by the role's
+:class:`~smartcam.protocols.base.Policy` it ends the link with a :class:`LinkFailed` event, or is
+dropped and counted.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import LocalProtocolError, MessageError, RemoteProtocolError, hex_excerpt
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import POLICIES, Dialect, Policy, Role, Transport
+from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from smartcam.protocols.messages import Message
+
+__all__ = [
+    "TRANSITIONS",
+    "Counters",
+    "Event",
+    "LinkEnded",
+    "LinkFailed",
+    "Machine",
+    "State",
+]
+
+
+class State(enum.Enum):
+    """Where a link is."""
+
+    IDLE = "idle"
+    """Open, without a session."""
+    CONNECTING = "connecting"
+    """Connect was sent, its answer has not come."""
+    CONNECTED = "connected"
+    """In a session."""
+    DISCONNECTED = "disconnected"
+    """Disconnect was sent; what the camera had under way may still come."""
+    CLOSED = "closed"
+    """The peer closed the link."""
+    FAILED = "failed"
+    """The peer broke the protocol; nothing is read any more."""
+
+
+_SESSION_REQUESTS = (
+    m.Query,
+    m.SwitchApplication,
+    m.GetClock,
+    m.SetClock,
+    m.SetInput,
+    m.SetSequenceNumber,
+    m.Trigger,
+    m.Start,
+    m.Stop,
+    m.Reboot,
+)
+_SESSION_REPORTS = (
+    m.StatusReport,
+    m.ResultContainer,
+    m.QueryAnswer,
+    m.SwitchAnswer,
+    m.ClockAnswer,
+)
+
+
+def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
+    client, camera = m.Sender.CLIENT, m.Sender.CAMERA
+    idle, connecting, connected = State.IDLE, State.CONNECTING, State.CONNECTED
+    table: dict[tuple[State, m.Sender, type[Message]], State] = {
+        # without a session it is harmless, and it ends one that a dead client left behind
+        (idle, client, m.Disconnect): idle,
+        (idle, client, m.Connect): connecting,
+        (connecting, client, m.Disconnect): State.DISCONNECTED,
+        (connecting, client, m.Connect): connecting,
+        (connecting, camera, m.ConnectAnswer): connected,
+        (connected, client, m.Connect): connecting,
+        (connected, client, m.Disconnect): State.DISCONNECTED,
+        (State.DISCONNECTED, client, m.Disconnect): State.DISCONNECTED,
+        (State.DISCONNECTED, client, m.Connect): connecting,
+        (State.DISCONNECTED, camera, m.ConnectAnswer): State.DISCONNECTED,
+        (connected, client, m.UnknownMessage): connected,
+    }
+    table |= {(connected, client, request): connected for request in _SESSION_REQUESTS}
+    for report in (*_SESSION_REPORTS, m.UnknownMessage):
+        table[connected, camera, report] = connected
+        table[State.DISCONNECTED, camera, report] = State.DISCONNECTED
+    return table
+
+
+TRANSITIONS: Mapping[tuple[State, m.Sender, type[Message]], State] = _transitions()
+"""``{(state, sender, message type): next state}``, for both roles. What is not here is illegal."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkFailed:
+    """The peer broke the protocol: close the link. Always the last event."""
+
+    error: RemoteProtocolError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkEnded:
+    """The peer closed the link; ``pending`` bytes of an unfinished frame were left."""
+
+    pending: int
+
+
+Event = m.Message | LinkFailed | LinkEnded
+
+
+@dataclass(slots=True)
+class Counters:
+    """What went through a machine."""
+
+    frames_received: int = 0
+    frames_sent: int = 0
+    bytes_received: int = 0
+    bytes_sent: int = 0
+    ignored_frames: int = 0
+    unknown_ids: int = 0
+    unexpected_messages: int = 0
+    long_bodies: int = 0
+
+
+class Machine:
+    """One link's protocol: bytes to events and messages to bytes.
+
+    Feed what the socket gives to :meth:`receive_data`, take :meth:`events`; give what is to be said
+    to :meth:`send` and write :meth:`data_to_send`.
+
+    Args:
+        dialect: the wire variant.
+        role: which side this is.
+        transport: stream or datagrams.
+        max_length: largest payload accepted, bytes.
+        policy: other than the role's own; the emulator's quirks use it.
+        trace: called with sender and frame for each whole frame, in both directions.
+    """
+
+    def __init__(
+        self,
+        dialect: Dialect,
+        role: Role,
+        transport: Transport,
+        *,
+        max_length: int = DEFAULT_MAX_LENGTH,
+        policy: Policy | None = None,
+        trace: Callable[[m.Sender, Frame], None] | None = None,
+    ) -> None:
+        self.dialect = dialect
+        self.role = role
+        self.transport = transport
+        self.state = State.IDLE
+        self.error: RemoteProtocolError | None = None
+        self.counters = Counters()
+        self._policy = policy or POLICIES[role, transport]
+        self._framer = Framer(dialect.header, max_length)
+        self._trace = trace
+        self._events: list[Event] = []
+        self._outbox: list[bytes] = []
+        # id of each answer the camera owes -> whether anybody still wants it (client role)
+        self._open: dict[int, bool] = {}
+
+    # ------------------------------------------------------------------ bytes in
+
+    @property
+    def buffered(self) -> int:
+        """Bytes of an unfinished frame that are kept; at most one header and one payload."""
+        return self._framer.buffered
+
+    def receive_data(self, data: bytes | bytearray | memoryview) -> None:
+        """Take bytes from a stream, or one whole datagram; call :meth:`events` next.
+
+        Never raises for what is in the bytes. In state FAILED or CLOSED they are dropped.
+        """
+        if self.state in {State.FAILED, State.CLOSED}:
+            return
+        self.counters.bytes_received += len(data)
+        framer = self._framer
+        framer.feed(data)
+        if self.transport is Transport.UDP:
+            self._receive_datagram()
+            return
+        while True:
+            try:
+                frame = framer.next_frame()
+            except RemoteProtocolError as error:
+                if self._reject(error):
+                    return
+                framer.resync()
+                continue
+            if frame is None:
+                return
+            self._receive_frame(frame)
+            if self.error is not None:
+                return
+
+    def receive_eof(self) -> None:
+        """The peer will send no more; call :meth:`events` next."""
+        if self.state in {State.FAILED, State.CLOSED}:
+            return
+        self._events.append(LinkEnded(pending=self._framer.buffered))
+        self._framer.clear()
+        self.state = State.CLOSED
+
+    def events(self) -> list[Event]:
+        """Return what came since the last call, in order; the caller owns the list."""
+        events, self._events = self._events, []
+        return events
+
+    # ------------------------------------------------------------------ messages out
+
+    def send(self, message: Message, *, answered: bool | None = None) -> None:
+        """Say something; write :meth:`data_to_send` next.
+
+        Args:
+            message: what to say.
+            answered: for an :class:`~smartcam.protocols.messages.UnknownMessage`, whether an
+                answer is expected; by default what the table says, True for an unknown id.
+
+        Raises:
+            LocalProtocolError: this state forbids it, it does not fit its fields, or an answer of
+                the same id is still owed (answers carry no correlation). Nothing has changed.
+        """
+        key = (self.state, self.role.sends, type(message))
+        following = TRANSITIONS.get(key)
+        if following is None:
+            raise LocalProtocolError(
+                f"{type(message).__name__} cannot be sent by the {self.role.value} "
+                f"in state {self.state.value}"
+            )
+        frame = self.dialect.to_frame(message)
+        owed = self._answer_id(frame.message_id, answered)
+        if owed in self._open and owed is not None:
+            raise LocalProtocolError(
+                f"an answer to message {frame.message_id:#04x} is still owed; one request of an id "
+                "can be open"
+            )
+        data = self.dialect.encode_frame(frame)
+        if owed is not None:
+            self._open[owed] = True
+        self.state = following
+        self._outbox.append(data)
+        self.counters.frames_sent += 1
+        self.counters.bytes_sent += len(data)
+        if self._trace is not None:
+            self._trace(self.role.sends, frame)
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the frames to write, in order: one write each on UDP, any on TCP."""
+        outbox, self._outbox = self._outbox, []
+        return outbox
+
+    # ------------------------------------------------------------------ open requests
+
+    def is_open(self, message_id: int) -> bool:
+        """Whether the camera still owes an answer to a request of this id."""
+        return self.dialect.answer_id(message_id) in self._open
+
+    def forget(self, message_id: int) -> None:
+        """Nobody waits for this request's answer any more: drop it when it comes."""
+        answer_id = self.dialect.answer_id(message_id)
+        if answer_id in self._open and answer_id is not None:
+            self._open[answer_id] = False
+
+    # ------------------------------------------------------------------ inside
+
+    def _answer_id(self, request_id: int, answered: bool | None) -> int | None:
+        if self.role is Role.CAMERA or answered is False:
+            return None
+        answer_id = self.dialect.answer_id(request_id)
+        return request_id if answer_id is None and answered else answer_id
+
+    def _receive_datagram(self) -> None:
+        try:
+            frame = self._framer.next_frame()
+            if frame is None or self._framer.buffered:
+                raise MessageError(
+                    f"a datagram is not one whole frame: {hex_excerpt(self._framer.pending)}",
+                    data=self._framer.pending,
+                )
+        except RemoteProtocolError as error:
+            self._reject(error)
+        else:
+            self._receive_frame(frame)
+        self._framer.clear()
+
+    def _receive_frame(self, frame: Frame) -> None:
+        self.counters.frames_received += 1
+        sender = self.role.receives
+        if self._trace is not None:
+            self._trace(sender, frame)
+        surplus = self.dialect.surplus(sender, frame)
+        try:
+            if surplus > 0 and self._policy.exact_length:
+                raise MessageError(f"message {frame.message_id:#04x} is {surplus} bytes too long")
+            message = self.dialect.decode(sender, frame)
+            following = TRANSITIONS.get((self.state, sender, type(message)))
+            if following is None:
+                raise MessageError(
+                    f"{type(message).__name__} ({frame.message_id:#04x}) came in state "
+                    f"{self.state.value}, where it is not expected",
+                    data=frame.payload,
+                )
+        except RemoteProtocolError as error:
+            self._reject(error)
+            return
+        if surplus > 0:
+            self.counters.long_bodies += 1
+        self.state = following
+        if self.role is Role.CAMERA or self._wanted(message, frame.message_id):
+            self._events.append(message)
+
+    def _wanted(self, message: Message, message_id: int) -> bool:
+        """Whether the client shall see it: unasked answers and unwanted ones are counted only."""
+        if isinstance(message, (m.ResultContainer, m.StatusReport)):
+            return True
+        unknown = isinstance(message, m.UnknownMessage)
+        if unknown:
+            self.counters.unknown_ids += 1
+        wanted = self._open.pop(message_id, None)
+        if wanted is None and unknown:
+            return True
+        if not wanted:
+            self.counters.unexpected_messages += 1
+        return bool(wanted)
+
+    def _reject(self, error: RemoteProtocolError) -> bool:
+        """Fail the link (True) or drop and count, as the policy says."""
+        if not self._policy.fail:
+            self.counters.ignored_frames += 1
+            return False
+        self.state = State.FAILED
+        self.error = error
+        self._framer.clear()
+        self._events.append(LinkFailed(error=error))
+        return True

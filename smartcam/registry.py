@@ -1,0 +1,133 @@
+"""Finding plug-ins by name: built-ins and entry points in one place.
+
+Names are listed without importing anything, a plug-in is loaded when it is first asked for, and a
+broken one costs only its own name.
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import PluginError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+__all__ = ["INTERPRETERS", "PROTOCOLS", "PluginInfo", "Registry"]
+
+
+class PluginInfo(NamedTuple):
+    """Where a plug-in comes from.
+
+    Attributes:
+        name: name it is asked for by.
+        target: ``module:attribute`` that it is loaded from.
+        origin: ``built-in`` or the distributions that provide it.
+    """
+
+    name: str
+    target: str
+    origin: str
+
+
+class Registry:
+    """Plug-ins of one entry-point group.
+
+    Args:
+        group: entry-point group, as in ``[project.entry-points."smartcam.interpreters"]``.
+        builtins: name to ``module:attribute`` of those that smartcam brings.
+        aliases: other accepted names of built-ins.
+    """
+
+    def __init__(
+        self, group: str, builtins: dict[str, str], aliases: dict[str, str] | None = None
+    ) -> None:
+        self.group = group
+        self._builtins = builtins
+        self._aliases = aliases or {}
+        self._found: dict[str, list[EntryPoint]] | None = None
+        self._loaded: dict[str, object] = {}
+
+    def available(self) -> list[PluginInfo]:
+        """Return every known name, sorted; imports nothing."""
+        infos = [PluginInfo(name, target, "built-in") for name, target in self._builtins.items()]
+        for name, points in self._entry_points().items():
+            if name not in self._builtins:
+                origin = ", ".join(_distribution(point) for point in points)
+                infos.append(PluginInfo(name, points[0].value, origin))
+        return sorted(infos)
+
+    def __contains__(self, name: object) -> bool:
+        """Whether ``name`` is known, as a name or an alias."""
+        return name in self._builtins or name in self._aliases or name in self._entry_points()
+
+    def load(self, name: str) -> object:
+        """Return what ``name`` stands for, importing it at the first call.
+
+        Raises:
+            PluginError: unknown, provided by two distributions (or by one that takes a built-in's
+                name), or its import failed.
+        """
+        name = self._aliases.get(name, name)
+        if name not in self._loaded:
+            self._loaded[name] = self._load(name)
+        return self._loaded[name]
+
+    def refresh(self) -> None:
+        """Forget what was found and loaded; the next call looks again."""
+        self._found = None
+        self._loaded.clear()
+
+    def _entry_points(self) -> dict[str, list[EntryPoint]]:
+        if self._found is None:
+            self._found = {}
+            for point in entry_points(group=self.group):
+                self._found.setdefault(point.name, []).append(point)
+        return self._found
+
+    def _load(self, name: str) -> object:
+        points = self._entry_points().get(name, [])
+        providers = [_distribution(point) for point in points]
+        if name in self._builtins:
+            if points:
+                raise PluginError(
+                    f"{self.group}: the name {name!r} is smartcam's own, "
+                    f"but {' and '.join(providers)} also provides it",
+                    name=name,
+                )
+            module, _, attribute = self._builtins[name].partition(":")
+            return getattr(importlib.import_module(module), attribute)
+        if not points:
+            known = ", ".join(info.name for info in self.available())
+            raise PluginError(f"{self.group}: {name!r} is unknown; known are {known}", name=name)
+        if len(points) > 1:
+            raise PluginError(
+                f"{self.group}: the name {name!r} is provided by {' and '.join(providers)}",
+                name=name,
+            )
+        try:
+            loaded: object = points[0].load()
+        except Exception as exc:
+            raise PluginError(
+                f"{self.group}: {name!r} of {providers[0]} failed to load: {exc!r}", name=name
+            ) from exc
+        return loaded
+
+
+def _distribution(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else point.value
+
+
+INTERPRETERS = Registry(
+    "smartcam.interpreters",
+    {
+        name: f"smartcam.interpreters.{name}:{name.capitalize()}"
+        for name in ("localizations", "strings50", "record", "table", "raw")
+    },
+    # the thesis' keywords for the first two
+    aliases={"Localizations": "localizations", "50ByteStrings": "strings50"},
+)
+
+PROTOCOLS = Registry("smartcam.protocols", {"bvs": "smartcam.protocols.bvs:BVS"})
