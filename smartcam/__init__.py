@@ -1,1 +1,138 @@
-"""smartcam: talk to industrial smart cameras."""
+"""Talk to industrial smart cameras.
+
+``async with smartcam.connect("bvs://192.168.0.10", application=7) as camera`` gives a
+:class:`~smartcam.client.SmartCamera`. ``import smartcam`` is light: names are resolved when they
+are first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from smartcam import emulator, exceptions, interpreters, layout, models, protocols
+    from smartcam.client import SmartCamera, connect
+    from smartcam.exceptions import (
+        CameraBusyError,
+        CameraFaultError,
+        CommandRejectedError,
+        ConfigurationError,
+        ConnectFailedError,
+        ConnectionClosedError,
+        ConnectionLostError,
+        ConnectionTakenError,
+        FrameError,
+        InputContainerError,
+        InterpretationError,
+        LayoutError,
+        LinkError,
+        LocalProtocolError,
+        MessageError,
+        MissingExtraError,
+        NotRunningError,
+        OvertriggeredError,
+        PluginError,
+        ProtocolError,
+        RemoteProtocolError,
+        ResponseTimeoutError,
+        SmartCamError,
+        SubscriberOverflowError,
+        TriggerError,
+        TriggerTimeoutError,
+        UnsupportedError,
+        WrongApplicationError,
+    )
+    from smartcam.layout import Layout
+    from smartcam.models import (
+        ApplicationChanged,
+        CameraEvent,
+        Connected,
+        Disconnected,
+        Header,
+        Localization,
+        Pose,
+        Position,
+        Quaternion,
+        Reconnected,
+        Result,
+        Statistics,
+        Status,
+        StatusChanged,
+    )
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ApplicationChanged",
+    "CameraBusyError",
+    "CameraEvent",
+    "CameraFaultError",
+    "CommandRejectedError",
+    "ConfigurationError",
+    "ConnectFailedError",
+    "Connected",
+    "ConnectionClosedError",
+    "ConnectionLostError",
+    "ConnectionTakenError",
+    "Disconnected",
+    "FrameError",
+    "Header",
+    "InputContainerError",
+    "InterpretationError",
+    "Layout",
+    "LayoutError",
+    "LinkError",
+    "LocalProtocolError",
+    "Localization",
+    "MessageError",
+    "MissingExtraError",
+    "NotRunningError",
+    "OvertriggeredError",
+    "PluginError",
+    "Pose",
+    "Position",
+    "ProtocolError",
+    "Quaternion",
+    "Reconnected",
+    "RemoteProtocolError",
+    "ResponseTimeoutError",
+    "Result",
+    "SmartCamError",
+    "SmartCamera",
+    "Statistics",
+    "Status",
+    "StatusChanged",
+    "SubscriberOverflowError",
+    "TriggerError",
+    "TriggerTimeoutError",
+    "UnsupportedError",
+    "WrongApplicationError",
+    "__version__",
+    "connect",
+    "emulator",
+    "exceptions",
+    "interpreters",
+    "layout",
+    "models",
+    "protocols",
+]
+
+_ROOMS = frozenset({"emulator", "exceptions", "interpreters", "layout", "models", "protocols"})
+_HOMES = {"connect": "client", "SmartCamera": "client", "Layout": "layout"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'smartcam' has no attribute {name!r}")
+    if name in _ROOMS:
+        value: Any = importlib.import_module(f"smartcam.{name}")
+    else:
+        home = _HOMES.get(name) or ("exceptions" if name.endswith("Error") else "models")
+        value = getattr(importlib.import_module(f"smartcam.{home}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

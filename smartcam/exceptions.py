@@ -16,6 +16,7 @@
     ├── CommandRejectedError                   the camera said no; what is active now
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── CameraFaultError                       the camera reports System Error
+    ├── SubscriberOverflowError                a stream's reader was too slow, and wanted to know
     ├── TriggerError                           a trigger that gave no result, and why
     │   ├── OvertriggeredError
     │   ├── NotRunningError
@@ -60,6 +61,7 @@ __all__ = [
     "RemoteProtocolError",
     "ResponseTimeoutError",
     "SmartCamError",
+    "SubscriberOverflowError",
     "TriggerError",
     "TriggerTimeoutError",
     "UnsupportedError",
@@ -210,6 +212,10 @@ class UnsupportedError(SmartCamError):
 
 class CameraFaultError(SmartCamError):
     """The camera reports System Error."""
+
+
+class SubscriberOverflowError(SmartCamError):
+    """A stream with ``overflow="error"`` was full; items after what was queued are lost."""
 
 
 class TriggerError(SmartCamError):

@@ -7,15 +7,16 @@ Lengths are metres, angles radians, times seconds unless a name says otherwise.
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import math
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 if TYPE_CHECKING:
-    from datetime import datetime
+    from collections.abc import Iterable
 
 __all__ = [
     "ApplicationChanged",
@@ -311,23 +312,23 @@ def jsonable(value: object) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, (bytes, bytearray, memoryview)):
-        return bytes(value).hex()
+    if isinstance(value, (bytes, bytearray)):
+        return value.hex()
     return _jsonable_container(value)
 
 
 def _jsonable_container(value: Any) -> Any:
+    numpy = sys.modules.get("numpy")  # never imported for JSON's sake
     if hasattr(value, "_asdict"):
         return {name: jsonable(item) for name, item in value._asdict().items()}
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
+    if dataclasses.is_dataclass(value):
+        return {f.name: jsonable(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if hasattr(value, "items"):
         return {str(key): jsonable(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [jsonable(item) for item in value]
-    if hasattr(value, "isoformat"):
+        return [jsonable(item) for item in cast("Iterable[Any]", value)]
+    if isinstance(value, datetime):
         return value.isoformat()
-    numpy = sys.modules.get("numpy")  # never imported for JSON's sake
     if numpy is not None and isinstance(value, numpy.ndarray):
         return _jsonable_array(value)
     if numpy is not None and isinstance(value, numpy.generic):

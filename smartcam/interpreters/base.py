@@ -2,4 +2,394 @@
 
 An interpreter keeps nothing between results and guesses nothing. The shortest one is a function
 over a :class:`Reader`; one that takes a layout is a subclass of :class:`Interpreter`.
+:func:`resolve` turns what the user wrote into one, :func:`run` is the only place that calls it.
 """
+
+from __future__ import annotations
+
+import difflib
+import functools
+import re
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias
+
+from smartcam._layout_text import TYPES
+from smartcam.exceptions import (
+    ConfigurationError,
+    InterpretationError,
+    LayoutError,
+    PluginError,
+    SmartCamError,
+)
+from smartcam.layout import Layout
+from smartcam.registry import INTERPRETERS
+
+if TYPE_CHECKING:
+    from smartcam.models import ByteOrder
+
+__all__ = ["Context", "Function", "Interpreter", "Reader", "Spec", "resolve", "run"]
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+@dataclass(slots=True, kw_only=True)
+class Context:
+    """What an interpreter may know about a container beside its bytes.
+
+    Attributes:
+        camera: name of the camera.
+        application: id of the application that made it.
+        number: the client's own count of containers.
+        received_at: when its last byte arrived, UTC.
+        byte_order: order of the bytes of a number, as the camera's status says.
+        y_down: whether the camera's y axis points down; poses are turned to y up.
+        lenient: take any byte but zero for a true bool.
+        empty_slots: records of zeros that were skipped; the interpreter counts here.
+    """
+
+    camera: str = ""
+    application: int = 0
+    number: int = 0
+    received_at: datetime = _EPOCH
+    byte_order: ByteOrder = "little"
+    y_down: bool = False
+    lenient: bool = False
+    empty_slots: int = 0
+
+
+@functools.lru_cache(maxsize=64)
+def _number(code: str, byte_order: str) -> struct.Struct:
+    return struct.Struct(("<" if byte_order == "little" else ">") + code)
+
+
+class Reader:
+    """Reads values from a container's bytes; every read that does not fit is an error.
+
+    Args:
+        data: the container's bytes behind the application id.
+        context: what else is known about it.
+        layout: the layout the user gave, None without one.
+
+    All offsets are bytes from the start of ``data``. Every method raises
+    :class:`~smartcam.InterpretationError` with offset, expected and got where the bytes asked for
+    are not all there.
+    """
+
+    __slots__ = ("context", "data", "layout")
+
+    def __init__(
+        self,
+        data: bytes | bytearray | memoryview,
+        context: Context | None = None,
+        layout: Layout | None = None,
+    ) -> None:
+        self.data = bytes(data)
+        self.context = Context() if context is None else context
+        self.layout = layout
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def get_bool(self, first_byte: int) -> bool:
+        """Return a bool: 0xFF is true, 0x00 false, another byte an error unless lenient."""
+        raw = self._take(first_byte, 1, "a bool")[0]
+        if raw not in (0x00, 0xFF) and not self.context.lenient:
+            raise InterpretationError(
+                f"offset {first_byte}: expected 0x00 or 0xFF for a bool, got 0x{raw:02X}",
+                offset=first_byte,
+                expected="0x00 or 0xFF for a bool",
+                got=f"0x{raw:02X}",
+            )
+        return raw != 0
+
+    def get_int8(self, first_byte: int) -> int:
+        """Return an integer of one byte with a sign."""
+        return int(self._get(first_byte, "b", "an int8"))
+
+    def get_int16(self, first_byte: int) -> int:
+        """Return an integer of two bytes with a sign."""
+        return int(self._get(first_byte, "h", "an int16"))
+
+    def get_int32(self, first_byte: int) -> int:
+        """Return an integer of four bytes with a sign."""
+        return int(self._get(first_byte, "i", "an int32"))
+
+    def get_int64(self, first_byte: int) -> int:
+        """Return an integer of eight bytes with a sign."""
+        return int(self._get(first_byte, "q", "an int64"))
+
+    def get_uint8(self, first_byte: int) -> int:
+        """Return an integer of one byte."""
+        return int(self._get(first_byte, "B", "a uint8"))
+
+    def get_uint16(self, first_byte: int) -> int:
+        """Return an integer of two bytes."""
+        return int(self._get(first_byte, "H", "a uint16"))
+
+    def get_uint32(self, first_byte: int) -> int:
+        """Return an integer of four bytes."""
+        return int(self._get(first_byte, "I", "a uint32"))
+
+    def get_uint64(self, first_byte: int) -> int:
+        """Return an integer of eight bytes."""
+        return int(self._get(first_byte, "Q", "a uint64"))
+
+    def get_real32(self, first_byte: int) -> float:
+        """Return an IEEE number of four bytes; it may be NaN or infinite."""
+        return float(self._get(first_byte, "f", "a real32"))
+
+    def get_real64(self, first_byte: int) -> float:
+        """Return an IEEE number of eight bytes; it may be NaN or infinite."""
+        return float(self._get(first_byte, "d", "a real64"))
+
+    def get_string(self, first_byte: int, length: int) -> str:
+        """Return a text of ``length`` bytes, cut at the first zero and decoded as UTF-8."""
+        raw = self._take(first_byte, length, "a string").partition(b"\0")[0]
+        try:
+            return raw.decode()
+        except UnicodeDecodeError as exc:
+            offset = first_byte + exc.start
+            raise InterpretationError(
+                f"offset {offset}: expected UTF-8 text, got 0x{raw[exc.start]:02X} ({exc.reason})",
+                offset=offset,
+                expected="UTF-8 text",
+                got=f"0x{raw[exc.start]:02X}",
+            ) from exc
+
+    def get_bytes(self, first_byte: int, length: int) -> bytes:
+        """Return ``length`` bytes as they are."""
+        return self._take(first_byte, length, "bytes")
+
+    def records(self, size: int) -> range:
+        """Return the offsets of records of ``size`` bytes, which fill the container.
+
+        Raises:
+            InterpretationError: bytes are left behind the last whole record.
+        """
+        if size < 1:
+            raise ValueError(f"expected a record of at least 1 byte, got {size}")
+        remainder = len(self.data) % size
+        if remainder:
+            offset = len(self.data) - remainder
+            raise InterpretationError(
+                f"offset {offset}: expected whole records of {size} bytes, got {remainder} bytes "
+                f"(the container has {len(self.data)})",
+                offset=offset,
+                expected=size,
+                got=remainder,
+            )
+        return range(0, len(self.data), size)
+
+    def _get(self, first_byte: int, code: str, what: str) -> Any:
+        number = _number(code, self.context.byte_order)
+        return number.unpack(self._take(first_byte, number.size, what))[0]
+
+    def _take(self, first_byte: int, length: int, what: str) -> bytes:
+        end = first_byte + length
+        if first_byte < 0 or length < 0 or end > len(self.data):
+            got = max(0, len(self.data) - max(0, first_byte))
+            raise InterpretationError(
+                f"offset {first_byte}: expected {what} of {length} bytes, got {got} "
+                f"(the container has {len(self.data)})",
+                offset=first_byte,
+                expected=length,
+                got=got,
+            )
+        return self.data[first_byte:end]
+
+
+class Interpreter(ABC):
+    """Turns a container's bytes into a value; keeps nothing between two of them.
+
+    Args:
+        layout: which fields the container holds; without one, :attr:`default_layout`.
+
+    Raises:
+        ConfigurationError: a layout that this interpreter does not take, or none where it needs
+            one.
+    """
+
+    default_layout: ClassVar[str | None] = None
+    """Text of the layout that is used where the user gives none."""
+
+    layout_use: ClassVar[Literal["none", "optional", "required"]] = "optional"
+    """Whether a layout may or must be given."""
+
+    def __init__(self, layout: Layout | None = None) -> None:
+        name = type(self).__name__.lower()
+        if layout is not None and self.layout_use == "none":
+            raise ConfigurationError(f"interpreter {name}: expected no layout, got '{layout}'")
+        if layout is None and self.default_layout is not None:
+            layout = Layout(self.default_layout)
+        if layout is None and self.layout_use == "required":
+            raise ConfigurationError(
+                f"interpreter {name}: expected a layout, got none; "
+                f'write one behind the name, as in "{name}: x: real32 mm, y: real32 mm"'
+            )
+        self.layout = layout
+
+    @abstractmethod
+    def interpret(self, reader: Reader) -> object:
+        """Return the value of a container.
+
+        Raises:
+            InterpretationError: the bytes do not fit.
+        """
+
+    def sequence(self, reader: Reader) -> int | None:
+        """Return the value of the layout's ``@sequence`` field, None without one.
+
+        Raises:
+            InterpretationError: the container's size does not fit the layout.
+        """
+        if self.layout is None or self.layout.sequence_field is None:
+            return None
+        return self.layout.sequence(reader.data, reader.context.byte_order)
+
+
+Function: TypeAlias = Callable[[Reader], object]
+"""The shortest interpreter: a function of a reader; ``reader.layout`` is the user's layout."""
+
+Spec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | Function | None
+"""What ``interpret_as`` takes for one application."""
+
+
+class _FunctionInterpreter(Interpreter):
+    """An interpreter around a plain function."""
+
+    def __init__(self, function: Function, layout: Layout | None = None) -> None:
+        super().__init__(layout)
+        self._function = function
+
+    def interpret(self, reader: Reader) -> object:
+        """Return what the function returns."""
+        return self._function(reader)
+
+    def __repr__(self) -> str:
+        return f"<interpreter {getattr(self._function, '__name__', self._function)}>"
+
+
+def run(interpreter: Interpreter, reader: Reader) -> object:
+    """Return what ``interpreter`` makes of a container.
+
+    The one place where interpreters are called: whatever one raises comes out as an
+    InterpretationError, so a slip in somebody's plug-in is an outcome like any other.
+
+    Raises:
+        InterpretationError: the bytes do not fit, or the interpreter failed; then the cause is
+            chained.
+    """
+    if reader.layout is None:
+        reader.layout = interpreter.layout
+    try:
+        return interpreter.interpret(reader)
+    except InterpretationError:
+        raise
+    except Exception as exc:
+        raise InterpretationError(
+            f"the interpreter failed with {type(exc).__name__}: {exc} "
+            f"(the container has {len(reader)} bytes)",
+            got=repr(exc),
+        ) from exc
+
+
+def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
+    """Return the interpreter that ``spec`` stands for.
+
+    Args:
+        spec: None (``raw``), a name (``"localizations"``), a layout text, a name with a layout
+            (``"table: x: real32 mm"``), a :class:`~smartcam.Layout`, an interpreter, its class,
+            or a function of a :class:`Reader`.
+        lenient: take any byte but zero for a true bool.
+
+    Raises:
+        PluginError: the name is unknown, or what it stands for cannot be loaded.
+        LayoutError: a mistake in the layout text; the position counts from the start of ``spec``.
+        ConfigurationError: the interpreter needs a layout, or takes none.
+    """
+    if spec is None:
+        return _make("raw", INTERPRETERS.load("raw"), None, lenient=lenient)
+    if isinstance(spec, str):
+        return _resolve_text(spec, lenient=lenient)
+    if isinstance(spec, Layout):
+        layout = Layout(spec.text, lenient=True) if lenient and not spec.lenient else spec
+        return _make("record", INTERPRETERS.load("record"), layout, lenient=lenient)
+    return _make(getattr(spec, "__name__", repr(spec)), spec, None, lenient=lenient)
+
+
+def _resolve_text(spec: str, *, lenient: bool) -> Interpreter:
+    head, colon, rest = spec.partition(":")
+    name = head.strip()
+    if not colon and "(" not in spec:
+        return _make(name, INTERPRETERS.load(name), None, lenient=lenient)
+    if colon and name in INTERPRETERS and not _is_type(rest):
+        layout = Layout(spec, lenient=lenient, start=len(head) + 1)
+        return _make(name, INTERPRETERS.load(name), layout, lenient=lenient)
+    _check_name(spec, name, rest)
+    layout = Layout(spec, lenient=lenient)
+    return _make("record", INTERPRETERS.load("record"), layout, lenient=lenient)
+
+
+_FIRST_WORD = re.compile(r"\s*([^\W\d]\w*)\s*(:?)")
+
+
+def _is_type(rest: str) -> bool:
+    """Whether a field's type comes: ``table: int32`` is a field that is named ``table``."""
+    word = _FIRST_WORD.match(rest)
+    return word is not None and word[1] in TYPES and not word[2]
+
+
+def _check_name(spec: str, name: str, rest: str) -> None:
+    """Complain of a mistyped interpreter's name, which no layout text would begin with."""
+    word = _FIRST_WORD.match(rest)
+    another_colon = word is not None and word[2] and word[1] not in TYPES
+    if re.fullmatch(r"[\w.-]+", name) and (another_colon or not name.isidentifier()):
+        _fail_name(spec, name)
+    # "localization: (...)*" is a layout text whose group has a name, and surely a slip
+    if rest.lstrip().startswith("(") and name != "records":
+        known = [info.name for info in INTERPRETERS.available()]
+        close = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.8)
+        if close:
+            raise PluginError(
+                f"interpreter {name!r} is unknown, did you mean {close[0]!r}? "
+                f"known are {', '.join(known)} (a group may have that name in a Layout({spec!r}))",
+                name=name,
+            )
+
+
+def _fail_name(spec: str, name: str) -> NoReturn:
+    """Say that ``name`` is no interpreter, with those that are, nor ``spec`` a layout text."""
+    nor = ""
+    try:
+        Layout(spec)
+    except LayoutError as exc:
+        nor = f"; nor is it a layout text: {exc}"
+    known = ", ".join(info.name for info in INTERPRETERS.available())
+    raise PluginError(f"interpreter {name!r} is unknown; known are {known}{nor}", name=name)
+
+
+def _make(name: str, loaded: object, layout: Layout | None, *, lenient: bool) -> Interpreter:
+    if isinstance(loaded, Interpreter):
+        if layout is not None:
+            raise ConfigurationError(f"interpreter {name}: expected no layout, got '{layout}'")
+        return loaded
+    if isinstance(loaded, type) and issubclass(loaded, Interpreter):
+        if layout is None and lenient and loaded.default_layout is not None:
+            layout = Layout(loaded.default_layout, lenient=True)
+        try:
+            return loaded(layout)
+        except SmartCamError:
+            raise
+        except Exception as exc:
+            raise PluginError(f"interpreter {name}: cannot be made: {exc!r}", name=name) from exc
+    if not isinstance(loaded, type) and callable(loaded):
+        return _FunctionInterpreter(loaded, layout)
+    raise PluginError(
+        f"interpreter {name}: expected a function of a Reader or a subclass of Interpreter, "
+        f"got {loaded!r:.200}",
+        name=name,
+    )

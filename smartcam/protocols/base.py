@@ -124,7 +124,7 @@ class _Codec:
         return self.type(**values)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Dialect:
     """One wire variant of a protocol, as data.
 
@@ -144,10 +144,10 @@ class Dialect:
     about: str
     source: str
     _encoders: dict[type[Message], _Codec] = field(
-        init=False, repr=False, compare=False, default_factory=dict[type[Message], _Codec]
+        init=False, repr=False, default_factory=dict[type[Message], _Codec]
     )
     _decoders: dict[tuple[Sender, int], _Codec] = field(
-        init=False, repr=False, compare=False, default_factory=dict[tuple[Sender, int], _Codec]
+        init=False, repr=False, default_factory=dict[tuple[Sender, int], _Codec]
     )
 
     def __post_init__(self) -> None:

@@ -142,7 +142,8 @@ class Machine:
         transport: stream or datagrams.
         max_length: largest payload accepted, bytes.
         policy: other than the role's own; the emulator's quirks use it.
-        trace: called with sender and frame for each whole frame, in both directions.
+        trace: called with the sender and each whole frame, in both directions, and with the error
+            for bytes that make none.
     """
 
     def __init__(
@@ -153,7 +154,7 @@ class Machine:
         *,
         max_length: int = DEFAULT_MAX_LENGTH,
         policy: Policy | None = None,
-        trace: Callable[[m.Sender, Frame], None] | None = None,
+        trace: Callable[[m.Sender, Frame | RemoteProtocolError], None] | None = None,
     ) -> None:
         self.dialect = dialect
         self.role = role
@@ -166,8 +167,7 @@ class Machine:
         self._trace = trace
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
-        # id of each answer the camera owes -> whether anybody still wants it (client role)
-        self._open: dict[int, bool] = {}
+        self._open: set[int] = set()  # ids of the answers the camera owes (client role)
 
     # ------------------------------------------------------------------ bytes in
 
@@ -230,8 +230,7 @@ class Machine:
             LocalProtocolError: this state forbids it, it does not fit its fields, or an answer of
                 the same id is still owed (answers carry no correlation). Nothing has changed.
         """
-        key = (self.state, self.role.sends, type(message))
-        following = TRANSITIONS.get(key)
+        following = TRANSITIONS.get((self.state, self.role.sends, type(message)))
         if following is None:
             raise LocalProtocolError(
                 f"{type(message).__name__} cannot be sent by the {self.role.value} "
@@ -239,14 +238,14 @@ class Machine:
             )
         frame = self.dialect.to_frame(message)
         owed = self._answer_id(frame.message_id, answered)
-        if owed in self._open and owed is not None:
+        if owed in self._open:
             raise LocalProtocolError(
                 f"an answer to message {frame.message_id:#04x} is still owed; one request of an id "
                 "can be open"
             )
         data = self.dialect.encode_frame(frame)
         if owed is not None:
-            self._open[owed] = True
+            self._open.add(owed)
         self.state = following
         self._outbox.append(data)
         self.counters.frames_sent += 1
@@ -259,25 +258,13 @@ class Machine:
         outbox, self._outbox = self._outbox, []
         return outbox
 
-    # ------------------------------------------------------------------ open requests
-
-    def is_open(self, message_id: int) -> bool:
-        """Whether the camera still owes an answer to a request of this id."""
-        return self.dialect.answer_id(message_id) in self._open
-
-    def forget(self, message_id: int) -> None:
-        """Nobody waits for this request's answer any more: drop it when it comes."""
-        answer_id = self.dialect.answer_id(message_id)
-        if answer_id in self._open and answer_id is not None:
-            self._open[answer_id] = False
-
     # ------------------------------------------------------------------ inside
 
     def _answer_id(self, request_id: int, answered: bool | None) -> int | None:
         if self.role is Role.CAMERA or answered is False:
             return None
         answer_id = self.dialect.answer_id(request_id)
-        return request_id if answer_id is None and answered else answer_id
+        return request_id if answered else answer_id
 
     def _receive_datagram(self) -> None:
         try:
@@ -320,21 +307,21 @@ class Machine:
             self._events.append(message)
 
     def _wanted(self, message: Message, message_id: int) -> bool:
-        """Whether the client shall see it: unasked answers and unwanted ones are counted only."""
+        """Whether the client shall see it: an answer that nothing asked for is counted only."""
         if isinstance(message, (m.ResultContainer, m.StatusReport)):
             return True
         unknown = isinstance(message, m.UnknownMessage)
-        if unknown:
-            self.counters.unknown_ids += 1
-        wanted = self._open.pop(message_id, None)
-        if wanted is None and unknown:
+        self.counters.unknown_ids += unknown
+        if message_id in self._open:
+            self._open.remove(message_id)
             return True
-        if not wanted:
-            self.counters.unexpected_messages += 1
-        return bool(wanted)
+        self.counters.unexpected_messages += not unknown
+        return unknown
 
     def _reject(self, error: RemoteProtocolError) -> bool:
         """Fail the link (True) or drop and count, as the policy says."""
+        if self._trace is not None:
+            self._trace(self.role.receives, error)
         if not self._policy.fail:
             self.counters.ignored_frames += 1
             return False

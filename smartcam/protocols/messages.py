@@ -8,7 +8,6 @@ says which message has which id; codecs, construct views and the documentation a
 from __future__ import annotations
 
 import enum
-import functools
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, get_type_hints
 
@@ -243,7 +242,6 @@ class UnknownMessage(Message):
     payload: bytes
 
 
-@functools.cache
 def wire_fields(message_type: type[Message]) -> tuple[tuple[str, Wire], ...]:
     """Return name and wire type of each field of a message's body, in order."""
     hints: dict[str, Any] = get_type_hints(message_type, include_extras=True)

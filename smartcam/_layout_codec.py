@@ -1,0 +1,354 @@
+"""Records of a layout: from bytes to values and back, in plain Python.
+
+Reading is two-speed. The fast way unpacks all records with one ``struct.Struct``, turns the rows
+into columns, converts the columns that need it, and turns them back into rows; it knows nothing of
+fields and offsets. Where it stumbles, the slow way walks the bytes in order and finds the place.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+import struct
+from collections import namedtuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, SupportsIndex, overload
+
+from smartcam._layout_text import UNITS
+from smartcam.exceptions import ConfigurationError, InterpretationError, hex_excerpt
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import ClassVar, TypeAlias
+
+    from smartcam._layout_text import Field, Unit
+    from smartcam.models import ByteOrder
+
+    Convert: TypeAlias = Callable[[Sequence[Any]], list[Any]]
+
+__all__ = ["Payload", "Record", "RecordCodec", "check_names", "named", "record_class"]
+
+Payload = bytes | bytearray | memoryview
+"""What a container's data comes as."""
+
+_BOOLS = {0x00: False, 0xFF: True}
+
+
+class Record(tuple[Any, ...]):
+    """One record's values, by name and by place.
+
+    A tuple with the layout's field names as attributes: ``record.x``, ``record["x"]`` and
+    ``record[0]`` are the same. A field's name goes before the tuple's own, so ``record.count``
+    is the field where the layout has one. Equal to a plain tuple of the same values.
+    """
+
+    __slots__ = ()
+    _fields: ClassVar[tuple[str, ...]] = ()
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+        count: Any
+        index: Any
+
+    @overload
+    def __getitem__(self, key: SupportsIndex | str, /) -> Any: ...
+    @overload
+    def __getitem__(self, key: slice, /) -> tuple[Any, ...]: ...
+    def __getitem__(self, key: SupportsIndex | slice | str, /) -> Any:
+        """Return the value of a name, at a place, or a slice as a tuple.
+
+        Raises:
+            KeyError: no field has that name.
+            IndexError: no field is at that place.
+        """
+        if isinstance(key, str):
+            if key not in self._fields:
+                raise KeyError(f"{key!r} is not a field; fields are {', '.join(self._fields)}")
+            key = self._fields.index(key)
+        return super().__getitem__(key)
+
+    def _asdict(self) -> dict[str, Any]:
+        """Return the values by name, in the layout's order."""
+        return dict(zip(self._fields, self, strict=True))
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={value!r}" for name, value in self._asdict().items())
+        return f"Record({values})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _make_record, (self._fields, tuple(self))
+
+
+@functools.lru_cache(maxsize=256)  # a class per layout; evicting one costs only its making
+def record_class(names: tuple[str, ...]) -> type[Record]:
+    """Return the record class with these field names."""
+    # only for its getters, which are written in C
+    maker = namedtuple("Fields", names)  # noqa: PYI024  # pyright: ignore[reportUntypedNamedTuple]
+    attributes: dict[str, Any] = {name: vars(maker)[name] for name in names}
+    return type(
+        "Record",
+        (Record,),
+        {
+            **attributes,
+            "__slots__": (),
+            "__module__": __name__,
+            "__match_args__": names,
+            "_fields": names,
+        },
+    )
+
+
+def _make_record(names: tuple[str, ...], values: tuple[Any, ...]) -> Record:
+    return Record.__new__(record_class(names), values)
+
+
+class RecordCodec:
+    """Reads and writes records of one list of fields in one byte order.
+
+    Args:
+        fields: the fields, packed.
+        byte_order: order of the bytes of a number.
+        lenient: take any byte but zero for a true bool.
+    """
+
+    def __init__(self, fields: tuple[Field, ...], byte_order: ByteOrder, *, lenient: bool) -> None:
+        self.fields = fields
+        self.lenient = lenient
+        self.offsets = _offsets(fields)
+        self.make = functools.partial(
+            Record.__new__, record_class(tuple(field.name for field in fields))
+        )
+        order = "<" if byte_order == "little" else ">"
+        codes = (f"{field.length or ''}{field.wire.code}" for field in fields)
+        self._struct = struct.Struct(order + "".join(codes))
+        self._singles = [struct.Struct(f"{order}{f.length or ''}{f.wire.code}") for f in fields]
+        self._converters = [
+            (index, convert)
+            for index, field in enumerate(fields)
+            if (convert := _converter(field, lenient=lenient)) is not None
+        ]
+        self.size = self._struct.size
+
+    def read(self, payload: Payload, offset: int, count: int, *, what: str = "") -> list[Record]:
+        """Return ``count`` records from ``offset`` on; the caller has checked that they are there.
+
+        Raises:
+            InterpretationError: a byte that is no bool, or a text that is not UTF-8.
+        """
+        end = offset + count * self.size
+        whole = offset == 0 and end == len(payload)
+        rows = self._struct.iter_unpack(payload if whole else memoryview(payload)[offset:end])
+        if not self._converters:
+            return list(map(self.make, rows))
+        columns: list[Sequence[Any]] = list(zip(*rows, strict=True))
+        if not columns:
+            return []
+        try:
+            for index, convert in self._converters:
+                columns[index] = convert(columns[index])
+        except (KeyError, UnicodeDecodeError) as exc:
+            raise self.locate(payload, offset, count, what) from exc
+        return list(map(self.make, zip(*columns, strict=True)))
+
+    def read_field(self, payload: Payload, offset: int, index: int) -> Any:
+        """Return the unconverted value of one field of the record at ``offset``."""
+        return self._singles[index].unpack_from(payload, offset + self.offsets[index])[0]
+
+    def write(self, values: Sequence[Any], what: str) -> bytes:
+        """Return one record's bytes; ``values`` in the order of the fields.
+
+        Raises:
+            ConfigurationError: a value that does not fit its field; ``what`` tells the record.
+        """
+        wire: list[Any] = []
+        for field, value in zip(self.fields, values, strict=True):
+            try:
+                wire.append(_to_wire(field, value))
+            except (ArithmeticError, TypeError, ValueError) as exc:
+                raise ConfigurationError(
+                    f"layout: {what}{field.label}: expected {_expected(field)}, got {_shown(value)}"
+                ) from exc
+        return self._struct.pack(*wire)
+
+    def take(self, value: object, what: str, forced: Mapping[str, Any]) -> list[Any]:
+        """Return the values of one record in the order of the fields.
+
+        Args:
+            value: mapping, record, or sequence of the values in order.
+            what: tells the record in an error.
+            forced: values of some fields that go before those of ``value``.
+
+        Raises:
+            ConfigurationError: a field is missing, unknown, or there are too few or too many.
+        """
+        names = [field.name for field in self.fields]
+        given = named(value, names, what)
+        given.update({name: forced[name] for name in names if name in forced})
+        check_names(given, names, what)
+        return [given[name] for name in names]
+
+    def field_at(self, position: int) -> tuple[Field, int]:
+        """Return the field that holds byte ``position`` of a record, and where it begins."""
+        for field, offset in zip(self.fields, self.offsets, strict=True):
+            if position < offset + field.size:
+                return field, offset
+        return self.fields[-1], self.offsets[-1]
+
+    def locate(self, payload: Payload, offset: int, count: int, what: str) -> InterpretationError:
+        """Return the error for the first value that cannot be converted; there must be one."""
+        for number in range(count):
+            start = offset + number * self.size
+            for index, convert in self._converters:
+                value = self.read_field(payload, start, index)
+                try:
+                    convert([value])
+                except (KeyError, UnicodeDecodeError) as exc:
+                    at = start + self.offsets[index]
+                    where = f"{what} {number}: " if what else ""
+                    return _bad_value(self.fields[index], where, at, value, exc)
+        raise AssertionError("the fast way failed and the slow way did not")
+
+
+def named(value: object, names: Sequence[str], what: str) -> dict[str, Any]:
+    """Return a mapping's, a record's or a sequence's values by name.
+
+    Raises:
+        ConfigurationError: it is none of these, or a sequence of another length.
+    """
+    given: Any = value
+    if isinstance(value, Mapping):
+        return dict(given)
+    if isinstance(value, Record):
+        return dict(given._asdict())
+    if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
+        raise ConfigurationError(
+            f"layout: {what}expected a mapping or a sequence of values, got {_shown(value)}"
+        )
+    if len(given) != len(names):
+        raise ConfigurationError(
+            f"layout: {what}expected {len(names)} values ({', '.join(names)}), got {len(given)}"
+        )
+    return dict(zip(names, given, strict=True))
+
+
+def check_names(given: Mapping[str, Any], names: Sequence[str], what: str) -> None:
+    """Raise ConfigurationError where ``given`` has not exactly these names."""
+    if set(given) == set(names):
+        return
+    missing = [name for name in names if name not in given]
+    unknown = [str(name) for name in given if name not in names]
+    raise ConfigurationError(
+        f"layout: {what}expected the fields {', '.join(names)}"
+        + (f"; missing: {', '.join(missing)}" if missing else "")
+        + (f"; unknown: {', '.join(unknown)}" if unknown else "")
+    )
+
+
+def _bad_value(
+    field: Field, where: str, offset: int, value: Any, exc: Exception
+) -> InterpretationError:
+    if isinstance(exc, UnicodeDecodeError):
+        offset += exc.start
+        expected, got = "UTF-8 text", f"{hex_excerpt(value)} ({exc.reason})"
+    else:
+        expected, got = "0x00 or 0xFF for a bool", f"0x{value:02X}"
+    return InterpretationError(
+        f"{where}{field.label} at offset {offset}: expected {expected}, got {got}",
+        field=field.name,
+        offset=offset,
+        expected=expected,
+        got=got,
+    )
+
+
+def _offsets(fields: tuple[Field, ...]) -> list[int]:
+    offsets: list[int] = []
+    at = 0
+    for field in fields:
+        offsets.append(at)
+        at += field.size
+    return offsets
+
+
+def _converter(field: Field, *, lenient: bool) -> Convert | None:
+    """Return what turns a column of wire values into values, None where they are the same."""
+    if field.type == "string":
+        return lambda column: [raw.partition(b"\0")[0].decode() for raw in column]
+    if field.type == "bool":
+        if lenient:
+            return lambda column: [raw != 0 for raw in column]
+        return lambda column: [_BOOLS[raw] for raw in column]
+    if field.unit is None:
+        return None
+    _, _, multiply, divide = UNITS[field.unit]
+    if multiply == divide == 1.0:
+        return None if not field.wire.is_integer else lambda column: [float(v) for v in column]
+    return lambda column: [v * multiply / divide for v in column]
+
+
+def _to_wire(field: Field, value: Any) -> Any:
+    """Return what ``struct`` packs; ValueError, TypeError or ArithmeticError where it cannot be."""
+    if field.type == "bool":
+        if value not in (True, False):
+            raise ValueError("not a bool")
+        return 0xFF if value else 0x00
+    if field.type == "string":
+        return _text_to_wire(field, value)
+    if isinstance(value, (str, bytes, bytearray)):
+        raise TypeError("not a number")
+    if field.unit is not None:
+        value = _from_si(UNITS[field.unit], float(value))
+    if not field.wire.is_integer:
+        value = float(value)
+        struct.pack(f"<{field.wire.code}", value)  # its range is struct's to know
+        return value
+    number = _to_integer(value, rounded=field.unit is not None)
+    if not (field.wire.low or 0) <= number <= (field.wire.high or 0):
+        raise ValueError("out of range")
+    return number
+
+
+def _from_si(unit: Unit, si: float) -> float:
+    """Return the number whose SI value is ``si``, where there is one, else the nearest."""
+    value = si * unit.divide / unit.multiply
+    if math.isinf(value) and math.isfinite(si):
+        raise OverflowError("out of range")
+    for near in (value, math.nextafter(value, math.inf), math.nextafter(value, -math.inf)):
+        if near * unit.multiply / unit.divide == si:
+            return near
+    return value
+
+
+def _to_integer(value: Any, *, rounded: bool) -> int:
+    if isinstance(value, float):
+        if not rounded and not value.is_integer():
+            raise ValueError("not a whole number")
+        return round(value)
+    return operator.index(value)
+
+
+def _text_to_wire(field: Field, value: Any) -> bytes:
+    if not isinstance(value, str) or "\0" in value:
+        raise TypeError("not a text")
+    raw = value.encode()
+    if len(raw) > field.size:
+        raise ValueError("too long")
+    return raw
+
+
+def _expected(field: Field) -> str:
+    wire = field.wire
+    if field.type == "bool":
+        return "True or False"
+    if field.type == "string":
+        return f"a text of at most {field.length} bytes in UTF-8, without a zero character"
+    what = "a number in range" if not wire.is_integer else f"{wire.low} to {wire.high}"
+    return what if field.unit is None else f"{what} on the wire ({UNITS[field.unit].si} here)"
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 64 else f"{text[:64]} ..."

@@ -1,0 +1,210 @@
+"""Layouts as plain data, YAML, pydantic models. Imported where one of them is first asked for."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, RootModel, ValidationError, create_model
+from pydantic import Field as ModelField
+
+from smartcam._layout_text import TYPES, UNITS, LayoutSpec, parse_text, to_text
+from smartcam._layout_text import Field as LayoutField
+from smartcam.exceptions import ConfigurationError, LayoutError, MissingExtraError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import ModuleType
+
+__all__ = ["dump_yaml", "from_data", "load_yaml", "make_model", "to_data"]
+
+_Name = Annotated[str, ModelField(pattern=r"^[^\W\d]\w*$", max_length=200)]
+_Count = Annotated[int, ModelField(ge=1, le=65_535, strict=True)]
+
+
+class _FieldData(BaseModel):
+    """One field, as it stands in a file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: _Name
+    type: str = ModelField(description="type as in a layout text", max_length=200)
+    unit: str | None = ModelField(None, description="unit on the wire", max_length=200)
+    sequence: bool = ModelField(False, description="carries the sequence number", strict=True)
+
+
+class _LayoutData(BaseModel):
+    """A layout, as it stands in a file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    fields_: list[_FieldData] = ModelField(alias="fields", min_length=1)
+    head: list[_FieldData] = []
+    repeat: Literal["*"] | _Count | _Name | None = None
+    group: _Name | None = None
+    lenient: bool = ModelField(False, strict=True)
+
+
+def to_data(spec: LayoutSpec, *, lenient: bool) -> dict[str, Any]:
+    """Return ``spec`` as plain data; what has its usual value is left out."""
+    data: dict[str, Any] = {}
+    if spec.head:
+        data["head"] = [_field_data(field) for field in spec.head]
+    data["fields"] = [_field_data(field) for field in spec.fields]
+    if spec.repeat is not None:
+        data["repeat"] = spec.repeat
+    if spec.group is not None:
+        data["group"] = spec.group
+    if lenient:
+        data["lenient"] = True
+    return data
+
+
+def _field_data(field: LayoutField) -> dict[str, Any]:
+    data: dict[str, Any] = {"name": field.name, "type": field.type_text}
+    if field.unit is not None:
+        data["unit"] = field.unit
+    if field.sequence:
+        data["sequence"] = True
+    return data
+
+
+def from_data(data: Mapping[str, Any]) -> tuple[str, bool]:
+    """Return the layout text of plain data, and whether it is lenient.
+
+    The text is put together from checked words and then read like any other, so that there is
+    one place that knows what a layout may be.
+
+    Raises:
+        ConfigurationError: unknown keys, or values that are no words of a layout text.
+    """
+    try:
+        checked = _LayoutData.model_validate(data)
+    except ValidationError as exc:
+        mistakes = "; ".join(
+            f"{'.'.join(map(str, error['loc'])) or 'layout'}: {error['msg']}"
+            for error in exc.errors()[:5]
+        )
+        raise ConfigurationError(f"layout: {mistakes}") from exc
+    if checked.repeat is None and (checked.head or checked.group is not None):
+        raise ConfigurationError("layout: head and group are for layouts with repeat")
+    spec = LayoutSpec(
+        tuple(_checked_field(field) for field in checked.head),
+        tuple(_checked_field(field) for field in checked.fields_),
+        checked.repeat,
+        checked.group,
+    )
+    return to_text(spec), checked.lenient
+
+
+def _checked_field(data: _FieldData) -> LayoutField:
+    type_, _, length = data.type.partition("[")
+    digits = length.removesuffix("]")
+    if type_ not in TYPES or (length and not (length.endswith("]") and digits.isdecimal())):
+        raise ConfigurationError(
+            f"layout: field {data.name!r}: expected a type ({', '.join(TYPES)}[n]), "
+            f"got {data.type!r}"
+        )
+    if data.unit is not None and data.unit not in UNITS:
+        raise ConfigurationError(
+            f"layout: field {data.name!r}: expected a unit ({', '.join(UNITS)}), got {data.unit!r}"
+        )
+    # the length stays a text in the type: the layout text's reader knows its range
+    return LayoutField(data.name, data.type, None, data.unit, data.sequence)
+
+
+def dump_yaml(data: dict[str, Any]) -> str:
+    """Return plain data as YAML."""
+    text: str = _yaml().safe_dump(data, sort_keys=False, allow_unicode=True)
+    return text
+
+
+def load_yaml(text: str) -> dict[str, Any] | str:
+    """Return the plain data of a YAML document, or the layout text that it is.
+
+    Raises:
+        LayoutError: neither the one nor the other.
+    """
+    yaml = _yaml()
+    try:
+        loaded: Any = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as exc:
+        # "x: int32, y: int32" is no YAML; a broken document is no layout text either
+        try:
+            return _checked_text(text)
+        except LayoutError as error:
+            raise LayoutError(
+                f"{error}\nnor is it YAML: {exc}", text=error.text, position=error.position
+            ) from exc
+    given: Any = loaded
+    if isinstance(loaded, str):
+        return loaded
+    # "x: int32" is a YAML mapping as well; those of a file hold more than texts
+    is_data = isinstance(loaded, dict) and not all(isinstance(v, str) for v in given.values())
+    return given if is_data else text
+
+
+def _checked_text(text: str) -> str:
+    parse_text(text)
+    return text
+
+
+def _yaml() -> ModuleType:
+    try:
+        return importlib.import_module("yaml")
+    except ImportError as exc:
+        raise MissingExtraError(
+            'layout: YAML needs PyYAML, which is not installed: pip install "smartcam[yaml]"',
+            extra="yaml",
+        ) from exc
+
+
+def make_model(spec: LayoutSpec) -> type[BaseModel]:
+    """Return the pydantic model of what a layout's ``parse`` gives."""
+    record = _object_model("Record", [_member(field) for field in spec.fields])
+    if spec.repeat is None:
+        return record
+    bounds = {"min_length": spec.repeat, "max_length": spec.repeat}
+    limits: dict[str, Any] = bounds if isinstance(spec.repeat, int) else {}
+    records: Any = Annotated[list[record], ModelField(**limits)]  # type: ignore[valid-type]
+    if spec.is_list:
+        return type("Records", (RootModel[records],), {"__module__": __name__})
+    members = [_member(field) for field in spec.head]
+    return _object_model("Container", [*members, (spec.group_field, records, "the records", {})])
+
+
+def _member(field: LayoutField) -> tuple[str, Any, str, dict[str, Any]]:
+    """Return name, type, description and limits of a field's value."""
+    wire, text = field.wire, field.type_text
+    if field.sequence:
+        text += ", the sequence number"
+    if field.type == "bool":
+        return field.name, bool, text, {}
+    if field.type == "string":
+        return field.name, str, text, {"max_length": field.length}
+    if field.unit is not None:
+        text = f"{UNITS[field.unit].si}; {text} {field.unit} on the wire"
+    elif wire.is_integer:
+        return field.name, int, text, {"ge": wire.low, "le": wire.high}
+    return field.name, float, text, {}
+
+
+def _object_model(
+    name: str, members: list[tuple[str, Any, str, dict[str, Any]]]
+) -> type[BaseModel]:
+    taken = {member[0] for member in members}
+    definitions: dict[str, Any] = {}
+    for member, type_, description, limits in members:
+        attribute = member
+        while hasattr(BaseModel, attribute) or (attribute != member and attribute in taken):
+            attribute += "_"
+        alias = None if attribute == member else member
+        definitions[attribute] = (
+            type_,
+            ModelField(alias=alias, description=description, **limits),
+        )
+    config = ConfigDict(
+        frozen=True, extra="forbid", from_attributes=True, protected_namespaces=(), title=name
+    )
+    model: type[BaseModel] = create_model(name, __config__=config, **definitions)
+    return model

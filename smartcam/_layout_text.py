@@ -1,0 +1,481 @@
+"""The layout language: text to fields and back.
+
+::
+
+    layout = item { "," item } [ "," ]
+    item   = field | group                      one group at most, and it comes last
+    field  = name ":" type [ unit ] [ "@sequence" ]
+    group  = [ name ":" ] "(" field { "," field } [ "," ] ")" ( "*" | "[" number | name "]" )
+
+White space and new lines mean nothing, ``#`` begins a comment. One pass of recursive descent
+over a list of tokens; every token knows its place, so every mistake can be shown.
+"""
+
+from __future__ import annotations
+
+import difflib
+import keyword
+import math
+import re
+import unicodedata
+from dataclasses import dataclass
+from typing import NamedTuple, NoReturn
+
+from smartcam.exceptions import LayoutError
+
+__all__ = ["TYPES", "UNITS", "Field", "LayoutSpec", "Unit", "WireType", "parse_text", "to_text"]
+
+MAX_TEXT = 20_000
+"""Characters of a layout text. A container holds about 64 kB (bvs.md 4); a thousand fields, each
+of them configured by hand on the camera, still fit."""
+
+MAX_COUNT = 65_535
+"""Bytes of a string and number of records: more than a container of about 64 kB holds."""
+
+SEQUENCE = "sequence"
+
+
+class WireType(NamedTuple):
+    """How a type stands on the wire.
+
+    Attributes:
+        code: its letter in ``struct``.
+        numpy: its numpy type without a byte order.
+        size: bytes; 0 for a string, whose length the field says.
+        low: smallest value of an integer, None for the rest.
+        high: largest value of an integer, None for the rest.
+    """
+
+    code: str
+    numpy: str
+    size: int
+    low: int | None = None
+    high: int | None = None
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether it is one of the integers; a bool is none."""
+        return self.low is not None
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is an integer or a real."""
+        return self.is_integer or self.numpy[0] == "f"
+
+
+def _integers(prefix: str, codes: str, kind: str) -> dict[str, WireType]:
+    """Return the integers of one, two, four and eight bytes."""
+    table: dict[str, WireType] = {}
+    for code, size in zip(codes, (1, 2, 4, 8), strict=True):
+        values = 1 << 8 * size
+        low = -(values // 2) if kind == "i" else 0
+        table[f"{prefix}{8 * size}"] = WireType(code, f"{kind}{size}", size, low, low + values - 1)
+    return table
+
+
+TYPES: dict[str, WireType] = {
+    "bool": WireType("B", "u1", 1),
+    **_integers("int", "bhiq", "i"),
+    **_integers("uint", "BHIQ", "u"),
+    "real32": WireType("f", "f4", 4),
+    "real64": WireType("d", "f8", 8),
+    "string": WireType("s", "S", 0),
+}
+"""Every type of the language."""
+
+
+class Unit(NamedTuple):
+    """A unit of the wire: ``value * multiply / divide`` is SI.
+
+    One of the two is 1 (or, for ``inch``, the product is exact), so a value is rounded once, and
+    scalars and numpy columns come out the same to the last bit.
+    """
+
+    quantity: str
+    si: str
+    multiply: float = 1.0
+    divide: float = 1.0
+
+
+UNITS: dict[str, Unit] = {
+    "m": Unit("length", "metres"),
+    "mm": Unit("length", "metres", divide=1000.0),
+    "um": Unit("length", "metres", divide=1_000_000.0),
+    "inch": Unit("length", "metres", multiply=254.0, divide=10_000.0),
+    "rad": Unit("angle", "radians"),
+    "deg": Unit("angle", "radians", multiply=math.pi / 180.0),
+    "percent": Unit("ratio", "0 to 1", divide=100.0),
+    "px": Unit("pixels", "pixels"),
+    "s": Unit("time", "seconds"),
+    "ms": Unit("time", "seconds", divide=1000.0),
+}
+"""Every unit of the language."""
+
+# what people write for a type, where the spelling alone does not lead there
+_MEANT = {
+    "float": "real32",
+    "float32": "real32",
+    "float64": "real64",
+    "double": "real64",
+    "int": "int32",
+    "str": "string[n]",
+    "byte": "uint8",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field of a layout.
+
+    Attributes:
+        name: name of the value.
+        type: ``bool``, ``int8`` to ``uint64``, ``real32``, ``real64`` or ``string``.
+        length: bytes of a string, None for the other types.
+        unit: unit on the wire; the value is SI. None: taken as it comes.
+        sequence: whether it carries the sequence number (``@sequence``).
+    """
+
+    name: str
+    type: str
+    length: int | None = None
+    unit: str | None = None
+    sequence: bool = False
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return TYPES[self.type].size if self.length is None else self.length
+
+    @property
+    def wire(self) -> WireType:
+        """How its type stands on the wire."""
+        return TYPES[self.type]
+
+    @property
+    def type_text(self) -> str:
+        """The type as it is written, ``string[20]`` with its length."""
+        return self.type if self.length is None else f"{self.type}[{self.length}]"
+
+    @property
+    def label(self) -> str:
+        """What an error calls it: ``field 'x' (real32 mm)``."""
+        return f"field {self.name!r} ({str(self).partition(': ')[2]})"
+
+    def __str__(self) -> str:
+        text = f"{self.name}: {self.type_text}"
+        if self.unit is not None:
+            text += f" {self.unit}"
+        return f"{text} @{SEQUENCE}" if self.sequence else text
+
+
+class LayoutSpec(NamedTuple):
+    """What a layout text says.
+
+    Attributes:
+        head: fields in front of the group; empty without one.
+        fields: fields of a record.
+        repeat: None for exactly one record, ``"*"``, a number, or the name of the count field.
+        group: name of the group, None without one.
+    """
+
+    head: tuple[Field, ...]
+    fields: tuple[Field, ...]
+    repeat: str | int | None
+    group: str | None
+
+    @property
+    def is_list(self) -> bool:
+        """Whether the value is a plain list: a group without a name, nothing else to tell."""
+        told = (field.sequence or field.name == self.repeat for field in self.head)
+        return self.repeat is not None and self.group is None and all(told)
+
+    @property
+    def group_field(self) -> str:
+        """Name of the list where the value is a record with a list in it."""
+        return self.group or "records"
+
+
+def to_text(spec: LayoutSpec) -> str:
+    """Return the canonical text of ``spec``: one line, single spaces."""
+    fields = ", ".join(map(str, spec.fields))
+    if spec.repeat is None:
+        return fields
+    name = f"{spec.group}: " if spec.group is not None else ""
+    repeat = "*" if spec.repeat == "*" else f"[{spec.repeat}]"
+    return ", ".join([*map(str, spec.head), f"{name}({fields}){repeat}"])
+
+
+def parse_text(text: str, start: int = 0) -> LayoutSpec:
+    """Return what ``text`` says, read from ``start`` on.
+
+    Raises:
+        LayoutError: with the position of the mistake in ``text``.
+    """
+    if len(text) - start > MAX_TEXT:
+        raise LayoutError(
+            f"layout: expected at most {MAX_TEXT} characters, got {len(text) - start}",
+            text=text,
+            position=start + MAX_TEXT,
+        )
+    return _Parser(text, start).layout()
+
+
+class _Token(NamedTuple):
+    kind: str
+    text: str
+    position: int
+
+    def __str__(self) -> str:
+        return "the end" if self.kind == "end" else repr(self.text)
+
+
+_TOKEN = re.compile(
+    r"(?P<space>(?:\s|\#[^\n]*)+)|(?P<name>[^\W\d]\w*)|(?P<number>[0-9]+)|(?P<mark>[:,()\[\]*@])"
+)
+
+
+class _Parser:
+    def __init__(self, text: str, start: int) -> None:
+        self._text = text
+        self._tokens = self._tokenize(start)
+        self._next = 0
+        self._names: set[str] = set()
+        self._has_sequence = False
+
+    def layout(self) -> LayoutSpec:
+        """Read everything."""
+        fields: list[Field] = []
+        group: LayoutSpec | None = None
+        while True:
+            here = self._peek()
+            if here.kind == "end" and (fields or group):
+                break
+            if group is not None:
+                self._fail(f"expected the end, a group comes last, got {here}", here)
+            if self._at_group():
+                group = self._group(tuple(fields))
+            else:
+                fields.append(self._field("a field or a group"))
+            if not self._take_mark(","):
+                self._expect_end(None if group else fields[-1])
+                break
+        return group or LayoutSpec((), tuple(fields), None, None)
+
+    # -- rules -------------------------------------------------------------------------------
+
+    def _at_group(self) -> bool:
+        """Whether ``(`` or ``name : (`` comes."""
+        ahead = [token.text for token in self._tokens[self._next : self._next + 3]]
+        return ahead[:1] == ["("] or ahead[1:] == [":", "("]
+
+    def _group(self, head: tuple[Field, ...]) -> LayoutSpec:
+        at = self._peek()
+        name: str | None = None
+        if at.text != "(":
+            name = self._name("a field or a group")
+            self._take()
+        self._take()
+        fields: list[Field] = []
+        while not (fields and self._peek().text == ")"):
+            if self._at_group():
+                self._fail("expected a field, groups do not nest", self._peek())
+            fields.append(self._field("a field"))
+            if not self._take_mark(","):
+                break
+        if not self._take_mark(")"):
+            self._fail_after(fields[-1], "',' or ')'")
+        spec = LayoutSpec(head, tuple(fields), self._repeat(head), name)
+        if not spec.is_list and any(field.name == spec.group_field for field in head):
+            self._fail("expected a name before the group, 'records' is a field already", at)
+        return spec
+
+    def _repeat(self, head: tuple[Field, ...]) -> str | int:
+        if self._take_mark("*"):
+            return "*"
+        if not self._take_mark("["):
+            self._fail(
+                f"expected '*', '[number]' or '[name]' behind the group, got {self._peek()}",
+                self._peek(),
+            )
+        token = self._take()
+        repeat: str | int
+        if token.kind == "number":
+            repeat = self._number(token, "records")
+        elif token.kind == "name":
+            repeat = self._count_name(token, head)
+        else:
+            self._fail(f"expected a number or the name of a count field, got {token}", token)
+        if not self._take_mark("]"):
+            self._fail(f"expected ']', got {self._peek()}", self._peek())
+        return repeat
+
+    def _count_name(self, token: _Token, head: tuple[Field, ...]) -> str:
+        name = unicodedata.normalize("NFKC", token.text)
+        for field in head:
+            if field.name == name:
+                break
+        else:
+            known = ", ".join(field.name for field in head) or "none"
+            self._fail(
+                f"expected the name of a field before the group (there: {known}), got {token}",
+                token,
+            )
+        if not field.wire.is_integer or field.unit is not None or field.sequence:
+            self._fail(
+                f"expected an integer field without a unit as the count, got {field.label}", token
+            )
+        return name
+
+    def _field(self, what: str) -> Field:
+        name = self._name(what)
+        if not self._take_mark(":"):
+            self._fail(f"expected ':' and a type behind {name!r}, got {self._peek()}", self._peek())
+        type_, length = self._type()
+        unit = self._unit(type_)
+        return Field(name, type_, length, unit, self._sequence(type_, unit))
+
+    def _name(self, what: str) -> str:
+        token = self._take()
+        if token.kind != "name":
+            self._fail(f"expected {what}, got {token}", token)
+        name = unicodedata.normalize("NFKC", token.text)  # as Python does with attribute names
+        if not token.text.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
+            self._fail(
+                f"expected a name that can be an attribute (letters, digits, '_'; no leading '_', "
+                f"no Python keyword), got {token}",
+                token,
+            )
+        if name in self._names:
+            self._fail(f"expected a new name, {name!r} is there already", token)
+        self._names.add(name)
+        return name
+
+    def _type(self) -> tuple[str, int | None]:
+        token = self._take()
+        if token.text not in TYPES:
+            self._fail(
+                f"expected a type ({', '.join(TYPES)}), got {token}{_suggest(token.text)}",
+                token,
+            )
+        if token.text != "string":
+            return token.text, None
+        if not self._take_mark("["):
+            self._fail(
+                f"expected '[' and the string's length in bytes, got {self._peek()}", self._peek()
+            )
+        length = self._number(self._take(), "bytes")
+        if not self._take_mark("]"):
+            self._fail(f"expected ']', got {self._peek()}", self._peek())
+        return token.text, length
+
+    def _unit(self, type_: str) -> str | None:
+        token = self._peek()
+        if token.kind != "name" or self._after().text == ":":
+            return None
+        if not TYPES[type_].is_number:
+            self._fail(f"expected no unit, a {type_} has none, got {token}", token)
+        if token.text not in UNITS:
+            self._fail(f"expected a unit ({', '.join(UNITS)}), got {token}", token)
+        return self._take().text
+
+    def _sequence(self, type_: str, unit: str | None) -> bool:
+        at = self._peek()
+        if not self._take_mark("@"):
+            return False
+        if self._peek().text != SEQUENCE:
+            self._fail(f"expected '@{SEQUENCE}', got '@' and {self._peek()}", at)
+        self._take()
+        if not TYPES[type_].is_integer or unit is not None:
+            self._fail(f"expected '@{SEQUENCE}' only behind an integer without a unit", at)
+        if self._has_sequence:
+            self._fail(f"expected one '@{SEQUENCE}', got a second", at)
+        self._has_sequence = True
+        return True
+
+    def _number(self, token: _Token, what: str) -> int:
+        digits = token.text.lstrip("0")
+        # the length first: int() refuses some thousand digits with an error of its own
+        if token.kind != "number" or not 1 <= len(digits) <= 5 or int(digits) > MAX_COUNT:
+            self._fail(f"expected a number of {what} from 1 to {MAX_COUNT}, got {token}", token)
+        return int(digits)
+
+    def _expect_end(self, last: Field | None) -> None:
+        here = self._peek()
+        if here.kind == "end":
+            return
+        if last is None:
+            self._fail(f"expected the end, a group comes last, got {here}", here)
+        self._fail_after(last, "',' or the end")
+
+    # -- tokens ------------------------------------------------------------------------------
+
+    def _tokenize(self, start: int) -> list[_Token]:
+        tokens: list[_Token] = []
+        position = start
+        while position < len(self._text):
+            match = _TOKEN.match(self._text, position)
+            if match is None:
+                bad = self._text[position]
+                self._fail(
+                    f"expected a name, a number or one of : , ( ) [ ] * @ #, got {bad!r}",
+                    _Token("mark", bad, position),
+                )
+            if match.lastgroup != "space":
+                tokens.append(_Token(match.lastgroup or "", match.group(), position))
+            position = match.end()
+        tokens.append(_Token("end", "", max(start, len(self._text))))
+        return tokens
+
+    def _peek(self) -> _Token:
+        return self._tokens[self._next]
+
+    def _after(self) -> _Token:
+        return self._tokens[min(self._next + 1, len(self._tokens) - 1)]
+
+    def _take(self) -> _Token:
+        token = self._tokens[self._next]
+        if token.kind != "end":
+            self._next += 1
+        return token
+
+    def _take_mark(self, mark: str) -> bool:
+        if self._peek().kind == "mark" and self._peek().text == mark:
+            self._next += 1
+            return True
+        return False
+
+    def _fail_after(self, field: Field, expected: str) -> NoReturn:
+        """Fail behind a whole field: say what could have followed."""
+        here = self._peek()
+        if here.kind == "name":
+            self._fail(f"expected {expected}, got {here}: a comma is missing before it", here)
+        extras = "" if field.unit or not field.wire.is_number else "a unit, "
+        self._fail(f"expected {extras}{expected}, got {here}", here)
+
+    def _fail(self, message: str, token: _Token) -> NoReturn:
+        at = token.position
+        raise LayoutError(
+            f"layout: {message} {_show(self._text, at)}", text=self._text, position=at
+        )
+
+
+def _suggest(word: str) -> str:
+    meant = _MEANT.get(word)
+    close = [meant] if meant else difflib.get_close_matches(word.lower(), TYPES, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _show(text: str, position: int) -> str:
+    """Return where ``position`` is, with its line and a caret below it."""
+    before = text[:position]
+    line = before.count("\n") + 1
+    begin = before.rfind("\n") + 1
+    end = text.find("\n", position)
+    column = position - begin
+    where = (
+        f"at character {position}" if "\n" not in text else f"at line {line}, column {column + 1}"
+    )
+    content = text[begin : end if end >= 0 else len(text)]
+    first = max(0, column - 50)  # a window of it, where the line is long
+    shown = "".join(char if char.isprintable() else " " for char in content[first : column + 30])
+    return f"{where}\n  {shown}\n  {' ' * (column - first)}^"

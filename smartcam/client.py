@@ -1,0 +1,756 @@
+"""The camera as the user sees it.
+
+``open()`` starts one supervisor task, the client's only bare ``create_task``. It makes the session
+and then reads the link: every chunk goes to the :class:`~smartcam.inbox.Inbox`, which knows who
+waits for what. Commands stand here; each is a few messages out and a wait with a deadline.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import logging
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from smartcam.conversation import Conversation, is_ready
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectionClosedError,
+    ConnectionLostError,
+    InterpretationError,
+    LocalProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.handshake import Session, establish
+from smartcam.inbox import Inbox
+from smartcam.interpretation import Interpretation
+from smartcam.models import CameraEvent, Connected, Disconnected, Result, Statistics, Status
+from smartcam.protocols import messages as m
+from smartcam.protocols.framing import Frame
+from smartcam.settings import CameraSettings
+from smartcam.streams import Subscription
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
+    from types import TracebackType
+    from typing import Literal, Self
+
+    from smartcam.connection import Link, TraceEntry
+
+__all__ = ["SmartCamera", "connect"]
+
+logger = logging.getLogger("smartcam.client")
+
+DEFAULT_MAX_QUEUE = 1024
+"""Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
+
+DEFAULT_TRIGGER_TIMEOUT = 5.0
+
+
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    trace: Callable[[TraceEntry], None] | None = None,
+    **options: Any,
+) -> SmartCamera:
+    """Return a camera to be opened with ``async with`` (or ``await``).
+
+    Args:
+        url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
+            pins the dialect; or a bare host together with ``model``.
+        model: camera model, such as ``"BVS002C"``.
+        trace: called with every frame, see :class:`~smartcam.connection.TraceEntry`.
+        **options: ``name``, ``application``, ``interpret_as``, ``y_down``, ``lenient``,
+            ``connect_timeout``, ``connect_attempts``, ``switch_timeout``, ``request_timeout``,
+            ``close_timeout``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
+
+    Raises:
+        ConfigurationError: an address or option cannot work; nothing was tried.
+    """
+    return SmartCamera(CameraSettings.make(url, model, options), trace=trace)
+
+
+@dataclass(frozen=True, slots=True)
+class _Before:
+    """What to go back to after a temporary switch."""
+
+    application: int
+    running: bool
+    expected: int | None
+
+
+class SmartCamera:
+    """A smart camera; made by :func:`connect`.
+
+    Used once: after :meth:`close`, or when the link is lost, make a new one. Every method that
+    talks to the camera raises :exc:`~smartcam.exceptions.ConnectionLostError` (with the first cause
+    chained) once the link is gone and :exc:`~smartcam.exceptions.ConnectionClosedError` before
+    ``open()`` and after ``close()``.
+
+    Args:
+        settings: validated options.
+        trace: called with every frame.
+    """
+
+    def __init__(
+        self, settings: CameraSettings, *, trace: Callable[[TraceEntry], None] | None = None
+    ) -> None:
+        self.settings = settings
+        self._trace = trace
+        self._inbox = Inbox(settings.name, self._interpretation(settings.interpret_as))
+        self._talk = Conversation(self._inbox)
+        self._supervisor: asyncio.Task[None] | None = None
+        self._opened: asyncio.Future[SmartCamError | None] | None = None
+        self._session: Session | None = None
+        self._jobs: asyncio.TaskGroup | None = None
+        self._turn = asyncio.Lock()  # one command at a time
+        self._leaving: set[asyncio.Task[None]] = set()  # jobs that go back to an application
+        self._going_back_failed: SmartCamError | None = None
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self) -> Self:
+        """Connect; with ``application=`` in the options also have it running and ready.
+
+        Raises:
+            ConnectFailedError: no session; names each attempt and what came.
+            CommandRejectedError: the camera does not have the application.
+            ResponseTimeoutError: it did not become ready within ``switch_timeout``.
+
+        Cancellation: the link is dropped.
+        """
+        if self._supervisor is not None:
+            raise LocalProtocolError(f"{self.name}: opened before; make a new one")
+        self._opened = asyncio.get_running_loop().create_future()
+        self._supervisor = asyncio.create_task(
+            self._supervise(), name=f"smartcam[{self.settings.address.host}].supervisor"
+        )
+        try:
+            await asyncio.wait({self._opened})
+            error = self._opened.result()
+            if error is not None:
+                raise error
+            if self.settings.application is not None:
+                async with self._command(self.settings.switch_timeout) as deadline:
+                    await self._talk.ensure(self.settings.application, deadline)
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def close(self) -> None:
+        """Send Disconnect, end the link, wait for the client's tasks. Idempotent, bounded.
+
+        The camera's run state is left as it is.
+        Cancellation: the link is dropped at once.
+        """
+        self._inbox.fail(self._closed_error())
+        supervisor, session = self._supervisor, self._session
+        try:
+            if session is not None:
+                await session.link.close(self.settings.close_timeout)
+        finally:
+            if supervisor is not None and session is None:
+                supervisor.cancel()
+            if supervisor is not None and supervisor is not asyncio.current_task():
+                await asyncio.wait({supervisor})
+
+    async def __aenter__(self) -> Self:
+        return await self.open()
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    def __await__(self) -> Generator[Any, None, Self]:
+        return self.open().__await__()
+
+    def __repr__(self) -> str:
+        return f"<SmartCamera {self.name} {self.url}>"
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def name(self) -> str:
+        """The camera's name in logs and results."""
+        return self.settings.name
+
+    @property
+    def url(self) -> str:
+        """Its address, with the dialect pinned once it was found out."""
+        address = self._session.address if self._session else self.settings.address
+        return address.url
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a session."""
+        return self._session is not None and self._inbox.end is None
+
+    @property
+    def status(self) -> Status:
+        """The last status the camera sent.
+
+        Raises:
+            ConnectionClosedError: there was no session yet.
+        """
+        if self._inbox.status is None:
+            raise self._closed_error()
+        return self._inbox.status
+
+    @property
+    def active_application(self) -> int | None:
+        """Id of the active application as last told by the camera; None before ``open()``."""
+        return self._inbox.active
+
+    @property
+    def protocol_version(self) -> int | None:
+        """Version from the answer to Connect; None before ``open()``."""
+        return self._session.version if self._session else None
+
+    def statistics(self) -> Statistics:
+        """Return everything counted so far. The accounts balance at any time."""
+        inbox, session = self._inbox, self._session
+        counters = dataclasses.asdict(session.link.machine.counters) if session is not None else {}
+        return dataclasses.replace(
+            Statistics(),
+            received=inbox.received,
+            **inbox.fates,
+            **counters,
+            empty_slots=inbox.empty_slots,
+            overtriggers=inbox.overtriggers,
+            sessions=int(session is not None),
+            last_error=str(inbox.end) if isinstance(inbox.end, ConnectionLostError) else None,
+            subscribers=[s.statistics() for s in inbox.streams() if not s.ended],
+        )
+
+    # ------------------------------------------------------------------ streams and waits
+
+    def results(
+        self,
+        *,
+        min_interval: float = 0.0,
+        max_queue: int = DEFAULT_MAX_QUEUE,
+        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
+    ) -> Subscription[Result]:
+        """Subscribe to everything the camera sends, triggered or not; subscribed when called.
+
+        A container that does not fit its layout is raised from the iterator as
+        :exc:`~smartcam.exceptions.InterpretationError`; the iterator stays usable. Results of
+        another application than the one named are counted, not delivered.
+
+        Args:
+            min_interval: seconds; results that come sooner after the last one are dropped.
+            max_queue: results kept for a slow reader.
+            overflow: what happens beyond that.
+        """
+        stream: Subscription[Result] = self._stream("results", min_interval, max_queue, overflow)
+        self._inbox.result_streams.add(stream)
+        return stream
+
+    def statuses(
+        self,
+        *,
+        min_interval: float = 0.0,
+        max_queue: int = DEFAULT_MAX_QUEUE,
+        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
+    ) -> Subscription[Status]:
+        """Subscribe to every status the camera sends from now on; arguments as in `results`."""
+        stream: Subscription[Status] = self._stream("statuses", min_interval, max_queue, overflow)
+        self._inbox.status_streams.add(stream)
+        return stream
+
+    def events(
+        self,
+        *,
+        max_queue: int = DEFAULT_MAX_QUEUE,
+        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
+    ) -> Subscription[CameraEvent]:
+        """Subscribe to what happens to the camera, in order.
+
+        The events are ``Connected``, ``Disconnected``, ``StatusChanged`` and
+        ``ApplicationChanged``. Subscribe before :meth:`open` to see the first ones.
+        """
+        stream: Subscription[CameraEvent] = self._stream("events", 0.0, max_queue, overflow)
+        self._inbox.event_streams.add(stream)
+        return stream
+
+    async def wait_status(
+        self, predicate: Callable[[Status], bool], timeout: float = 10.0
+    ) -> Status:
+        """Return the first status, the present one included, that ``predicate`` accepts.
+
+        It is shown every status in order, never only the last.
+
+        Raises:
+            ResponseTimeoutError: after ``timeout`` seconds.
+
+        Cancellation: safe.
+        """
+        self._talk.require_link()
+        return await self._talk.until(predicate, self._deadline(timeout), "the status wanted")
+
+    async def wait_ready(self, timeout: float = 10.0) -> Status:
+        """Wait until the camera is not BUSY, and Running if a start was asked for.
+
+        Raises:
+            ResponseTimeoutError: after ``timeout`` seconds.
+
+        Cancellation: safe.
+        """
+        self._talk.require_link()
+        predicate = is_ready if self._talk.wants_running else _is_not_busy
+        return await self._talk.until(predicate, self._deadline(timeout), "the camera to be ready")
+
+    def next_result(
+        self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
+    ) -> Coroutine[Any, Any, Result]:
+        """Wait for the next result, whoever triggers it; registered when called, not when awaited.
+
+        ``waiting = camera.next_result(); start_conveyor(); result = await waiting``
+
+        Args:
+            timeout: seconds from the call.
+
+        Raises:
+            TriggerTimeoutError: nothing came in time.
+            InterpretationError: what came does not fit its layout.
+
+        Cancellation: safe; the result still goes to the streams.
+        """
+        self._talk.require_link()
+        future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
+        self._inbox.next_results.append(future)
+        return self._await_next(future, self._deadline(timeout), timeout)
+
+    # ------------------------------------------------------------------ commands
+
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: object = None,
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+    ) -> Result:
+        """Trigger one inspection and return its result.
+
+        Waits until the camera waits for a trigger, then sends. One trigger at a time: a second
+        caller waits its turn, within its own ``timeout``.
+
+        Args:
+            application: have this application running for this trigger, and go back to the present
+                one afterwards, also after an error or a cancellation. Each switch has
+                ``switch_timeout`` of its own.
+            interpret_as: how to read this result; default as given to :func:`connect`.
+            input: input data for this inspection, sent right before the trigger.
+            timeout: seconds, for the turn, the readiness and the result together.
+            when_busy: ``refuse`` raises CameraBusyError instead of waiting for readiness.
+
+        Raises:
+            NotRunningError: the application is stopped (neither BUSY nor Running).
+            TriggerTimeoutError: no result in time; it says what the status was. An application
+                that runs free never waits for a trigger and ends here.
+            OvertriggeredError: the camera dropped a trigger meanwhile.
+            CameraBusyError: with ``when_busy="refuse"``.
+            CameraFaultError: the camera reports System Error.
+            InputContainerError: with ``input``: it did not belong to this inspection.
+            InterpretationError: the result does not fit its layout.
+            WrongApplicationError: the result is another application's.
+            CommandRejectedError, ResponseTimeoutError: with ``application``: the switch failed.
+
+        Cancellation: safe. A result still under way is made impossible (Stop, Query, Start) before
+        the next trigger, and counted as late if it comes.
+        """
+        interpretation = (
+            self._inbox.interpretation
+            if interpret_as is None
+            else self._interpretation(interpret_as)
+        )
+        wait = when_busy == "wait"
+        data = None if input is None else bytes(input)
+        try:
+            async with self._turn_for(application, timeout) as deadline:
+                return await self._talk.trigger(interpretation, data, deadline, wait=wait)
+        except ResponseTimeoutError as exc:
+            raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
+
+    async def switch_application(self, application: int, *, timeout: float | None = None) -> None:
+        """Load another application; returns when the camera is ready for it.
+
+        A running application is stopped first (the camera demands it) and the new one started.
+        Results are expected from the new application from then on. After a refusal the old one
+        runs again, if it ran, before the error is raised.
+
+        Args:
+            application: its id.
+            timeout: seconds for the whole; default ``switch_timeout``.
+
+        Raises:
+            CommandRejectedError: unknown id, or 0; tells the id that is active.
+            ResponseTimeoutError: the camera did not answer, or stayed BUSY.
+
+        Cancellation: safe; the camera may be in either application, and stopped.
+        Source: SC manual p. 34 (published).
+        """
+        limit = self.settings.switch_timeout if timeout is None else timeout
+        async with self._command(limit) as deadline:
+            await self._talk.switch(application, deadline, start=Status.RUNNING in self.status)
+
+    @contextlib.asynccontextmanager
+    async def application(self, application: int) -> AsyncGenerator[Self]:
+        """Have an application running inside the ``async with``, then go back to the one before.
+
+        Raises:
+            CommandRejectedError, ResponseTimeoutError: as :meth:`switch_application`.
+
+        Cancellation: going back is finished by the client's supervisor; the next call waits for it.
+        """
+        limit = self.settings.switch_timeout
+        async with self._command(limit) as deadline:
+            before = await self._before(deadline)
+            try:
+                await self._talk.ensure(application, deadline)
+            except BaseException:
+                self._go_back(before)
+                raise
+        try:
+            yield self
+        except BaseException:
+            self._go_back(before)
+            raise
+        going_back = self._go_back(before)
+        if going_back is not None:
+            await asyncio.wait({going_back})
+            self._raise_going_back()
+
+    async def start(self, *, timeout: float = 10.0) -> None:
+        """Enter run mode; returns when the camera reports Running and is not BUSY.
+
+        Raises:
+            ResponseTimeoutError: it did not within ``timeout`` seconds.
+
+        Cancellation: safe; the command may have been sent.
+        """
+        async with self._command(timeout) as deadline:
+            await self._talk.start(deadline)
+
+    async def stop(self, *, timeout: float = 10.0) -> None:
+        """Leave run mode; returns when the camera no longer reports Running.
+
+        An inspection under way is voided (inferred).
+
+        Raises:
+            ResponseTimeoutError: it did not within ``timeout`` seconds.
+
+        Cancellation: safe; the command may have been sent.
+        """
+        async with self._command(timeout) as deadline:
+            await self._talk.stop(deadline)
+
+    async def query_application(self, *, timeout: float | None = None) -> int:
+        """Ask the camera which application is active.
+
+        Raises:
+            ResponseTimeoutError: no answer; the link is given up, since a later answer could pass
+                for the next one's.
+
+        Cancellation: safe; the answer is dropped when it comes.
+        """
+        limit = self.settings.request_timeout if timeout is None else timeout
+        return await self._talk.query(self._deadline(limit))
+
+    async def get_clock(self, *, timeout: float | None = None) -> datetime:
+        """Return the camera's clock: a naive datetime, since it carries no time zone.
+
+        Raises:
+            ResponseTimeoutError: no answer; the link is given up.
+            InterpretationError: what came is no date.
+
+        Cancellation: safe; the answer is dropped when it comes.
+        """
+        limit = self.settings.request_timeout if timeout is None else timeout
+        clock = await self._talk.ask(m.GetClock(), m.ClockAnswer, self._deadline(limit))
+        fields = (clock.year, clock.month, clock.day, clock.hour, clock.minute, clock.second)
+        try:
+            return datetime(*fields)  # noqa: DTZ001 - the camera's clock has no zone
+        except (ValueError, OverflowError) as exc:
+            raise InterpretationError(
+                f"{self.name}: the camera's clock is no date: {fields}",
+                field="clock",
+                expected="a date and time",
+                got=fields,
+            ) from exc
+
+    async def set_clock(self, when: datetime) -> None:
+        """Set the camera's clock to the fields of ``when``; nothing confirms it.
+
+        Source: mvBlueGEMINI manual p. 29 (published, sibling): invalid values may be dropped.
+        """
+        await self._tell(
+            m.SetClock(
+                year=when.year,
+                month=when.month,
+                day=when.day,
+                hour=when.hour,
+                minute=when.minute,
+                second=when.second,
+            )
+        )
+
+    async def set_input(self, data: bytes) -> None:
+        """Send input data for the next inspection; nothing confirms it.
+
+        ``trigger(input=...)`` binds data to its own trigger. The camera queues containers against
+        inspections; the Input Container bit says when they are out of step.
+        """
+        await self._tell(m.SetInput(data=bytes(data)))
+
+    async def set_sequence_number(self, number: int) -> None:
+        """Set the number of the next run (0 to 4294967295); nothing confirms it.
+
+        Raises:
+            LocalProtocolError: the number does not fit.
+        """
+        await self._tell(m.SetSequenceNumber(number=number))
+
+    async def reboot(self) -> None:
+        """Restart the camera; returns when the command is written.
+
+        The link is lost then, and the camera is away for about 30 seconds (published for a
+        sibling). It comes back with the last application, stopped.
+        """
+        await self._tell(m.Reboot())
+
+    async def request(
+        self,
+        message_id: int,
+        payload: bytes = b"",
+        *,
+        answered: bool | None = None,
+        timeout: float | None = None,
+    ) -> bytes | None:
+        """Send any message; the escape hatch for what has no method here.
+
+        Args:
+            message_id: its id.
+            payload: its body.
+            answered: whether an answer under the same id is expected; by default what the message
+                table says, True for an unknown id.
+            timeout: seconds for the answer.
+
+        Returns:
+            The answer's body, None where no answer is expected: returned once written.
+
+        Raises:
+            LocalProtocolError: Connect and Disconnect (sessions are the client's own).
+            ResponseTimeoutError: no answer; the link is given up.
+
+        Cancellation: safe; the answer is dropped when it comes.
+        """
+        dialect = self._talk.require_link().machine.dialect
+        message: m.Message = m.UnknownMessage(message_id=message_id, payload=bytes(payload))
+        with contextlib.suppress(SmartCamError):
+            message = dialect.decode(m.Sender.CLIENT, Frame(message_id, bytes(payload)))
+        if isinstance(message, (m.Connect, m.Disconnect)):
+            raise LocalProtocolError(f"{self.name}: the session is the client's own")
+        answer_id = dialect.answer_id(message_id)
+        expected = answer_id is not None if answered is None else answered
+        if not expected:
+            await self._tell(message)
+            return None
+        key = dialect.message_type(m.Sender.CAMERA, message_id)
+        limit = self.settings.request_timeout if timeout is None else timeout
+        answer = await self._talk.exchange(
+            message, message_id if key is m.UnknownMessage else key, self._deadline(limit)
+        )
+        return dialect.to_frame(answer).payload
+
+    # ------------------------------------------------------------------ the supervisor
+
+    async def _supervise(self) -> None:
+        """Make the session, read the link to its end, tell everybody."""
+        error: SmartCamError = self._closed_error()
+        try:
+            session = await establish(self.settings, self._trace)
+            self._adopt(session)
+            async with asyncio.TaskGroup() as self._jobs:
+                self._tell_opener(None)
+                error = await self._read(session.link)
+                self._inbox.fail(error)  # ends the jobs' waits too
+        except SmartCamError as exc:
+            error = exc
+        except Exception as exc:  # nobody must wait for a dead supervisor
+            logger.exception("%s ! the supervisor failed", self.name)
+            error = ConnectionLostError(f"{self.name}: {exc!r} in the client")
+            error.__cause__ = exc
+        finally:
+            self._jobs = None
+            self._inbox.fail(error)
+            if self._session is not None:
+                self._session.link.abort()
+            self._tell_opener(error)
+
+    def _tell_opener(self, error: SmartCamError | None) -> None:
+        if self._opened is not None and not self._opened.done():
+            self._opened.set_result(error)
+
+    def _adopt(self, session: Session) -> None:
+        self._session, self._talk.link = session, session.link
+        logger.info("%s = connected to %s", self.name, session.address.url)
+        self._inbox.publish(
+            Connected(camera=self.name, at=datetime.now(UTC), url=session.address.url)
+        )
+        for chunk in session.early:
+            self._inbox.dispatch(chunk)
+
+    async def _read(self, link: Link) -> SmartCamError:
+        """Dispatch chunks until the link ends; return why it did."""
+        try:
+            while True:
+                self._inbox.dispatch(await link.receive())
+        except ConnectionLostError as error:
+            ours = isinstance(self._inbox.end, ConnectionClosedError)
+            reason = "closed by this side" if ours else str(error.__cause__)
+            if not ours:
+                logger.warning("%s ! %s", self.name, error)
+            self._inbox.publish(
+                Disconnected(camera=self.name, at=datetime.now(UTC), reason=reason, expected=ours)
+            )
+            return error
+
+    # ------------------------------------------------------------------ turns and going back
+
+    @contextlib.asynccontextmanager
+    async def _command(self, timeout: float) -> AsyncGenerator[float]:
+        """Hold the turn; gives the deadline, the wait for the turn included."""
+        deadline = self._deadline(timeout)
+        self._talk.require_link()
+        try:
+            async with asyncio.timeout_at(deadline):
+                while self._leaving:
+                    await asyncio.wait(self._leaving)
+                await self._turn.acquire()
+        except TimeoutError as exc:
+            raise ResponseTimeoutError(
+                f"{self.name}: another command had the camera for {timeout:g} s", waited=timeout
+            ) from exc
+        try:
+            self._raise_going_back()
+            yield deadline
+        finally:
+            self._turn.release()
+
+    @contextlib.asynccontextmanager
+    async def _turn_for(self, application: int | None, timeout: float) -> AsyncGenerator[float]:
+        """Hold the turn, in ``application`` if one is given; gives the deadline."""
+        if application is None:
+            async with self._command(timeout) as deadline:
+                yield deadline
+            return
+        limit = self.settings.switch_timeout
+        async with self._command(limit) as switch_deadline:
+            before = await self._before(switch_deadline)
+            try:
+                await self._talk.ensure(application, switch_deadline)
+                yield self._deadline(timeout)
+            finally:
+                going_back = self._go_back(before)
+        if going_back is not None:
+            await asyncio.wait({going_back})
+
+    async def _before(self, deadline: float) -> _Before:
+        running = Status.RUNNING in self.status
+        return _Before(await self._talk.query(deadline), running, self._inbox.expected)
+
+    def _go_back(self, before: _Before) -> asyncio.Task[None] | None:
+        """Let the supervisor go back to ``before``; later commands wait for it."""
+        if self._jobs is None or self._inbox.end is not None:
+            return None
+        job = self._jobs.create_task(
+            self._going_back(before), name=f"smartcam[{self.name}].going_back"
+        )
+        self._leaving.add(job)
+        job.add_done_callback(self._leaving.discard)
+        return job
+
+    async def _going_back(self, before: _Before) -> None:
+        """Restore application and run state within ``switch_timeout``; never raises."""
+        talk = self._talk
+        async with self._turn:
+            deadline = self._deadline(self.settings.switch_timeout)
+            try:
+                if await talk.query(deadline) != before.application:
+                    await talk.switch(before.application, deadline, start=before.running)
+                elif before.running and Status.RUNNING not in self.status:
+                    await talk.start(deadline)
+                elif not before.running and Status.RUNNING in self.status:
+                    await talk.stop(deadline)
+            except SmartCamError as error:
+                logger.warning("%s ! going back failed: %s", self.name, error)
+                self._going_back_failed = error
+            finally:
+                self._inbox.expected = before.expected
+
+    def _raise_going_back(self) -> None:
+        error, self._going_back_failed = self._going_back_failed, None
+        if error is not None:
+            raise error
+
+    # ------------------------------------------------------------------ small helpers
+
+    def _deadline(self, timeout: float) -> float:
+        if not 0 <= timeout < float("inf"):
+            raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
+        return asyncio.get_running_loop().time() + timeout
+
+    async def _tell(self, message: m.Message) -> None:
+        await self._talk.tell(message, self._deadline(self.settings.request_timeout))
+
+    def _interpretation(self, spec: object) -> Interpretation:
+        return Interpretation(spec, lenient=self.settings.lenient, y_down=self.settings.y_down)
+
+    def _stream(self, name: str, min_interval: float, max_queue: int, overflow: str) -> Any:
+        stream: Subscription[Any] = Subscription(
+            name, max_queue=max_queue, overflow=overflow, min_interval=min_interval
+        )
+        if self._inbox.end is not None:
+            ours = isinstance(self._inbox.end, ConnectionClosedError)
+            stream.end(None if ours else self._inbox.end)
+        return stream
+
+    async def _await_next(
+        self, future: asyncio.Future[Result], deadline: float, timeout: float
+    ) -> Result:
+        try:
+            async with asyncio.timeout_at(deadline):
+                return await future
+        except TimeoutError as exc:
+            if future.done() and not future.cancelled():
+                return future.result()
+            raise TriggerTimeoutError(
+                f"{self.name}: no result came within {timeout:g} s; "
+                f"status: {self.status.describe()}",
+                waited=timeout,
+            ) from exc
+        finally:
+            if future in self._inbox.next_results:
+                self._inbox.next_results.remove(future)
+
+    def _closed_error(self) -> ConnectionClosedError:
+        address = self.settings.address
+        state = "closed" if self._supervisor is not None else "not opened yet"
+        return ConnectionClosedError(
+            f"{self.name}: the connection is {state}", host=address.host, port=address.port
+        )
+
+
+def _is_not_busy(status: Status) -> bool:
+    return Status.BUSY not in status

@@ -1,0 +1,352 @@
+"""One TCP or UDP link to a camera, used once.
+
+The transport hands bytes to the machine of ``protocols/`` and puts what comes out, a chunk of
+events per delivery, into one bounded queue; the client's receive task takes chunks out of it. There
+is no task switch per message.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import logging
+import socket
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
+from smartcam.models import jsonable
+from smartcam.protocols.base import Dialect, Role, Transport
+from smartcam.protocols.machine import Event, LinkFailed, Machine, State
+from smartcam.protocols.messages import Disconnect, Message, Sender, wire_fields
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.protocols.framing import Frame
+
+__all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
+
+logger = logging.getLogger("smartcam.connection")
+
+MAX_CHUNKS = 256
+"""Chunks that wait for the receive task. It only hands events on and never waits, so a few are
+normal; beyond this TCP stops reading and UDP drops, which is counted."""
+
+
+class Chunk(NamedTuple):
+    """Events that one delivery of bytes gave, and the loop time when it came."""
+
+    received_at: float
+    events: list[Event]
+
+
+class TraceEntry(NamedTuple):
+    """One frame as ``--trace`` writes it.
+
+    Attributes:
+        at: when, UTC.
+        camera: name of the camera.
+        direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol.
+        message_id: id on the wire, None for broken bytes.
+        message: name of the message, or the error's text for broken bytes.
+        fields: decoded body, None where it cannot be decoded.
+        hex: the bytes.
+    """
+
+    at: datetime
+    camera: str
+    direction: str
+    message_id: int | None
+    message: str
+    fields: Any
+    hex: str
+
+
+class Link(asyncio.Protocol, asyncio.DatagramProtocol):
+    """One link. Made by :func:`open_link`; when it ends, a new one is made.
+
+    Args:
+        machine: the protocol's client side.
+        name: the camera's name, for logs and errors.
+        host: address of the camera.
+        port: its port.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        *,
+        name: str,
+        host: str,
+        port: int,
+    ) -> None:
+        self.machine = machine
+        self.name = name
+        self.host = host
+        self.port = port
+        self._loop = asyncio.get_running_loop()
+        self._transport: Any = None
+        self._chunks: collections.deque[Chunk] = collections.deque()
+        self._wakeup: asyncio.Future[None] | None = None
+        self._closed: asyncio.Future[None] = self._loop.create_future()
+        self._loss: BaseException | None = None
+        self._writable = asyncio.Event()
+        self._writable.set()
+        self._closing = False
+        self._paused = False
+
+    # ------------------------------------------------------------------ for the client
+
+    def send(self, *messages: Message) -> None:
+        """Write messages at once: one write on TCP, a datagram each on UDP.
+
+        Raises:
+            LocalProtocolError: the protocol's state forbids one; those before it were written.
+            ConnectionLostError: the link is gone.
+        """
+        if self._closed.done() or self._loss is not None:
+            raise self._lost_error()
+        try:
+            for message in messages:
+                self.machine.send(message)
+        finally:
+            self._flush()
+
+    async def drain(self) -> None:
+        """Wait until the transport takes more; bounded by the caller's deadline."""
+        await self._writable.wait()
+
+    async def receive(self) -> Chunk:
+        """Return the next chunk; waits without a bound, the reader's life is the link's.
+
+        Raises:
+            ConnectionLostError: the link is gone and every chunk was taken.
+
+        Cancellation: safe, nothing is lost.
+        """
+        while not self._chunks:
+            if self._loss is not None:
+                raise self._lost_error()
+            self._wakeup = self._loop.create_future()
+            try:
+                await self._wakeup
+            finally:
+                self._wakeup = None
+        chunk = self._chunks.popleft()
+        if self._paused and len(self._chunks) < MAX_CHUNKS // 2:
+            self._paused = False
+            self._transport.resume_reading()
+        return chunk
+
+    async def close(self, timeout: float) -> None:
+        """Send Disconnect, end the link in order, within ``timeout`` seconds; else abort it.
+
+        On TCP the sending side is closed first and the camera's end awaited: closing a socket with
+        unread bytes in it sends a reset, which can overtake the Disconnect.
+        Cancellation: aborts the link.
+        """
+        self._closing = True
+        try:
+            if self._transport is None or self._closed.done():
+                return
+            self._say_goodbye()
+            if self.machine.transport is Transport.UDP:
+                self._transport.close()
+            elif not self._transport.is_closing():
+                self._resume()
+                self._transport.write_eof()
+            await asyncio.wait({self._closed}, timeout=timeout)
+        finally:
+            self.abort()
+
+    def abort(self, reason: BaseException | None = None) -> None:
+        """Drop the link at once; ``reason`` is what readers are told."""
+        self._lose(reason or ConnectionAbortedError("closed by this side"))
+        if self._transport is not None:
+            self._transport.abort()
+
+    def give_up(self, reason: BaseException) -> None:
+        """Drop the link at once, but say Disconnect first where there is a session."""
+        if self._transport is not None and not self._transport.is_closing():
+            self._say_goodbye()
+        self.abort(reason)
+
+    @property
+    def peer(self) -> str:
+        """``host:port`` of the camera."""
+        return f"{self.host}:{self.port}"
+
+    # ------------------------------------------------------------------ transport callbacks
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """asyncio: the link is open."""
+        self._transport = transport
+        sock = transport.get_extra_info("socket")
+        if sock is not None and self.machine.transport is Transport.TCP:
+            # the camera sets it and advises it (SC manual p. 40: published)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def data_received(self, data: bytes) -> None:
+        """asyncio: bytes of a TCP link."""
+        self.machine.receive_data(data)
+        self._enqueue()
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        """asyncio: a datagram of a UDP link."""
+        if len(self._chunks) >= MAX_CHUNKS:
+            self.machine.counters.ignored_frames += 1
+            return
+        self.machine.receive_data(data)
+        self._enqueue()
+
+    def eof_received(self) -> None:
+        """asyncio: the camera will send no more."""
+        self.machine.receive_eof()
+        self._enqueue()
+
+    def error_received(self, exc: Exception) -> None:
+        """asyncio: the system refused a datagram: nothing listens there."""
+        self._lose(exc)
+        self._transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """asyncio: the link is over."""
+        self._lose(exc or ConnectionResetError("the camera closed the connection"))
+        if not self._closed.done():
+            self._closed.set_result(None)
+
+    def pause_writing(self) -> None:
+        """asyncio: the send buffer is full."""
+        self._writable.clear()
+
+    def resume_writing(self) -> None:
+        """asyncio: the send buffer has room again."""
+        self._writable.set()
+
+    # ------------------------------------------------------------------ inside
+
+    def _flush(self) -> None:
+        frames = self.machine.data_to_send()
+        if not frames:
+            return
+        if self.machine.transport is Transport.UDP:
+            for frame in frames:
+                self._transport.sendto(frame)
+        else:
+            self._transport.write(b"".join(frames))
+
+    def _say_goodbye(self) -> None:
+        if self.machine.state in {State.CONNECTED, State.CONNECTING}:
+            self.machine.send(Disconnect())
+            self._flush()
+
+    def _enqueue(self) -> None:
+        events = self.machine.events()
+        if not events or self._closing:
+            return
+        self._chunks.append(Chunk(self._loop.time(), events))
+        last = events[-1]
+        if isinstance(last, LinkFailed):
+            self._lose(last.error)
+            self._transport.abort()
+        elif (
+            len(self._chunks) >= MAX_CHUNKS
+            and not self._paused
+            and self.machine.transport is Transport.TCP
+        ):
+            self._paused = True
+            self._transport.pause_reading()
+        self._wake()
+
+    def _resume(self) -> None:
+        if self._paused:
+            self._paused = False
+            self._transport.resume_reading()
+
+    def _lose(self, reason: BaseException) -> None:
+        if self._loss is None:
+            self._loss = reason
+        self._writable.set()
+        self._wake()
+
+    def _wake(self) -> None:
+        if self._wakeup is not None and not self._wakeup.done():
+            self._wakeup.set_result(None)
+
+    def _lost_error(self) -> ConnectionLostError:
+        error = ConnectionLostError(
+            f"{self.name}: the link to {self.peer} is gone: {self._loss}",
+            host=self.host,
+            port=self.port,
+        )
+        error.__cause__ = self._loss
+        return error
+
+
+async def open_link(
+    dialect: Dialect,
+    transport: Transport,
+    host: str,
+    port: int,
+    *,
+    name: str,
+    max_length: int,
+    trace: Callable[[TraceEntry], None] | None = None,
+) -> Link:
+    """Open a link; bounded by the caller's deadline.
+
+    Raises:
+        OSError: the name does not resolve, nothing listens, no way to the host.
+    """
+    loop = asyncio.get_running_loop()
+    tracer = _tracer(name, dialect, trace)
+    machine = Machine(dialect, Role.CLIENT, transport, max_length=max_length, trace=tracer)
+    link = Link(machine, name=name, host=host, port=port)
+    if transport is Transport.TCP:
+        await loop.create_connection(lambda: link, host, port)
+    else:
+        await loop.create_datagram_endpoint(lambda: link, remote_addr=(host, port))
+    return link
+
+
+def _tracer(
+    name: str, dialect: Dialect, trace: Callable[[TraceEntry], None] | None
+) -> Callable[[Sender, Frame | RemoteProtocolError], None] | None:
+    debug = logger.isEnabledFor(logging.DEBUG)
+    if trace is None and not debug:
+        return None
+
+    def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
+        if isinstance(frame, RemoteProtocolError):
+            entry = TraceEntry(
+                datetime.now(UTC), name, "!", None, str(frame), None, frame.data.hex()
+            )
+        else:
+            entry = _trace_entry(name, dialect, sender, frame)
+        if debug:
+            logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
+        if trace is not None:
+            trace(entry)
+
+    return on_frame
+
+
+def _trace_entry(name: str, dialect: Dialect, sender: Sender, frame: Frame) -> TraceEntry:
+    fields = None
+    try:
+        message = dialect.decode(sender, frame)
+    except RemoteProtocolError:
+        pass  # its error follows as an entry of its own
+    else:
+        names = [field for field, _ in wire_fields(type(message))]
+        fields = {field: jsonable(getattr(message, field)) for field in names}
+    return TraceEntry(
+        at=datetime.now(UTC),
+        camera=name,
+        direction=">" if sender is Sender.CLIENT else "<",
+        message_id=frame.message_id,
+        message=dialect.message_type(sender, frame.message_id).__name__,
+        fields=fields,
+        hex=dialect.encode_frame(frame).hex(),
+    )

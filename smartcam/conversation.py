@@ -1,0 +1,358 @@
+"""Steps of a conversation with the camera: a few messages out, then a wait with a deadline.
+
+The wire has no correlation: an answer is matched by its kind, at most one request of a kind is
+open, and one that was cancelled leaves an owed answer which the next request of that kind awaits
+first. An answer that never comes leaves the link untrustworthy, so it is given up.
+
+Every ``deadline`` is loop time. The turn (one command at a time) is the client's business.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, TypeVar
+
+from smartcam.exceptions import (
+    CameraBusyError,
+    CameraFaultError,
+    CommandRejectedError,
+    ConfigurationError,
+    ConnectionClosedError,
+    NotRunningError,
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.inbox import Inbox, PendingTrigger
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.connection import Link
+    from smartcam.interpretation import Interpretation
+    from smartcam.models import Result
+
+__all__ = ["Conversation"]
+
+AnswerT = TypeVar("AnswerT", bound=m.Message)
+
+MAX_APPLICATION_ID = 0xFFFFFFFF
+
+
+def is_ready(status: Status) -> bool:
+    """Running and not BUSY."""
+    return Status.RUNNING in status and Status.BUSY not in status
+
+
+def is_stopped(status: Status) -> bool:
+    """Neither Running nor BUSY."""
+    return not status & (Status.RUNNING | Status.BUSY)
+
+
+def takes_trigger(status: Status) -> bool:
+    """The camera waits for a trigger and is not BUSY."""
+    return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
+
+
+class Conversation:
+    """What is said to the camera over one session, step by step.
+
+    Args:
+        inbox: the receiving half.
+    """
+
+    def __init__(self, inbox: Inbox) -> None:
+        self.inbox = inbox
+        self.name = inbox.name
+        self.link: Link | None = None
+        self.wants_running = False
+        self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
+
+    def require_link(self) -> Link:
+        """Return the link.
+
+        Raises:
+            LinkError: there is none, and why.
+        """
+        if self.inbox.end is not None:
+            raise self.inbox.end
+        if self.link is None:
+            raise ConnectionClosedError(f"{self.name}: not connected: open it first")
+        return self.link
+
+    @property
+    def status(self) -> Status:
+        """The last status; there is one since the session was made."""
+        return self.inbox.status or Status(0)
+
+    # ------------------------------------------------------------------ say and wait
+
+    async def tell(self, message: m.Message, deadline: float) -> None:
+        """Send what the camera never answers; returns once written.
+
+        Raises:
+            ResponseTimeoutError: the camera takes no bytes.
+        """
+        link = self.require_link()
+        link.send(message)
+        try:
+            async with asyncio.timeout_at(deadline):
+                await link.drain()
+        except TimeoutError as exc:
+            error = ResponseTimeoutError(
+                f"{self.name}: the camera takes no more bytes; {type(message).__name__} is stuck"
+            )
+            link.give_up(error)
+            raise error from exc
+
+    async def ask(self, message: m.Message, answer: type[AnswerT], deadline: float) -> AnswerT:
+        """Send a request and return its answer, which may come among statuses and results.
+
+        Raises:
+            ResponseTimeoutError: it did not come; the link is given up.
+        """
+        got = await self.exchange(message, answer, deadline)
+        if not isinstance(got, answer):
+            raise RemoteProtocolError(f"{self.name}: {got} came, {answer.__name__} was expected")
+        return got
+
+    async def exchange(
+        self, message: m.Message, key: type[m.Message] | int, deadline: float
+    ) -> m.Message:
+        """Send a request and return the answer registered under ``key``; as :meth:`ask`."""
+        lock = self._locks[key]
+        try:
+            async with asyncio.timeout_at(deadline):
+                await lock.acquire()
+        except TimeoutError as exc:
+            raise self._overdue(message, deadline) from exc
+        try:
+            await self._await_owed(key, message, deadline)
+            link = self.require_link()
+            link.send(message)
+            return await self._await_answer(self.inbox.next_answer(key), message, deadline)
+        finally:
+            lock.release()
+
+    async def until(
+        self, predicate: Callable[[Status], bool], deadline: float, what: str
+    ) -> Status:
+        """Wait for a status.
+
+        Raises:
+            ResponseTimeoutError: says what was waited for and what the status is.
+        """
+        begin = asyncio.get_running_loop().time()
+        try:
+            return await self.inbox.wait_status(predicate, deadline)
+        except TimeoutError as exc:
+            waited = max(0.0, deadline - begin)
+            raise ResponseTimeoutError(
+                f"{self.name}: waited {waited:.1f} s for {what}; status: {self.status.describe()}",
+                waited=waited,
+            ) from exc
+
+    # ------------------------------------------------------------------ run state, application
+
+    async def start(self, deadline: float) -> None:
+        """Enter run mode and wait until the camera reports it."""
+        self.wants_running = True
+        await self.tell(m.Start(), deadline)
+        await self.until(is_ready, deadline, "Running and not BUSY after Start")
+
+    async def stop(self, deadline: float) -> None:
+        """Leave run mode and wait until the camera reports it."""
+        self.wants_running = False
+        await self.tell(m.Stop(), deadline)
+        await self.until(
+            lambda status: Status.RUNNING not in status, deadline, "not Running after Stop"
+        )
+
+    async def query(self, deadline: float) -> int:
+        """Return the active application.
+
+        During a switch a Query tells the old id, so an owed switch answer is awaited first.
+        """
+        await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
+        return (await self.ask(m.Query(), m.QueryAnswer, deadline)).application
+
+    async def ensure(self, application: int, deadline: float) -> None:
+        """Have an application running and ready, by the least that is needed."""
+        if await self.query(deadline) != application:
+            await self.switch(application, deadline, start=True)
+            return
+        self.inbox.expected = application
+        if Status.RUNNING not in self.status:
+            await self.start(deadline)
+        self.wants_running = True
+        await self.until(is_ready, deadline, "Running and not BUSY")
+
+    async def switch(self, application: int, deadline: float, *, start: bool) -> None:
+        """Stop if need be, switch, wait until not BUSY, start if wanted.
+
+        Raises:
+            CommandRejectedError: the camera refused; the old application runs again if it ran.
+        """
+        if not 0 <= application <= MAX_APPLICATION_ID:
+            raise ConfigurationError(
+                f"{self.name}: application id {application} is not 0 to {MAX_APPLICATION_ID}"
+            )
+        was_running = Status.RUNNING in self.status
+        if application == 0:
+            # Never allowed, several applications may carry it (SC manual p. 34, published): so
+            # nothing is stopped for it.
+            code, active = 1, await self.query(deadline)
+        else:
+            if was_running:
+                await self.stop(deadline)
+            request = m.SwitchApplication(application=application)
+            answer = await self.ask(request, m.SwitchAnswer, deadline)
+            self.inbox.debt = None  # stopped, and the answer came behind whatever was under way
+            code, active = answer.code, answer.application
+        if code != 0 or active != application:
+            if was_running and Status.RUNNING not in self.status:
+                await self.start(deadline)
+            raise CommandRejectedError(
+                f"{self.name}: the camera refused to switch to application {application} "
+                f"(status {code}); application {active} is active",
+                message_id=self.require_link().machine.dialect.message_id(m.SwitchApplication),
+                code=code,
+                active_application=active,
+            )
+        await self.until(lambda status: Status.BUSY not in status, deadline, "not BUSY")
+        if start:
+            await self.start(deadline)
+
+    # ------------------------------------------------------------------ trigger
+
+    async def trigger(
+        self,
+        interpretation: Interpretation,
+        input_data: bytes | None,
+        deadline: float,
+        *,
+        wait: bool,
+    ) -> Result:
+        """Wait until the camera takes a trigger, send it, return the result.
+
+        Raises:
+            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
+        """
+        inbox, loop = self.inbox, asyncio.get_running_loop()
+        if inbox.debt is not None:
+            await self._settle_debt(deadline)
+        await self._wait_for_trigger(deadline, wait=wait)
+        link = self.require_link()
+        outcome: asyncio.Future[Result] = loop.create_future()
+        sent_at = loop.time()
+        inbox.pending = PendingTrigger(
+            outcome, interpretation, input_data is not None, sent_at, datetime.now(UTC)
+        )
+        try:
+            if input_data is not None:
+                link.send(m.SetInput(data=input_data), m.Trigger())
+            else:
+                link.send(m.Trigger())
+            async with asyncio.timeout_at(deadline):
+                await link.drain()
+                return await outcome
+        except TimeoutError as exc:
+            if outcome.done() and not outcome.cancelled():
+                return outcome.result()
+            inbox.debt = "late"
+            waited = deadline - sent_at
+            raise TriggerTimeoutError(
+                f"{self.name}: no result within {waited:.2g} s of the trigger; "
+                f"status: {self.status.describe()}",
+                waited=waited,
+            ) from exc
+        except asyncio.CancelledError:
+            if not outcome.done() or outcome.cancelled():
+                inbox.debt = "late"
+            raise
+        finally:
+            inbox.pending = None
+
+    async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
+        """Wait until the camera takes a trigger, or say why it never will."""
+        begin = asyncio.get_running_loop().time()
+        while True:
+            status = self.status
+            if Status.SYSTEM_ERROR in status:
+                raise CameraFaultError(f"{self.name}: the camera reports System Error")
+            if takes_trigger(status):
+                return
+            if is_stopped(status):
+                raise NotRunningError(
+                    f"{self.name}: application {self.inbox.active} is stopped: start it, or name "
+                    f"it so that it is started; status: {status.describe()}"
+                )
+            if not wait:
+                raise CameraBusyError(
+                    f"{self.name}: the camera does not wait for a trigger: {status.describe()}"
+                )
+            try:
+                await self.inbox.wait_status(_is_decided, deadline)
+            except TimeoutError as exc:
+                free = "; an application that runs free never does" if is_ready(status) else ""
+                waited = max(0.0, deadline - begin)
+                raise TriggerTimeoutError(
+                    f"{self.name}: the camera did not wait for a trigger within {waited:.2g} s; "
+                    f"status: {self.status.describe()}{free}",
+                    waited=waited,
+                ) from exc
+
+    async def _settle_debt(self, deadline: float) -> None:
+        """Make a result that may still come impossible: Stop voids it, a Query is the fence.
+
+        Source: that Stop voids the inspection under way is inferred. What comes before the
+        Query's answer came from before.
+        """
+        if Status.RUNNING in self.status:
+            await self.stop(deadline)
+            await self.query(deadline)
+            await self.start(deadline)
+        self.inbox.debt = None
+
+    # ------------------------------------------------------------------ answers
+
+    async def _await_owed(
+        self, key: type[m.Message] | int, message: m.Message, deadline: float
+    ) -> None:
+        owed = self.inbox.answers.get(key)
+        if owed is not None:
+            await self._await_answer(owed, message, deadline)
+
+    async def _await_answer(
+        self, answer: asyncio.Future[m.Message | SmartCamError], message: m.Message, deadline: float
+    ) -> m.Message:
+        # asyncio.wait leaves the future alone when this task is cancelled: the answer stays owed
+        loop = asyncio.get_running_loop()
+        await asyncio.wait({answer}, timeout=max(0.0, deadline - loop.time()))
+        if not answer.done():
+            error = self._overdue(message, deadline)
+            if self.link is not None:
+                self.link.give_up(error)
+            raise error
+        got = answer.result()
+        if isinstance(got, SmartCamError):
+            raise got
+        return got
+
+    def _overdue(self, message: m.Message, deadline: float) -> ResponseTimeoutError:
+        link = self.require_link()
+        message_id = link.machine.dialect.message_id(message)
+        return ResponseTimeoutError(
+            f"{self.name}: no answer to {type(message).__name__} ({message_id:#04x}) in time; "
+            f"status: {self.status.describe()}",
+            message_id=message_id,
+        )
+
+
+def _is_decided(status: Status) -> bool:
+    return takes_trigger(status) or is_stopped(status) or Status.SYSTEM_ERROR in status

@@ -1,0 +1,93 @@
+"""What is not known about real cameras, as options.
+
+Each field is one open question: its default is what the emulator does, its description says why and
+how well that is founded. Grades: *published* in a manual of this product or a sibling, *inferred*,
+*recommended* (nothing is known; some choice had to be made).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["Quirks"]
+
+_Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+
+
+class Quirks(BaseModel):
+    """Behaviour that the documents leave open. Times are seconds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    switch_while_running: Literal["refuse", "ignore", "allow"] = Field(
+        "refuse",
+        description=(
+            "A switch while the application runs: refused with code 1, not answered, or done. "
+            "The application must be stopped first (SC manual p. 34, published); what happens "
+            "otherwise is unknown (refuse: recommended)."
+        ),
+    )
+    switch_answer: Literal["after_status", "before_status"] = Field(
+        "after_status",
+        description=(
+            "Whether the answer to a switch comes after or before the status in which BUSY has "
+            "fallen. The answer comes after the switch (SC manual p. 34, published); its order "
+            "with the status is unknown (after_status: recommended)."
+        ),
+    )
+    waiting_before_result: bool = Field(
+        False,
+        description=(
+            "Whether Waiting for Trigger rises before the result is sent. The order is unknown "
+            "(result first: recommended)."
+        ),
+    )
+    busy_while_processing: bool = Field(
+        False,
+        description=(
+            "Whether BUSY is set during an inspection. Published only for the time of a switch "
+            "(SC manual p. 33); during an inspection unknown (off: recommended)."
+        ),
+    )
+    bad_frame: Literal["skip", "close"] = Field(
+        "skip",
+        description=(
+            "TCP: after a wrong magic number or an impossible length, skip to the next magic "
+            "number or close the connection. Invalid messages are ignored (SC manual p. 28, "
+            "published); how a stream goes on is unknown (skip: recommended)."
+        ),
+    )
+    second_client: Literal["takeover", "refuse"] = Field(
+        "takeover",
+        description=(
+            "TCP: a Connect while another client has the session takes the session over, or the "
+            "newcomer's connection is closed without an answer. On UDP the newcomer wins (SC "
+            "manual p. 28, published), whatever stands here; on TCP unknown (takeover: inferred)."
+        ),
+    )
+    overtriggered_time: _Seconds = Field(
+        0.1,
+        description=(
+            "How long Overtriggered stays set after the last dropped trigger. It falls by itself "
+            "(SC manual p. 30, published); the duration is unknown (0.1: recommended)."
+        ),
+    )
+    input_queue_depth: int = Field(
+        8,
+        ge=1,
+        le=1024,
+        description=(
+            "Input containers that are kept. They are queued, and one more drops one (SC manual "
+            "p. 30, published); the depth is unknown, and so is which one is dropped (8, the "
+            "oldest: recommended)."
+        ),
+    )
+    reboot_time: _Seconds = Field(
+        30.0,
+        description=(
+            "How long a reboot keeps the camera off the network: about 30 s (mvBlueGEMINI manual "
+            "p. 31, published for the sibling)."
+        ),
+    )

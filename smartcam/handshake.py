@@ -1,0 +1,230 @@
+"""Making a session: fresh links, one after the other, until one answers as a camera does.
+
+Each attempt sends Disconnect (harmless without a session; old sessions confuse the camera, thesis
+3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
+Query. Anything unexpected, silence included, ends the attempt: close, fresh link, next attempt.
+Where no dialect is pinned, attempts take turns through the protocol's dialects.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.connection import Chunk, Link, open_link
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectFailedError,
+    RemoteProtocolError,
+    SmartCamError,
+)
+from smartcam.protocols.base import Dialect, Protocol, Transport
+from smartcam.protocols.machine import LinkEnded, LinkFailed
+from smartcam.protocols.messages import (
+    Connect,
+    ConnectAnswer,
+    Disconnect,
+    Query,
+    QueryAnswer,
+    ResultContainer,
+    StatusReport,
+)
+from smartcam.registry import PROTOCOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.connection import TraceEntry
+    from smartcam.settings import Address, CameraSettings
+
+__all__ = ["Session", "Try", "attempt", "establish", "load_protocol"]
+
+logger = logging.getLogger("smartcam.handshake")
+
+DETECTION_SHARE = 1.0
+"""Seconds that a dialect gets in the first round while others are still untried. A camera answers
+in milliseconds, one that speaks another dialect is silent; later rounds have the rest of the time,
+for slow links."""
+
+
+class Session(NamedTuple):
+    """A link with a session on it.
+
+    Attributes:
+        link: the link.
+        address: where it leads, with the dialect pinned.
+        dialect: what is spoken.
+        version: protocol version from the Connect answer.
+        early: every chunk that came meanwhile, in order: the first status, and whatever else the
+            camera had to say.
+    """
+
+    link: Link
+    address: Address
+    dialect: Dialect
+    version: int
+    early: list[Chunk]
+
+
+@dataclass(slots=True)
+class Try:
+    """One attempt: what was tried and how far it came."""
+
+    dialect: str
+    transport: str
+    step: str = "opening the link"
+    outcome: str = ""
+    received: int = 0
+
+    def __str__(self) -> str:
+        """One line for an error text."""
+        return f"{self.dialect} over {self.transport.upper()}: {self.step}: {self.outcome}"
+
+
+@dataclass(slots=True)
+class _Collector:
+    """Takes events until a wanted one is there; keeps the rest for the client."""
+
+    link: Link
+    early: list[Chunk] = field(default_factory=list[Chunk])
+    version: int | None = None
+    status: StatusReport | None = None
+    application: int | None = None
+
+    async def take(self) -> None:
+        chunk = await self.link.receive()
+        self.early.append(chunk)
+        for event in chunk.events:
+            match event:
+                case ConnectAnswer(version=version):
+                    if version < 1:
+                        raise RemoteProtocolError(f"the camera speaks protocol version {version}")
+                    self.version = version
+                case StatusReport():
+                    self.status = self.status or event
+                case QueryAnswer(application=application):
+                    self.application = application
+                case ResultContainer():
+                    pass
+                case LinkFailed(error=error):
+                    raise error
+                case LinkEnded(pending=pending):
+                    more = f" in the middle of a frame ({pending} bytes of it)" if pending else ""
+                    raise RemoteProtocolError(f"the other side closed the connection{more}")
+                case _:
+                    logger.debug("%s ! %s during connect", self.link.name, type(event).__name__)
+
+
+def load_protocol(name: str) -> Protocol:
+    """Return the protocol of this name.
+
+    Raises:
+        PluginError: unknown, or it failed to load.
+        ConfigurationError: the entry point gives something else.
+    """
+    protocol = PROTOCOLS.load(name)
+    if not isinstance(protocol, Protocol):
+        raise ConfigurationError(f"entry point {name!r} gives {protocol!r}, not a Protocol")
+    return protocol
+
+
+async def attempt(
+    address: Address,
+    dialect: Dialect,
+    transport: Transport,
+    *,
+    progress: Try,
+    name: str,
+    max_length: int,
+    trace: Callable[[TraceEntry], None] | None = None,
+) -> Session:
+    """Make a session over one fresh link; bounded by the caller's deadline.
+
+    Raises:
+        OSError: no link.
+        SmartCamError: the link ended, or what came was no camera's answer.
+    """
+    link = await open_link(
+        dialect,
+        transport,
+        address.host,
+        address.port,
+        name=name,
+        max_length=max_length,
+        trace=trace,
+    )
+    collector = _Collector(link)
+    try:
+        link.send(Disconnect(), Connect())
+        progress.step = "waiting for the answer to Connect"
+        while collector.version is None:
+            await collector.take()
+        progress.step = "waiting for the first status"
+        while collector.status is None:
+            await collector.take()
+        progress.step = "waiting for the answer to Query"
+        link.send(Query())
+        while collector.application is None:
+            await collector.take()
+    except BaseException as exc:
+        link.give_up(exc)
+        raise
+    finally:
+        progress.received = link.machine.counters.bytes_received
+    if collector.version > 1:
+        logger.warning("%s ! protocol version %d is newer than 1", name, collector.version)
+    pinned = address._replace(dialect=dialect.name)
+    return Session(link, pinned, dialect, collector.version, collector.early)
+
+
+async def establish(
+    settings: CameraSettings, trace: Callable[[TraceEntry], None] | None = None
+) -> Session:
+    """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.
+
+    Raises:
+        ConnectFailedError: names each attempt and what came.
+
+    Cancellation: the link that was being made is dropped.
+    """
+    address = settings.address
+    protocol = load_protocol(address.protocol)
+    transport = protocol.schemes[address.scheme]
+    names = [address.dialect] if address.dialect else list(protocol.dialects)
+    rounds = [name for _ in range(settings.connect_attempts) for name in names]
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + settings.connect_timeout
+    tries: list[Try] = []
+    cause: BaseException | None = None
+    for number, name in enumerate(rounds):
+        share = (deadline - loop.time()) / (len(rounds) - number)
+        if len(names) > 1 and number < len(names):
+            share = min(share, DETECTION_SHARE)
+        progress = Try(name, transport.value)
+        tries.append(progress)
+        try:
+            async with asyncio.timeout(share):
+                return await attempt(
+                    address,
+                    protocol.dialects[name],
+                    transport,
+                    progress=progress,
+                    name=settings.name,
+                    max_length=settings.max_length,
+                    trace=trace,
+                )
+        except TimeoutError as exc:
+            what = f"{progress.received} bytes, then silence" if progress.received else "silence"
+            progress.outcome, cause = f"{what} for {share:.1f} s", exc
+        except (OSError, SmartCamError) as exc:
+            progress.outcome, cause = str(exc), exc
+        logger.debug("%s ! attempt %d: %s", settings.name, number + 1, progress)
+    texts = tuple(f"attempt {n}: {one}" for n, one in enumerate(tries, 1))
+    raise ConnectFailedError(
+        f"{settings.name}: no session with {address.url}: " + "; ".join(texts),
+        host=address.host,
+        port=address.port,
+        attempts=texts,
+    ) from cause

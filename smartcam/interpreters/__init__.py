@@ -1,0 +1,19 @@
+"""Interpreters: what a result container's bytes mean. Pure; no clock, no socket.
+
+``localizations``, ``strings50``, ``record``, ``table`` and ``raw`` come with smartcam, others as
+entry points of the group ``smartcam.interpreters``.
+"""
+
+from __future__ import annotations
+
+from smartcam.interpreters.base import (
+    Context,
+    Function,
+    Interpreter,
+    Reader,
+    Spec,
+    resolve,
+    run,
+)
+
+__all__ = ["Context", "Function", "Interpreter", "Reader", "Spec", "resolve", "run"]

@@ -1,0 +1,29 @@
+"""``record``: what a layout says, as a record or a list of records."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from smartcam.interpreters.base import Interpreter
+
+if TYPE_CHECKING:
+    from smartcam.interpreters.base import Reader
+    from smartcam.layout import Layout
+    from smartcam.layout import Record as LayoutRecord
+
+__all__ = ["Record"]
+
+
+class Record(Interpreter):
+    """Gives what :meth:`smartcam.Layout.parse` gives; needs a layout."""
+
+    layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
+    layout: Layout
+
+    def interpret(self, reader: Reader) -> LayoutRecord | list[LayoutRecord]:
+        """Return the record, or the list of records.
+
+        Raises:
+            InterpretationError: the bytes do not fit the layout.
+        """
+        return self.layout.parse(reader.data, reader.context.byte_order)

@@ -1,0 +1,177 @@
+"""What a connection is told: the camera's address and the client's options.
+
+A wrong option is a :exc:`~smartcam.exceptions.ConfigurationError` that names it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from urllib.parse import parse_qsl, urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from smartcam.exceptions import ConfigurationError, PluginError
+from smartcam.registry import PROTOCOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.protocols.base import Protocol
+
+__all__ = ["Address", "CameraSettings", "parse_address", "validation_text"]
+
+Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+
+
+class Address(NamedTuple):
+    """Where a camera is and what is known of how it speaks.
+
+    Attributes:
+        protocol: name of the protocol.
+        scheme: of the URL; it decides the transport.
+        host: name or address.
+        port: its port.
+        dialect: pinned dialect, None to find it out.
+    """
+
+    protocol: str
+    scheme: str
+    host: str
+    port: int
+    dialect: str | None = None
+
+    @property
+    def url(self) -> str:
+        """The address as a URL, with everything pinned that is known."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        query = f"?dialect={self.dialect}" if self.dialect else ""
+        return f"{self.scheme}://{host}:{self.port}{query}"
+
+
+def parse_address(url: str, *, model: str | None = None) -> Address:
+    """Read a camera URL such as ``bvs://192.168.0.10?dialect=handbook``.
+
+    Args:
+        url: a URL, or a bare ``HOST[:PORT]`` together with ``model``.
+        model: camera model; picks the protocol of a bare host.
+
+    Raises:
+        ConfigurationError: says which part is wrong and what is accepted.
+    """
+    protocol, full = _pick_protocol(url.strip(), model)
+    try:
+        parts = urlsplit(full)
+        port = parts.port if parts.port is not None else protocol.default_port
+    except ValueError as exc:
+        raise ConfigurationError(f"camera address {url!r}: {exc}") from exc
+    if not parts.hostname:
+        raise ConfigurationError(f"camera address {url!r} has no host")
+    if port == 0:
+        raise ConfigurationError(f"camera address {url!r}: port 0 is no camera's port")
+    surplus = [
+        name
+        for name, value in [
+            ("a user", parts.username),
+            ("a path", parts.path.strip("/")),
+            ("a fragment", parts.fragment),
+        ]
+        if value
+    ]
+    if surplus:
+        raise ConfigurationError(f"camera address {url!r} has {surplus[0]}, which means nothing")
+    dialect = None
+    for key, value in parse_qsl(parts.query, keep_blank_values=True):
+        if key != "dialect":
+            raise ConfigurationError(f"camera address {url!r}: unknown {key!r}; known is 'dialect'")
+        dialect = value
+    if dialect is not None and dialect not in protocol.dialects:
+        raise ConfigurationError(
+            f"camera address {url!r}: {protocol.name} has no dialect {dialect!r}; "
+            f"it has {', '.join(protocol.dialects)}"
+        )
+    return Address(protocol.name, parts.scheme, parts.hostname, port, dialect)
+
+
+def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
+    if "://" in url:
+        scheme = url.partition("://")[0].lower()
+        for protocol in _protocols():
+            if scheme in protocol.schemes:
+                return protocol, url
+        known = ", ".join(f"{s}://" for p in _protocols() for s in p.schemes)
+        raise ConfigurationError(
+            f"camera address {url!r}: unknown scheme {scheme!r}; known are {known}"
+        )
+    if model is None:
+        raise ConfigurationError(
+            f"camera address {url!r} is a bare host: give a URL such as bvs://{url or 'HOST'}, "
+            'or a model, such as model="BVS002C"'
+        )
+    for protocol in _protocols():
+        if model.upper() in protocol.models:
+            return protocol, f"{next(iter(protocol.schemes))}://{url}"
+    known = ", ".join(name for p in _protocols() for name in p.models)
+    raise ConfigurationError(f"unknown camera model {model!r}; known are {known}")
+
+
+def _protocols() -> Iterator[Protocol]:
+    for info in PROTOCOLS.available():
+        try:
+            protocol: Any = PROTOCOLS.load(info.name)
+        except PluginError:
+            if info.origin == "built-in":
+                raise
+            continue  # a broken plug-in costs only its own name
+        yield protocol
+
+
+class CameraSettings(BaseModel):
+    """Options of one client. Times are seconds, each bounds one step."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    address: Address = Field(description="where the camera is")
+    name: str = Field("", max_length=200, description="name in logs and results; default HOST:PORT")
+    application: int | None = Field(
+        None, ge=0, le=0xFFFFFFFF, description="application to have running and ready"
+    )
+    interpret_as: Any = Field(None, description="what result containers hold")
+    y_down: bool = Field(
+        False, description="the camera's y axis points down; turned to y up on the way in"
+    )
+    lenient: bool = Field(False, description="any non-zero byte is a true bool")
+    connect_timeout: Seconds = Field(10.0, description="for a session, all attempts together")
+    connect_attempts: int = Field(3, ge=1, le=100, description="fresh links tried per dialect")
+    switch_timeout: Seconds = Field(10.0, description="for a switch until the camera is ready")
+    request_timeout: Seconds = Field(5.0, description="for the answer to a request")
+    close_timeout: Seconds = Field(1.0, description="for an orderly end of the link")
+    max_length: int = Field(
+        1 << 20, ge=16, le=1 << 30, description="largest payload accepted, bytes"
+    )
+
+    @classmethod
+    def make(cls, url: str, model: str | None, options: dict[str, Any]) -> CameraSettings:
+        """Validate what ``connect()`` was given.
+
+        Raises:
+            ConfigurationError: names the option, what came and what was expected.
+        """
+        address = parse_address(url, model=model)
+        try:
+            settings = cls(address=address, **options)
+        except ValidationError as exc:
+            raise ConfigurationError(f"connect: {validation_text(exc)}") from exc
+        except TypeError as exc:
+            raise ConfigurationError(f"connect: {exc}") from exc
+        if settings.name:
+            return settings
+        return settings.model_copy(update={"name": f"{address.host}:{address.port}"})
+
+
+def validation_text(error: ValidationError) -> str:
+    """Return pydantic's findings as one line: where, what was expected, what came."""
+    return "; ".join(
+        f"{'.'.join(str(part) for part in item['loc']) or 'value'}: {item['msg']}"
+        f" (got {item['input']!r:.80})"
+        for item in error.errors()
+    )
