@@ -7,6 +7,7 @@ fields and offsets. Where it stumbles, the slow way walks the bytes in order and
 
 from __future__ import annotations
 
+import bisect
 import functools
 import math
 import operator
@@ -85,8 +86,9 @@ class Record(tuple[Any, ...]):
 @functools.lru_cache(maxsize=256)  # a class per layout; evicting one costs only its making
 def record_class(names: tuple[str, ...]) -> type[Record]:
     """Return the record class with these field names."""
-    # only for its getters, which are written in C
-    maker = namedtuple("Fields", names)  # noqa: PYI024  # pyright: ignore[reportUntypedNamedTuple]
+    # getters written in C; the class that brings them must live until they are taken from it
+    make: Any = namedtuple  # noqa: PYI024  names known at run time, so no checker can follow
+    maker = make("Fields", names)
     attributes: dict[str, Any] = {name: vars(maker)[name] for name in names}
     return type(
         "Record",
@@ -192,10 +194,8 @@ class RecordCodec:
 
     def field_at(self, position: int) -> tuple[Field, int]:
         """Return the field that holds byte ``position`` of a record, and where it begins."""
-        for field, offset in zip(self.fields, self.offsets, strict=True):
-            if position < offset + field.size:
-                return field, offset
-        return self.fields[-1], self.offsets[-1]
+        index = bisect.bisect_right(self.offsets, position) - 1
+        return self.fields[index], self.offsets[index]
 
     def locate(self, payload: Payload, offset: int, count: int, what: str) -> InterpretationError:
         """Return the error for the first value that cannot be converted; there must be one."""

@@ -138,8 +138,8 @@ class Layout:
 
     # -- values ------------------------------------------------------------------------------
 
-    def parse(self, payload: Payload, byte_order: ByteOrder = "little") -> Record | list[Record]:
-        """Return the values of a container.
+    def parse(self, payload: Payload, byte_order: ByteOrder = "little") -> Any:
+        """Return the values of a container; what they come as is the layout text's to say.
 
         Args:
             payload: the container's bytes behind the application id.

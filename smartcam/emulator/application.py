@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -12,6 +12,11 @@ from smartcam.emulator.scene import TableScene
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.layout import Layout
 from smartcam.settings import validation_text
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.models import ByteOrder
 
 __all__ = ["BUILTIN_APPLICATIONS", "MAX_CONTAINER", "Application", "make_application"]
 
@@ -41,30 +46,36 @@ class Application(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
     id: int = Field(ge=1, le=0xFFFFFFFF, description="what clients switch to; 0 is not allowed")
-    name: str = Field("", max_length=200, description="for people")
-    layout: _LayoutText | None = Field(None, description="layout of the result container")
+    name: str = Field(default="", max_length=200, description="for people")
+    layout: _LayoutText | None = Field(default=None, description="layout of the result container")
     rate: float | None = Field(
-        None,
+        default=None,
         gt=0,
         le=1000,
         allow_inf_nan=False,
         description="runs per second of a free-running application; None: it waits for triggers",
     )
     load_time: _Seconds = Field(
-        0.3, description="seconds that a switch to it takes: several 100 ms (SC manual p. 34)"
+        default=0.3,
+        description="seconds that a switch to it takes: several 100 ms (SC manual p. 34)",
     )
-    processing_time: _Seconds = Field(0.05, description="seconds from trigger to result")
+    processing_time: _Seconds = Field(default=0.05, description="seconds from trigger to result")
     input: _LayoutText | None = Field(
-        None, description='layout of the input data: one record; None: no "receive data" tool'
+        default=None,
+        description='layout of the input data: one record; None: no "receive data" tool',
     )
     slots: int | None = Field(
-        None, ge=0, le=65_535, description="records in the container, unused ones are zeros"
+        default=None, ge=0, le=65_535, description="records in the container, unused ones are zeros"
     )
-    constant: dict[str, Any] | list[Any] | None = Field(None, description="the same values always")
+    constant: dict[str, Any] | list[Any] | None = Field(
+        default=None, description="the same values always"
+    )
     cycle: list[dict[str, Any] | list[Any]] | None = Field(
-        None, min_length=1, description="values of one run after the other, over and over"
+        default=None, min_length=1, description="values of one run after the other, over and over"
     )
-    generator: str | Generator | None = Field(None, description="a generator's name or function")
+    generator: str | Generator | None = Field(
+        default=None, description="a generator's name or function"
+    )
     parameters: dict[str, Any] = Field(
         default_factory=dict[str, Any], description="for the generator"
     )
@@ -84,8 +95,25 @@ class Application(BaseModel):
         """The compiled layout of the input data; any byte but zero is a true bool in it."""
         return None if self.input is None else Layout(self.input, lenient=True)
 
-    def container(self, run: Run, byte_order: Literal["little", "big"] = "little") -> bytes | None:
+    def container(
+        self,
+        *,
+        number: int,
+        turn: int,
+        time: float,
+        scene: TableScene,
+        values: Mapping[str, Any] | None = None,
+        byte_order: ByteOrder = "little",
+    ) -> bytes | None:
         """Return the result container's bytes of one run, None without a "send results" tool.
+
+        Args:
+            number: the run's sequence number.
+            turn: runs of this application before this one, since it was loaded.
+            time: seconds since the device was made.
+            scene: what the camera looks at.
+            values: of the input container.
+            byte_order: order of the bytes of a number.
 
         Raises:
             ConfigurationError: the values do not fit the layout.
@@ -94,12 +122,13 @@ class Application(BaseModel):
         layout = self.result_layout
         if layout is None:
             return None
+        run = Run(number, turn, time, layout, scene, values, self.parameters)
         field = layout.sequence_field
         data = layout.build(
             self._values(run),
             byte_order,
             slots=self.slots,
-            sequence=None if field is None else wrap_number(field, run.number),
+            sequence=None if field is None else wrap_number(field, number),
         )
         if len(data) > MAX_CONTAINER:
             raise ConfigurationError(
@@ -112,7 +141,7 @@ class Application(BaseModel):
         if self.constant is not None:
             return self.constant
         if self.cycle is not None:
-            return self.cycle[run.index % len(self.cycle)]
+            return self.cycle[run.turn % len(self.cycle)]
         generator = self.generator
         if generator is None:
             raise ConfigurationError(f"application {self.id} has a layout and no values")
@@ -121,9 +150,7 @@ class Application(BaseModel):
     @model_validator(mode="after")
     def _check(self) -> Application:
         sources = [
-            name
-            for name in ("constant", "cycle", "generator")
-            if getattr(self, name) is not None
+            name for name in ("constant", "cycle", "generator") if getattr(self, name) is not None
         ]
         if len(sources) > 1:
             raise ValueError(f"values come from one place, not from {' and '.join(sources)}")
@@ -138,24 +165,15 @@ class Application(BaseModel):
         if self.input_layout is not None and self.input_layout.repeat is not None:
             raise ValueError("input: input data is one record")
         if self.result_layout is not None:
-            self._try_values(self.result_layout)
+            self._try_values()
         return self
 
-    def _try_values(self, layout: Layout) -> None:
+    def _try_values(self) -> None:
         entries = self.cycle or ()
-        for index in range(max(1, len(entries))):
-            run = Run(
-                number=0,
-                index=index,
-                time=0.0,
-                layout=layout,
-                scene=TableScene(),
-                input=None,
-                parameters=self.parameters,
-            )
-            what = f"cycle.{index}: " if entries else ""
+        for turn in range(max(1, len(entries))):
+            what = f"cycle.{turn}: " if entries else ""
             try:
-                self.container(run)
+                self.container(number=0, turn=turn, time=0.0, scene=TableScene())
             except SmartCamError as exc:
                 raise ValueError(f"{what}{exc}") from exc
             except Exception as exc:

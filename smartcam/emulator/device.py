@@ -14,13 +14,12 @@ from __future__ import annotations
 
 import enum
 import logging
-from collections import deque
 from contextlib import nullcontext
-from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.emulator.clock import NANOSECONDS
-from smartcam.emulator.generators import Run
+from smartcam.emulator.parts import LOST_CLOCK, CalendarClock, InputQueue
 from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scene import TableScene
 from smartcam.exceptions import ConfigurationError, InterpretationError
@@ -30,20 +29,17 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from contextlib import AbstractContextManager
+    from datetime import datetime
 
     from smartcam.emulator.application import Application
     from smartcam.models import ByteOrder
 
-__all__ = ["LOST_CLOCK", "OPERATOR_CONDITIONS", "PROTOCOL_VERSION", "Device", "Mode"]
+__all__ = ["OPERATOR_CONDITIONS", "PROTOCOL_VERSION", "Device", "Mode"]
 
 _log = logging.getLogger("smartcam.emulator")
 
 PROTOCOL_VERSION = 1
 """What Connect is answered with (SC manual p. 29, published)."""
-
-LOST_CLOCK = datetime(1970, 1, 1, tzinfo=UTC)
-"""What the clock shows after a restart: it is lost (published for a sibling, the value inferred).
-The camera's clock has no time zone; UTC stands here because a time of ours needs one."""
 
 OPERATOR_CONDITIONS = Status.OVERHEAT | Status.SYSTEM_ERROR
 """Bits that nothing in the model sets: :meth:`Device.set_condition` does."""
@@ -68,6 +64,15 @@ class _Event(enum.IntEnum):
     LOADED = 2
     BOOTED = 3
     FREE_RUN = 4
+
+
+class _Inspection(NamedTuple):
+    """An inspection under way: what was fixed when it began."""
+
+    number: int
+    turn: int
+    time: float
+    input: Mapping[str, Any] | None
 
 
 def _ns(seconds: float) -> int:
@@ -114,7 +119,7 @@ class Device:
         ]
         self._now = 0
         self._mode = Mode.STOPPED
-        self._events: dict[_Event, int] = {}
+        self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
         self._session = False
         self._output: list[m.Message] = []
         self._reported: tuple[Status, int] | None = None
@@ -122,15 +127,9 @@ class Device:
         self._endian = 0
         self._next_number = 0
         self._runs = 0  # of the active application since it was loaded
-        self._run: Run | None = None
-        self._free_origin = 0
-        self._free_count = 0
-        self._target: Application | None = None
-        self._answer_switch = False
-        self._run_after_load = False
-        self._queue: deque[Mapping[str, Any]] = deque()
-        self._last_input: Mapping[str, Any] | None = None
-        self._set_clock(clock_time)
+        self._processing = False
+        self._inputs = InputQueue(self.quirks.input_queue_depth)
+        self._clock = CalendarClock(clock_time, self._now)
         if running:
             self._enter_run_mode()
 
@@ -159,7 +158,7 @@ class Device:
     @property
     def processing(self) -> bool:
         """Whether an inspection is under way."""
-        return self._run is not None
+        return self._processing
 
     @property
     def rebooting(self) -> bool:
@@ -184,7 +183,7 @@ class Device:
     @property
     def queued_inputs(self) -> int:
         """Input containers that wait for an inspection."""
-        return len(self._queue)
+        return len(self._inputs)
 
     @property
     def time(self) -> float:
@@ -194,11 +193,7 @@ class Device:
     @property
     def clock_time(self) -> datetime:
         """What its clock shows; the zone means nothing."""
-        passed = timedelta(microseconds=(self._now - self._clock_set_at) // 1000)
-        try:
-            return self._clock + passed
-        except OverflowError:
-            return datetime.max.replace(tzinfo=UTC)
+        return self._clock.read(self._now)
 
     @property
     def status(self) -> Status:
@@ -212,7 +207,7 @@ class Device:
             word |= Status.BUSY
         if self._mode is Mode.RUNNING:
             word |= Status.RUNNING
-            if self._run is not None:
+            if self._processing:
                 word |= Status.BUSY if self.quirks.busy_while_processing else Status(0)
             elif self._active.triggered and not self._faulty:
                 word |= Status.WAITING_FOR_TRIGGER
@@ -272,7 +267,7 @@ class Device:
         """Return the seconds until something happens by itself, None where nothing will."""
         if not self._events:
             return None
-        return max(0, min(self._events.values()) - self._now) / NANOSECONDS
+        return max(0, min(when for when, _ in self._events.values()) - self._now) / NANOSECONDS
 
     # ------------------------------------------------------------------ the operator
 
@@ -322,7 +317,7 @@ class Device:
         with self.around():
             self._reboot()
 
-    def set_condition(self, condition: Status, on: bool) -> None:  # noqa: FBT001
+    def set_condition(self, condition: Status, on: bool) -> None:
         """Set or clear Overheat or System Error.
 
         With a System Error the inspection under way is void, and none begins until it is cleared
@@ -360,9 +355,9 @@ class Device:
             case m.SwitchApplication(application=application):
                 self._switch(application)
             case m.GetClock():
-                self._say(self._clock_answer())
+                self._say(self._clock.answer(self._now))
             case m.SetClock():
-                self._take_clock(message)
+                self._clock.set(message, self._now)
             case m.SetInput(data=data):
                 self._take_input(data)
             case m.SetSequenceNumber(number=number):
@@ -383,8 +378,7 @@ class Device:
             return
         self._mode = Mode.RUNNING
         if not self._active.triggered:
-            self._free_origin, self._free_count = self._now, 0
-            self._events[_Event.FREE_RUN] = self._now
+            self._plan_free_run(self._now, 0)
         self._report()
 
     def _leave_run_mode(self) -> None:
@@ -403,9 +397,11 @@ class Device:
         """
         if self._mode is not Mode.RUNNING or not self._active.triggered or self._faulty:
             return False
-        if self._run is not None:
+        if self._processing:
             self._conditions |= Status.OVERTRIGGERED
-            self._schedule(_Event.OVERTRIGGER_ENDS, self.quirks.overtriggered_time)
+            self._after(
+                self.quirks.overtriggered_time, _Event.OVERTRIGGER_ENDS, self._end_overtrigger
+            )
             self._report()
             return False
         self._begin_run()
@@ -426,8 +422,8 @@ class Device:
         self._void_run()
         self._events.pop(_Event.FREE_RUN, None)
         self._mode = Mode.SWITCHING
-        self._target, self._answer_switch, self._run_after_load = target, answer, running
-        self._schedule(_Event.LOADED, target.load_time)
+        finish = partial(self._finish_load, target, answer=answer, running=running)
+        self._after(target.load_time, _Event.LOADED, finish)
         self._report()
 
     def _reboot(self) -> None:
@@ -439,54 +435,43 @@ class Device:
             return
         self.disconnect()
         self._mode = Mode.REBOOTING
-        self._run = None
+        self._processing = False
         self._events = {}
-        self._schedule(_Event.BOOTED, self.quirks.reboot_time)
+        self._after(self.quirks.reboot_time, _Event.BOOTED, self._finish_boot)
 
     # ------------------------------------------------------------------ time
 
-    def _schedule(self, event: _Event, seconds: float) -> None:
-        self._events[event] = self._now + _ns(seconds)
+    def _after(self, seconds: float, event: _Event, action: Callable[[], None]) -> None:
+        self._events[event] = (self._now + _ns(seconds), action)
 
     def _advance(self, target: int) -> None:
         """Let everything happen that is due until ``target``."""
         while self._events:
-            event, when = min(self._events.items(), key=lambda item: (item[1], item[0]))
-            if when > target:
+            event = min(self._events, key=lambda key: (self._events[key][0], key))
+            if self._events[event][0] > target:
                 break
+            when, action = self._events.pop(event)
             self._now = max(self._now, when)
-            del self._events[event]
-            self._happen(event)
+            action()
         self._now = target
 
-    def _happen(self, event: _Event) -> None:
-        match event:
-            case _Event.INSPECTED:
-                self._finish_run()
-            case _Event.OVERTRIGGER_ENDS:
-                self._conditions &= ~Status.OVERTRIGGERED
-                self._report()
-            case _Event.LOADED:
-                self._finish_load()
-            case _Event.BOOTED:
-                self._finish_boot()
-            case _Event.FREE_RUN:
-                self._begin_free_run()
+    def _end_overtrigger(self) -> None:
+        self._conditions &= ~Status.OVERTRIGGERED
+        self._report()
 
-    def _finish_load(self) -> None:
-        if self._target is not None:
-            self._active, self._target = self._target, None
+    def _finish_load(self, target: Application, *, answer: bool, running: bool) -> None:
+        self._active = target
         self._forget_inputs()
         self._runs = 0
         self._mode = Mode.STOPPED
-        answer = m.SwitchAnswer(code=0, application=self._active.id)
+        message = m.SwitchAnswer(code=0, application=target.id)
         before = self.quirks.switch_answer == "before_status"
-        if self._answer_switch and before:
-            self._say(answer)
+        if answer and before:
+            self._say(message)
         self._report()
-        if self._answer_switch and not before:
-            self._say(answer)
-        if self._run_after_load:
+        if answer and not before:
+            self._say(message)
+        if running:
             self._enter_run_mode()
 
     def _finish_boot(self) -> None:
@@ -496,11 +481,10 @@ class Device:
         stopped, and a cleared System Error: inferred.
         """
         self._mode = Mode.STOPPED
-        self._target = None
         self._forget_inputs()
         self._conditions &= Status.OVERHEAT
         self._next_number = self._runs = 0
-        self._set_clock(LOST_CLOCK)
+        self._clock = CalendarClock(LOST_CLOCK, self._now)
 
     # ------------------------------------------------------------------ inspections
 
@@ -512,62 +496,67 @@ class Device:
     def _byte_order(self) -> ByteOrder:
         return "big" if self._endian == 1 else "little"
 
-    def _begin_free_run(self) -> None:
-        """Begin the run that is due and plan the next, counted from the start: no drift."""
-        self._free_count += 1
-        rate = self._active.rate or 1.0
-        self._events[_Event.FREE_RUN] = self._free_origin + _ns(self._free_count / rate)
+    def _plan_free_run(self, origin: int, count: int) -> None:
+        """Plan run ``count`` of a free-running application, counted from its start: no drift."""
+        when = origin + _ns(count / (self._active.rate or 1.0))
+        self._events[_Event.FREE_RUN] = (when, partial(self._begin_free_run, origin, count))
+
+    def _begin_free_run(self, origin: int, count: int) -> None:
+        self._plan_free_run(origin, count + 1)
         if not self._faulty:
             self._begin_run()
+            # both were rounded to nanoseconds; a run never reaches into the next
+            (ends, action), (following, _) = (
+                self._events[_Event.INSPECTED],
+                self._events[_Event.FREE_RUN],
+            )
+            self._events[_Event.INSPECTED] = (min(ends, following), action)
 
     def _begin_run(self) -> None:
         """Take the next number and the next input container."""
-        number, self._next_number = self._next_number, (self._next_number + 1) % _NUMBERS
-        application = self._active
-        self._run = Run(
-            number=number,
-            index=self._runs,
-            time=self.time,
-            layout=application.result_layout,
-            scene=self.scene,
-            input=self._next_input(),
-            parameters=application.parameters,
-        )
+        run = _Inspection(self._next_number, self._runs, self.time, self._next_input())
+        self._next_number = (self._next_number + 1) % _NUMBERS
         self._runs += 1
-        self._schedule(_Event.INSPECTED, application.processing_time)
+        self._processing = True
+        finish = partial(self._finish_run, run)
+        self._after(self._active.processing_time, _Event.INSPECTED, finish)
         self._report()
 
-    def _finish_run(self) -> None:
+    def _finish_run(self, run: _Inspection) -> None:
         """Send the result, then Waiting for Trigger rises again (the order is a quirk)."""
-        run, self._run = self._run, None
-        result = self._result(run) if run is not None else None
+        self._processing = False
+        result = self._result(run)
         if self.quirks.waiting_before_result:
             self._report()
         if result is not None:
             self._say(result)
         self._report()
 
-    def _result(self, run: Run) -> m.ResultContainer | None:
+    def _result(self, run: _Inspection) -> m.ResultContainer | None:
         application = self._active
         try:
-            data = application.container(run, self._byte_order)
-        except Exception:  # a generator is somebody's code; the camera goes on without a result
+            data = application.container(
+                number=run.number,
+                turn=run.turn,
+                time=run.time,
+                scene=self.scene,
+                values=run.input,
+                byte_order=self._byte_order,
+            )
+        except Exception:  # noqa: BLE001  a generator is somebody's code; the camera goes on
             _log.exception("! application %d, run %d: no result", application.id, run.number)
             return None
         return None if data is None else m.ResultContainer(application=application.id, data=data)
 
     def _void_run(self) -> None:
         """Drop the inspection under way: no result comes from it (inferred)."""
-        self._run = None
+        self._processing = False
         self._events.pop(_Event.INSPECTED, None)
 
     # ------------------------------------------------------------------ input data
 
     def _take_input(self, data: bytes) -> None:
-        """Queue a container; one that does not fit the layout is dropped (inferred).
-
-        Source: SC manual p. 30 and p. 33 (published) for the queue and its status bit.
-        """
+        """Queue a container; one that does not fit the layout is dropped (inferred)."""
         layout = self._active.input_layout
         if layout is None or self._mode is Mode.SWITCHING:
             return
@@ -576,64 +565,27 @@ class Device:
         except InterpretationError as exc:
             _log.debug("= input data dropped: %s", exc)
             return
-        if len(self._queue) == self.quirks.input_queue_depth:
-            self._queue.popleft()
-            self._conditions |= Status.INPUT_CONTAINER
+        if not self._inputs.put(values._asdict()):
+            self._in_step(fits=False)
             self._report()
-        self._queue.append(values._asdict())
 
     def _next_input(self) -> Mapping[str, Any] | None:
-        """Take a container from the queue, or the last one again; keep the status bit in step."""
         if self._active.input_layout is None:
             return None
-        if self._queue:
-            self._last_input = self._queue.popleft()
-            self._conditions &= ~Status.INPUT_CONTAINER
-        else:
+        values, fits = self._inputs.take()
+        self._in_step(fits=fits)
+        return values
+
+    def _in_step(self, *, fits: bool) -> None:
+        """Set the bit where containers and inspections are out of step, clear it where not."""
+        self._conditions &= ~Status.INPUT_CONTAINER
+        if not fits:
             self._conditions |= Status.INPUT_CONTAINER
-        return self._last_input
 
     def _forget_inputs(self) -> None:
         """A newly loaded application has an empty queue (inferred)."""
-        self._queue.clear()
-        self._last_input = None
-        self._conditions &= ~Status.INPUT_CONTAINER
-
-    # ------------------------------------------------------------------ the clock
-
-    def _set_clock(self, time: datetime) -> None:
-        self._clock = time.replace(tzinfo=UTC)
-        self._clock_set_at = self._now
-
-    def _take_clock(self, message: m.SetClock) -> None:
-        """Set the clock; what is no time is dropped.
-
-        Source: mvBlueGEMINI manual p. 30 (published): invalid values may be dropped or converted.
-        """
-        try:
-            time = datetime(
-                message.year,
-                message.month,
-                message.day,
-                message.hour,
-                message.minute,
-                message.second,
-                tzinfo=UTC,
-            )
-        except (ValueError, OverflowError):
-            return
-        self._set_clock(time)
-
-    def _clock_answer(self) -> m.ClockAnswer:
-        time = self.clock_time
-        return m.ClockAnswer(
-            year=time.year,
-            month=time.month,
-            day=time.day,
-            hour=time.hour,
-            minute=time.minute,
-            second=time.second,
-        )
+        self._inputs.clear()
+        self._in_step(fits=True)
 
     # ------------------------------------------------------------------ output
 

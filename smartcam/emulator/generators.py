@@ -35,7 +35,7 @@ class Run(NamedTuple):
 
     Attributes:
         number: the run's sequence number.
-        index: runs of this application since it was loaded, from 0.
+        turn: runs of this application before it, since it was loaded.
         time: seconds since the device was made.
         layout: layout of the result.
         scene: the table the camera looks at.
@@ -44,9 +44,9 @@ class Run(NamedTuple):
     """
 
     number: int
-    index: int
+    turn: int
     time: float
-    layout: Layout | None
+    layout: Layout
     scene: TableScene
     input: Mapping[str, Any] | None
     parameters: Mapping[str, Any]
@@ -65,7 +65,7 @@ def zeros(fields: Sequence[Field]) -> dict[str, Any]:
 
 
 def wrap_number(field: Field, number: int) -> int:
-    """Return a sequence number as ``field`` can hold it: counting starts over where it overflows."""
+    """Return a sequence number as ``field`` can hold it: it starts over where it overflows."""
     low, high = field.wire.low, field.wire.high
     if low is None or high is None:
         return number
@@ -105,7 +105,7 @@ def register_generator(name: str, function: Generator) -> None:
 def _tangram(run: Run) -> Values:
     """The table's pieces as the camera's own calibration gives them: metres and radians."""
 
-    def record(index: int, seen: Observation) -> dict[str, Any]:
+    def record(seen: Observation) -> dict[str, Any]:
         pose = run.scene.to_table(seen)
         return _localization(seen, x=pose.x, y=pose.y, theta=pose.theta)
 
@@ -115,7 +115,7 @@ def _tangram(run: Run) -> Values:
 def _tangram_pixels(run: Run) -> Values:
     """The table's pieces in pixels of the image; theta in radians."""
 
-    def record(index: int, seen: Observation) -> dict[str, Any]:
+    def record(seen: Observation) -> dict[str, Any]:
         return _localization(seen, x=seen.u, y=seen.v, theta=seen.theta)
 
     return _records(run, record)
@@ -132,14 +132,14 @@ def _localization(seen: Observation, *, x: float, y: float, theta: float) -> dic
     }
 
 
-def _records(run: Run, record: Callable[[int, Observation], dict[str, Any]]) -> Values:
+def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Values:
     """Return the fields that the layout has; ``pieces`` in the parameters picks and orders."""
     found = {seen.name: seen for seen in run.scene.measure()}
     wanted: Sequence[str] = run.parameters.get("pieces", list(found))
     names = {field.name for field in run.layout.fields}
     records = [
-        {key: value for key, value in record(index, found[name]).items() if key in names}
-        for index, name in enumerate(wanted)
+        {key: value for key, value in record(found[name]).items() if key in names}
+        for name in wanted
         if name in found
     ]
     if run.layout.repeat is None:

@@ -22,7 +22,7 @@ class Quirks(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     switch_while_running: Literal["refuse", "ignore", "allow"] = Field(
-        "refuse",
+        default="refuse",
         description=(
             "A switch while the application runs: refused with code 1, not answered, or done. "
             "The application must be stopped first (SC manual p. 34, published); what happens "
@@ -30,7 +30,7 @@ class Quirks(BaseModel):
         ),
     )
     switch_answer: Literal["after_status", "before_status"] = Field(
-        "after_status",
+        default="after_status",
         description=(
             "Whether the answer to a switch comes after or before the status in which BUSY has "
             "fallen. The answer comes after the switch (SC manual p. 34, published); its order "
@@ -38,21 +38,21 @@ class Quirks(BaseModel):
         ),
     )
     waiting_before_result: bool = Field(
-        False,
+        default=False,
         description=(
             "Whether Waiting for Trigger rises before the result is sent. The order is unknown "
             "(result first: recommended)."
         ),
     )
     busy_while_processing: bool = Field(
-        False,
+        default=False,
         description=(
             "Whether BUSY is set during an inspection. Published only for the time of a switch "
             "(SC manual p. 33); during an inspection unknown (off: recommended)."
         ),
     )
     bad_frame: Literal["skip", "close"] = Field(
-        "skip",
+        default="skip",
         description=(
             "TCP: after a wrong magic number or an impossible length, skip to the next magic "
             "number or close the connection. Invalid messages are ignored (SC manual p. 28, "
@@ -60,7 +60,7 @@ class Quirks(BaseModel):
         ),
     )
     second_client: Literal["takeover", "refuse"] = Field(
-        "takeover",
+        default="takeover",
         description=(
             "TCP: a Connect while another client has the session takes the session over, or the "
             "newcomer's connection is closed without an answer. On UDP the newcomer wins (SC "
@@ -68,14 +68,14 @@ class Quirks(BaseModel):
         ),
     )
     overtriggered_time: _Seconds = Field(
-        0.1,
+        default=0.1,
         description=(
             "How long Overtriggered stays set after the last dropped trigger. It falls by itself "
             "(SC manual p. 30, published); the duration is unknown (0.1: recommended)."
         ),
     )
     input_queue_depth: int = Field(
-        8,
+        default=8,
         ge=1,
         le=1024,
         description=(
@@ -85,7 +85,7 @@ class Quirks(BaseModel):
         ),
     )
     reboot_time: _Seconds = Field(
-        30.0,
+        default=30.0,
         description=(
             "How long a reboot keeps the camera off the network: about 30 s (mvBlueGEMINI manual "
             "p. 31, published for the sibling)."

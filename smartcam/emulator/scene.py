@@ -23,7 +23,7 @@ TABLE_SIZE = (0.30, 0.25)
 
 
 class TablePose(NamedTuple):
-    """Where a piece lies on the table: x right, y away, metres; theta counter-clockwise, radians."""
+    """Where a piece lies: x right, y away, metres; theta counter-clockwise, radians."""
 
     x: float
     y: float

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from smartcam.interpreters.base import Interpreter
 
 if TYPE_CHECKING:
     from smartcam.interpreters.base import Reader
     from smartcam.layout import Layout
-    from smartcam.layout import Record as LayoutRecord
 
 __all__ = ["Record"]
 
@@ -20,7 +19,7 @@ class Record(Interpreter):
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
     layout: Layout
 
-    def interpret(self, reader: Reader) -> LayoutRecord | list[LayoutRecord]:
+    def interpret(self, reader: Reader) -> Any:
         """Return the record, or the list of records.
 
         Raises:

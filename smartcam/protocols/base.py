@@ -167,6 +167,10 @@ class Dialect:
         codec = self._decoders.get((sender, message_id))
         return codec.type if codec is not None else UnknownMessage
 
+    def knows(self, sender: Sender, message_id: int) -> bool:
+        """Whether there is a message with this id from this sender."""
+        return (sender, message_id) in self._decoders
+
     def answer_id(self, request_id: int) -> int | None:
         """Return the id of the answer to a request, None if the camera never answers it.
 

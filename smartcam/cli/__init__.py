@@ -1,0 +1,32 @@
+"""The commands ``smartcam`` and ``smartcam-emulator``; thin, each calls the library."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+__all__ = ["emulator_main", "main"]
+
+
+def main() -> None:
+    """Run ``smartcam``."""
+    _run("smartcam", "commands")
+
+
+def emulator_main() -> None:
+    """Run ``smartcam-emulator``."""
+    _run("smartcam-emulator", "emulate")
+
+
+def _run(program: str, module: str) -> None:
+    try:
+        importlib.import_module("click")
+        importlib.import_module("yaml")
+    except ModuleNotFoundError:
+        sys.exit(_missing(program))
+    importlib.import_module(f"smartcam.cli.{module}").command(prog_name=program)
+
+
+def _missing(program: str) -> int:
+    sys.stderr.write(f'{program}: needs the extra "cli": pip install "smartcam[cli]"\n')
+    return 2

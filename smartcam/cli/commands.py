@@ -1,0 +1,256 @@
+"""The ``smartcam`` command."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import smartcam
+from smartcam.cli import decoding, demo, probing
+from smartcam.cli.options import (
+    CONNECTS,
+    Options,
+    camera_options,
+    output_options,
+    result_options,
+)
+from smartcam.cli.running import run
+from smartcam.cli.texts import result_text, table_text
+from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import TriggerTimeoutError
+from smartcam.handshake import load_protocol
+from smartcam.models import Status, jsonable
+from smartcam.registry import INTERPRETERS, PROTOCOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+__all__ = ["command"]
+
+EPILOG = (
+    "Exit codes: 0 done; 1 a fault of ours; 2 wrong usage, a bad layout text included; 3 no "
+    "session: nothing listens, silence or garbage, connection lost; 4 a wait in a session ran "
+    "out; 5 the camera refused or is not running; 6 a result is not interpretable."
+)
+
+
+@click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(smartcam.__version__)
+def command() -> None:
+    """Talk to industrial smart cameras.
+
+    A camera is named by its URL: bvs://HOST[:PORT] over TCP, bvs+udp://HOST[:PORT] over UDP;
+    ?dialect=NAME pins what is otherwise found out (see "smartcam protocols").
+    """
+
+
+@command.command(help=f"Find out how a camera speaks; HOST or URL. {CONNECTS}")
+@click.argument("host_or_url")
+@camera_options
+def probe(host_or_url: str, **shared: Any) -> None:
+    options = Options(**shared)
+    run(probing.probe(host_or_url, options), program="smartcam", debug=options.debug)
+
+
+@command.command(help=f"Show a camera's status; changes nothing on it. {CONNECTS}")
+@click.argument("url")
+@camera_options
+def status(url: str, **shared: Any) -> None:
+    _then_show(url, Options(**shared), None)
+
+
+@command.command(
+    help="Trigger and print the result. Without --application nothing is started: a stopped "
+    f"camera is an error (exit code 5). {CONNECTS}"
+)
+@click.argument("url")
+@click.option("--input", "input_hex", metavar="HEX", help="Input data for each inspection.")
+@result_options
+def trigger(url: str, input_hex: str | None, **shared: Any) -> None:
+    options = Options(**shared)
+    run(_trigger(url, input_hex, options), program="smartcam", debug=options.debug)
+
+
+async def _trigger(url: str, input_hex: str | None, options: Options) -> None:
+    data = None if input_hex is None else decoding.from_hex(input_hex, "--input")
+    timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
+    loop = asyncio.get_running_loop()
+    with options.camera(url) as unopened:
+        async with unopened as camera:
+            end = loop.time() + options.seconds if options.seconds else None
+            count = options.count or (None if end else 1)
+            done = 0
+            while (count is None or done < count) and (end is None or loop.time() < end):
+                result = await camera.trigger(input=data, timeout=timeout)
+                options.show(result, lambda: result_text(result))  # noqa: B023 - called at once
+                done += 1
+
+
+@command.command(
+    help="Print results as they come, until Ctrl-C, --count or --seconds. With --count each "
+    f"result must come within --timeout. {CONNECTS}"
+)
+@click.argument("url")
+@result_options
+def watch(url: str, **shared: Any) -> None:
+    options = Options(**shared)
+    run(_watch(url, options), program="smartcam", debug=options.debug, interrupted=0)
+
+
+async def _watch(url: str, options: Options) -> None:
+    each = options.step(DEFAULT_TRIGGER_TIMEOUT) if options.count else None
+    with options.camera(url) as unopened:
+        # subscribed before the session is there, so the first result is seen too
+        results = unopened.results()
+        async with unopened as camera:
+            done = 0
+            try:
+                async with asyncio.timeout(options.seconds):
+                    while options.count is None or done < options.count:
+                        try:
+                            async with asyncio.timeout(each):
+                                result = await anext(results)
+                        except TimeoutError as exc:
+                            raise TriggerTimeoutError(
+                                f"{camera.name}: no result within {each:g} s; "
+                                f"status: {camera.status.describe()}"
+                            ) from exc
+                        options.show(result, lambda: result_text(result))  # noqa: B023
+                        done += 1
+            except TriggerTimeoutError:
+                raise
+            except TimeoutError:
+                pass  # --seconds are over
+
+
+@command.command(
+    help="Load another application; returns when the camera is ready. It runs if the one before "
+    f"ran. {CONNECTS}"
+)
+@click.argument("url")
+@click.argument("application", type=click.IntRange(0, 0xFFFFFFFF))
+@camera_options
+def switch(url: str, application: int, **shared: Any) -> None:
+    _then_show(url, Options(**shared), lambda camera: camera.switch_application(application))
+
+
+@command.command(help=f"Enter run mode; returns when the camera is ready. {CONNECTS}")
+@click.argument("url")
+@camera_options
+def start(url: str, **shared: Any) -> None:
+    options = Options(**shared)
+    _then_show(url, options, lambda camera: camera.start(timeout=options.step(10.0)))
+
+
+@command.command(help=f"Leave run mode; returns when the camera has stopped. {CONNECTS}")
+@click.argument("url")
+@camera_options
+def stop(url: str, **shared: Any) -> None:
+    options = Options(**shared)
+    _then_show(url, options, lambda camera: camera.stop(timeout=options.step(10.0)))
+
+
+@command.command(
+    help="Decode DATA: hex, the name of a file (binary or hex text), or - for standard input. "
+    "Frames are shown field by field; anything else is a result container's data and needs "
+    "--interpret-as."
+)
+@click.argument("data")
+@click.option("--interpret-as", metavar="SPEC", help="How to read a result container's data.")
+@click.option("--big-endian", is_flag=True, help="The container is big endian.")
+@output_options
+def decode(data: str, interpret_as: str | None, big_endian: bool, **shared: Any) -> None:
+    options = Options(interpret_as=interpret_as, **shared)
+
+    async def main() -> None:
+        decoding.decode(data, options, big_endian=big_endian)
+
+    run(main(), program="smartcam", debug=options.debug)
+
+
+@command.command()
+@output_options
+def protocols(**shared: Any) -> None:
+    """List the protocols and their dialects."""
+    options = Options(**shared)
+
+    async def main() -> None:
+        for info in PROTOCOLS.available():
+            protocol = load_protocol(info.name)
+            value = {
+                "name": protocol.name,
+                "origin": info.origin,
+                "schemes": list(protocol.schemes),
+                "default_port": protocol.default_port,
+                "models": list(protocol.models),
+                "dialects": [
+                    {"name": d.name, "about": d.about, "source": d.source}
+                    for d in protocol.dialects.values()
+                ],
+            }
+            rows = [(d.name, d.about) for d in protocol.dialects.values()]
+            head = (
+                f"{info.name} ({info.origin}): {', '.join(f'{s}://' for s in protocol.schemes)}, "
+                f"port {protocol.default_port}, models {', '.join(protocol.models)}\n"
+            )
+            options.show(value, lambda: head + table_text(("dialect", ""), rows))  # noqa: B023
+
+    run(main(), program="smartcam", debug=options.debug)
+
+
+@command.command()
+@output_options
+def interpreters(**shared: Any) -> None:
+    """List the interpreters that --interpret-as knows."""
+    options = Options(**shared)
+
+    async def main() -> None:
+        for info in INTERPRETERS.available():
+            options.show(info, lambda: f"{info.name}  ({info.origin}: {info.target})")  # noqa: B023
+
+    run(main(), program="smartcam", debug=options.debug)
+
+
+@command.command(name="demo")
+@output_options
+def demo_command(**shared: Any) -> None:
+    """Watch smartcam do its main job against an emulated camera over real TCP."""
+    options = Options(**shared)
+    run(demo.demo(options), program="smartcam", debug=options.debug)
+
+
+def _then_show(
+    url: str,
+    options: Options,
+    action: Callable[[smartcam.SmartCamera], Awaitable[None]] | None,
+) -> None:
+    """Connect, do something, show how the camera is then."""
+
+    async def main() -> None:
+        with options.camera(url) as unopened:
+            async with unopened as camera:
+                if action is not None:
+                    await action(camera)
+                _show_camera(camera, options)
+
+    run(main(), program="smartcam", debug=options.debug)
+
+
+def _show_camera(camera: smartcam.SmartCamera, options: Options) -> None:
+    value = {
+        "camera": camera.name,
+        "url": camera.url,
+        "status": camera.status,
+        "active_application": camera.active_application,
+        "protocol_version": camera.protocol_version,
+    }
+    running = "running" if Status.RUNNING in camera.status else "stopped"
+    options.show(
+        jsonable(value),
+        lambda: (
+            f"{camera.url}\n  application {camera.active_application}, {running}\n"
+            f"  status: {camera.status.describe()}\n  protocol version {camera.protocol_version}"
+        ),
+    )

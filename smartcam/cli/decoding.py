@@ -1,0 +1,150 @@
+"""``smartcam decode``: bytes against a dialect or a layout, without a camera."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from smartcam.cli.texts import value_text
+from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
+from smartcam.handshake import load_protocol
+from smartcam.interpreters.base import Context, Interpreter, Reader, resolve, run
+from smartcam.models import jsonable
+from smartcam.protocols.framing import Framer
+from smartcam.protocols.messages import ResultContainer, Sender, wire_fields
+
+if TYPE_CHECKING:
+    from smartcam.cli.options import Options
+    from smartcam.models import ByteOrder
+    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framing import Frame
+
+__all__ = ["decode", "from_hex"]
+
+
+def from_hex(text: str, where: str) -> bytes:
+    """Return the bytes of hex text; spaces are allowed.
+
+    Raises:
+        ConfigurationError: it is no hex.
+    """
+    try:
+        return bytes.fromhex(text)
+    except ValueError as exc:
+        raise ConfigurationError(f"{where}: {text[:64]!r} is no hex: {exc}") from exc
+
+
+def decode(data: str, options: Options, *, big_endian: bool) -> None:
+    """Print what ``data`` means."""
+    payload = _load(data)
+    byte_order: ByteOrder = "big" if big_endian else "little"
+    interpreter = None if options.interpret_as is None else resolve(options.interpret_as)
+    dialect = _dialect_of(payload)
+    if dialect is not None:
+        _decode_frames(payload, dialect, interpreter, byte_order, options)
+        return
+    if interpreter is None:
+        raise ConfigurationError(
+            f"decode: {hex_excerpt(payload[:8])} begins no frame (no magic number), so "
+            "--interpret-as must say what the container holds"
+        )
+    value = _interpret(payload, interpreter, byte_order)
+    options.show({"value": value}, lambda: value_text(value))
+
+
+def _load(data: str) -> bytes:
+    if data == "-":
+        raw = sys.stdin.buffer.read()
+    else:
+        try:
+            path = Path(data)
+            if not path.is_file():
+                return from_hex(data, "decode: neither a file nor hex")
+            raw = path.read_bytes()
+        except (OSError, ValueError) as exc:
+            if isinstance(exc, ConfigurationError):
+                raise
+            raise ConfigurationError(f"decode: {data[:64]!r}: {exc}") from exc
+    try:
+        return bytes.fromhex(raw.decode("ascii"))
+    except ValueError:
+        return raw  # a binary file
+
+
+def _dialect_of(payload: bytes) -> Dialect | None:
+    for dialect in load_protocol("bvs").dialects.values():
+        if dialect.header.magic and payload.startswith(dialect.header.magic):
+            return dialect
+    return None
+
+
+def _decode_frames(
+    payload: bytes,
+    dialect: Dialect,
+    interpreter: Interpreter | None,
+    byte_order: ByteOrder,
+    options: Options,
+) -> None:
+    framer = Framer(dialect.header, max(16, len(payload)))
+    framer.feed(payload)
+    offset = 0
+    while (frame := framer.next_frame()) is not None:
+        _show_frame(frame, offset, dialect, interpreter, byte_order, options)
+        offset += dialect.header.size + len(frame.payload)
+    if framer.buffered:
+        raise FrameError(
+            f"decode: the last {framer.buffered} bytes, from offset {offset}, are no whole frame: "
+            f"{hex_excerpt(framer.pending)}",
+            offset=offset,
+            data=framer.pending,
+        )
+
+
+def _show_frame(
+    frame: Frame,
+    offset: int,
+    dialect: Dialect,
+    interpreter: Interpreter | None,
+    byte_order: ByteOrder,
+    options: Options,
+) -> None:
+    shown: dict[str, Any] = {
+        "offset": offset,
+        "dialect": dialect.name,
+        "message_id": frame.message_id,
+        "messages": [],
+    }
+    lines = [f"at {offset}: {dialect.name} frame, message {frame.message_id:#04x}"]
+    for sender in _senders(dialect, frame):
+        message = dialect.decode(sender, frame)
+        fields = {n: jsonable(getattr(message, n)) for n, _ in wire_fields(type(message))}
+        entry = {"sender": sender.value, "message": type(message).__name__, "fields": fields}
+        text = ", ".join(f"{n}={v}" for n, v in fields.items())
+        lines.append(f"  from the {sender.value}: {type(message).__name__}({text})")
+        if isinstance(message, ResultContainer) and interpreter is not None:
+            entry["value"] = _interpret(message.data, interpreter, byte_order)
+            lines.append(value_text(entry["value"]))
+        shown["messages"].append(entry)
+    if not shown["messages"]:
+        lines.append(f"  no message of this dialect: {hex_excerpt(frame.payload)}")
+        shown["payload"] = frame.payload
+    options.show(shown, lambda: "\n".join(lines))
+
+
+def _senders(dialect: Dialect, frame: Frame) -> list[Sender]:
+    """Return whose messages the frame can be, by id and by size."""
+    return [
+        sender
+        for sender in Sender
+        if dialect.knows(sender, frame.message_id) and dialect.surplus(sender, frame) == 0
+    ] or [
+        sender
+        for sender in Sender
+        if dialect.knows(sender, frame.message_id) and dialect.surplus(sender, frame) > 0
+    ]
+
+
+def _interpret(payload: bytes, interpreter: Interpreter, byte_order: ByteOrder) -> Any:
+    reader = Reader(payload, Context(byte_order=byte_order), interpreter.layout)
+    return run(interpreter, reader)

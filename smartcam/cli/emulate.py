@@ -1,0 +1,94 @@
+"""The ``smartcam-emulator`` command."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Any, Literal
+
+import click
+
+import smartcam
+from smartcam.cli.options import Options, output_options
+from smartcam.cli.running import run
+from smartcam.emulator import EmulatedCamera, load_scenario
+from smartcam.handshake import load_protocol
+
+__all__ = ["command"]
+
+DIALECTS = tuple(load_protocol("bvs").dialects)
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.argument("scenario", required=False, metavar="[SCENARIO.yaml]")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    show_default=True,
+    help="Port; 0 takes a free one, a camera's own is 36701. Further cameras take the next ones.",
+)
+@click.option(
+    "--dialect", type=click.Choice(DIALECTS), default=DIALECTS[0], show_default=True, help="Speak."
+)
+@click.option(
+    "--transport", type=click.Choice(("tcp", "udp")), default="tcp", show_default=True, help="Over."
+)
+@click.option(
+    "--cameras", type=click.IntRange(1, 10_000), default=1, show_default=True, help="How many."
+)
+@output_options
+@click.version_option(smartcam.__version__)
+def command(
+    scenario: str | None,
+    host: str,
+    port: int,
+    dialect: str,
+    transport: Literal["tcp", "udp"],
+    cameras: int,
+    **shared: Any,
+) -> None:
+    """Emulate smart cameras, over real TCP or UDP, until Ctrl-C or SIGTERM.
+
+    Prints one line per camera, its URL. Without a scenario there are the built-in applications:
+    1 three strings, 3 mixed fields, 7 the tangram table's localizations, 9 a free-running counter,
+    21 "Hello World".
+    """
+    options = Options(**shared)
+
+    async def main() -> None:
+        loaded = None if scenario is None else load_scenario(scenario)
+        async with contextlib.AsyncExitStack() as stack:
+            for index in range(cameras):
+                emulator = EmulatedCamera(
+                    scenario=loaded,
+                    host=host,
+                    port=port + index if port else 0,
+                    dialect=dialect,
+                    transport=transport,
+                    name=f"camera{index + 1}",
+                )
+                await stack.enter_async_context(emulator)
+                _announce(emulator, options)
+            await asyncio.Event().wait()
+
+    run(
+        main(),
+        program="smartcam-emulator",
+        debug=options.debug,
+        interrupted=0,
+        terminated=0,
+    )
+
+
+def _announce(emulator: EmulatedCamera, options: Options) -> None:
+    value = {
+        "url": emulator.url,
+        "host": emulator.host,
+        "port": emulator.port,
+        "transport": emulator.transport,
+        "dialect": emulator.dialect,
+        "applications": sorted(emulator.device.applications),
+    }
+    options.show(value, lambda: emulator.url)

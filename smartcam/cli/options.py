@@ -1,0 +1,134 @@
+"""Options that commands share, and what is made of them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from smartcam.client import SmartCamera, connect
+from smartcam.exceptions import ConfigurationError
+from smartcam.models import jsonable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.connection import TraceEntry
+
+__all__ = ["CONNECTS", "Options", "camera_options", "output_options", "result_options"]
+
+F = TypeVar("F", bound="Callable[..., Any]")
+
+CONNECTS = "Connecting takes the camera from another client: it serves one, and the newcomer wins."
+SECONDS = click.FloatRange(min=0, min_open=True, max=86_400)
+
+_output = [
+    click.option("--json", "as_json", is_flag=True, help="One JSON object a line on stdout."),
+    click.option("--debug", is_flag=True, help="Log what happens and show tracebacks, on stderr."),
+]
+_camera = [
+    click.option(
+        "--timeout",
+        type=SECONDS,
+        help="Bound of each step: connect (default 10), switch until ready (10), trigger (5).",
+    ),
+    click.option(
+        "--trace",
+        type=click.Path(dir_okay=False),
+        help="Write every frame, decoded and hex, as JSON lines.",
+    ),
+]
+_result = [
+    click.option(
+        "--application",
+        type=click.IntRange(0, 0xFFFFFFFF),
+        help="Have this application running and ready first (stop, switch, start as needed).",
+    ),
+    click.option(
+        "--interpret-as",
+        metavar="SPEC",
+        help="An interpreter, a layout, or both: localizations; 'x: real32 mm, y: real32 mm'; "
+        "'table: (x: real32)*'. Default raw: bytes, shown as hex.",
+    ),
+    click.option("--y-down", is_flag=True, help="The camera's y axis points down."),
+    click.option("--count", type=click.IntRange(min=1), help="End after so many results."),
+    click.option("--seconds", type=SECONDS, help="End after so many seconds."),
+]
+
+
+def _apply(options: list[Any], function: F) -> F:
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+def output_options(function: F) -> F:
+    """Decorate a command with ``--json`` and ``--debug``."""
+    return _apply(_output, function)
+
+
+def camera_options(function: F) -> F:
+    """Decorate a command that connects."""
+    return _apply([*_camera, *_output], function)
+
+
+def result_options(function: F) -> F:
+    """Decorate a command that prints results."""
+    return _apply([*_result, *_camera, *_output], function)
+
+
+@dataclass(slots=True)
+class Options:
+    """The shared options as a command uses them."""
+
+    as_json: bool = False
+    debug: bool = False
+    timeout: float | None = None
+    trace: str | None = None
+    application: int | None = None
+    interpret_as: str | None = None
+    y_down: bool = False
+    count: int | None = None
+    seconds: float | None = None
+
+    def step(self, default: float) -> float:
+        """Return the bound of a step, seconds."""
+        return default if self.timeout is None else self.timeout
+
+    @contextmanager
+    def camera(self, url: str) -> Iterator[SmartCamera]:
+        """Give an unopened camera; the trace file is open around it."""
+        with self.tracing() as trace:
+            yield connect(
+                url,
+                trace=trace,
+                application=self.application,
+                interpret_as=self.interpret_as,
+                y_down=self.y_down,
+                connect_timeout=self.step(10.0),
+                switch_timeout=self.step(10.0),
+            )
+
+    @contextmanager
+    def tracing(self) -> Iterator[Callable[[TraceEntry], None] | None]:
+        """Give what writes the trace file, None where none is wanted."""
+        if self.trace is None:
+            yield None
+            return
+        try:
+            stream = Path(self.trace).open("w", encoding="utf-8", buffering=1)  # noqa: SIM115
+        except OSError as exc:
+            raise ConfigurationError(f"--trace {self.trace}: {exc.strerror}") from exc
+        with stream:
+            yield lambda entry: print(json.dumps(jsonable(entry)), file=stream)
+
+    def show(self, value: object, text: Callable[[], str]) -> None:
+        """Print ``value`` as a line of JSON, or ``text()`` for people; flushed."""
+        line = json.dumps(jsonable(value)) if self.as_json else text()
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()

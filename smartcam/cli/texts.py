@@ -1,0 +1,72 @@
+"""Values as text for people."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import hex_excerpt
+from smartcam.models import Localization, Result, jsonable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["result_text", "table_text", "value_text"]
+
+
+def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return rows as aligned columns; numbers to the right."""
+    cells = [[_cell(value) for value in row] for row in rows]
+    widths = [max(len(text) for text in column) for column in zip(head, *cells, strict=True)]
+    numeric = [bool(rows) and isinstance(value, (int, float)) for value in (rows or [head])[0]]
+    lines = [
+        "  ".join(
+            text.rjust(width) if right else text.ljust(width)
+            for text, width, right in zip(line, widths, numeric, strict=True)
+        ).rstrip()
+        for line in [list(head), *cells]
+    ]
+    return "\n".join("  " + line for line in lines)
+
+
+def result_text(result: Result) -> str:
+    """Return a result: a line about it, then its value."""
+    latency = f", {1e3 * result.latency:.1f} ms after its trigger" if result.latency else ""
+    sequence = f", sequence {result.sequence}" if result.sequence is not None else ""
+    return (
+        f"result {result.number} of application {result.application}{sequence}{latency}\n"
+        f"{value_text(result.value)}"
+    )
+
+
+def value_text(value: Any) -> str:
+    """Return an interpreter's value as text."""
+    if isinstance(value, bytes):
+        return f"  {hex_excerpt(value)}"
+    if isinstance(value, list) and value and all(isinstance(v, Localization) for v in value):
+        return _localizations_text(value)
+    plain = jsonable(value)
+    if isinstance(plain, dict):
+        return "\n".join(f"  {name} = {_cell(item)}" for name, item in plain.items())
+    if isinstance(plain, list) and plain and all(isinstance(item, dict) for item in plain):
+        return table_text(list(plain[0]), [list(item.values()) for item in plain])
+    if isinstance(plain, list):
+        return "\n".join(f"  {_cell(item)}" for item in plain) or "  (nothing)"
+    return f"  {_cell(plain)}"
+
+
+def _localizations_text(parts: list[Localization]) -> str:
+    rows = [
+        (
+            part.feature_id,
+            part.quality,
+            part.pose.position.x,
+            part.pose.position.y,
+            part.pose.orientation.theta,
+        )
+        for part in parts
+    ]
+    return table_text(("feature_id", "quality", "x [m]", "y [m]", "theta [rad]"), rows)
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4f}" if isinstance(value, float) else str(value)

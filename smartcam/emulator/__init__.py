@@ -1,0 +1,33 @@
+"""An emulated smart camera: write and test an application without one on the desk.
+
+::
+
+    async with EmulatedCamera(applications=[...]) as emulator:
+        emulator.url    # bvs://127.0.0.1:PORT?dialect=handbook
+"""
+
+from smartcam.emulator.application import Application
+from smartcam.emulator.clock import Clock, ManualClock, RealClock
+from smartcam.emulator.device import Device
+from smartcam.emulator.generators import Run, register_generator
+from smartcam.emulator.quirks import Quirks
+from smartcam.emulator.scenario import Scenario, load_scenario
+from smartcam.emulator.scene import TableScene
+from smartcam.emulator.server import EmulatedCamera
+from smartcam.emulator.traffic import LogEntry
+
+__all__ = [
+    "Application",
+    "Clock",
+    "Device",
+    "EmulatedCamera",
+    "LogEntry",
+    "ManualClock",
+    "Quirks",
+    "RealClock",
+    "Run",
+    "Scenario",
+    "TableScene",
+    "load_scenario",
+    "register_generator",
+]

@@ -1,0 +1,348 @@
+"""Sockets of the emulated camera: they move bytes, what they mean is decided elsewhere.
+
+A link is one client's way to the camera: a TCP connection, or all datagrams of one address. Each
+has a :class:`~smartcam.protocols.machine.Machine` in the camera's role.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import Role, Transport
+from smartcam.protocols.machine import Machine
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from smartcam.emulator.quirks import Quirks
+    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framing import Frame
+
+__all__ = [
+    "MAX_INPUT",
+    "MAX_LINKS",
+    "WRITE_LIMIT",
+    "Link",
+    "Listener",
+    "Station",
+    "TcpListener",
+    "UdpListener",
+]
+
+_log = logging.getLogger("smartcam.emulator")
+
+MAX_INPUT = 1 << 16
+"""Bytes of payload the camera takes: input data has the container's limit of about 64 kB (HALCON
+script manual p. 35, published for that side)."""
+
+MAX_LINKS = 32
+"""Clients that are looked at. The camera serves one; a few more may wait to take over."""
+
+WRITE_LIMIT = 1 << 20
+"""Bytes kept for a client that does not read; more end its connection."""
+
+
+class Station(Protocol):
+    """What links want from the emulator behind them."""
+
+    @property
+    def spoken(self) -> Dialect:
+        """The dialect."""
+        ...
+
+    @property
+    def quirks(self) -> Quirks:
+        """The quirks."""
+        ...
+
+    def step(self) -> AbstractContextManager[object]:
+        """Bring the device's time up; afterwards deliver what it said."""
+        ...
+
+    def received(self, link: Link, message: m.Message) -> None:
+        """A link received a message."""
+        ...
+
+    def serves(self, link: Link) -> bool:
+        """Whether the link has the session."""
+        ...
+
+    def lost(self, link: Link) -> None:
+        """A link is gone; harmless when said twice."""
+        ...
+
+    def traced(self, link: Link, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+        """A machine saw a frame, or bytes that make none."""
+        ...
+
+
+class Link(ABC):
+    """One client's way to the camera."""
+
+    def __init__(self, station: Station, transport: Transport, peer: str) -> None:
+        self.peer = peer
+        self.closed = False
+        self._station = station
+        self._broken = False
+        self._machine = Machine(
+            station.spoken, Role.CAMERA, transport, max_length=MAX_INPUT, trace=self._trace
+        )
+
+    def say(self, message: m.Message) -> None:
+        """Put a message behind those that :meth:`flush` will write."""
+        try:
+            self._machine.send(message)
+        except LocalProtocolError as exc:
+            _log.warning("! %s: not sent: %s", self.peer, exc)
+
+    @abstractmethod
+    def flush(self) -> None:
+        """Write everything said."""
+
+    @abstractmethod
+    def close(self, reason: str) -> None:
+        """End the link; nothing is read or written any more."""
+
+    def _take(self, data: memoryview | bytes) -> None:
+        """Feed the machine and pass its messages on."""
+        self._machine.receive_data(data)
+        for event in self._machine.events():
+            if isinstance(event, m.Message) and not self.closed:
+                self._station.received(self, event)
+
+    def _trace(self, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+        self._broken = self._broken or isinstance(what, FrameError)
+        self._station.traced(self, sender, what)
+
+
+def _peer_text(address: Any) -> str:
+    return f"{address[0]}:{address[1]}" if address else "?"
+
+
+# ---------------------------------------------------------------------- TCP
+
+
+class _TcpLink(Link, asyncio.Protocol):
+    """A connection. All that one step causes goes out in one write (SC manual p. 40)."""
+
+    _transport: asyncio.Transport
+
+    def __init__(self, listener: TcpListener, station: Station) -> None:
+        super().__init__(station, Transport.TCP, "?")
+        self._listener = listener
+        self._tail = b""  # the last bytes received, a header's size of them
+        self._payload = 0  # bytes that the header in hand announces
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        self.peer = _peer_text(transport.get_extra_info("peername"))
+        self._listener.links.add(self)
+        if not self._listener.open:
+            self.close("the camera is down")
+            return
+        if len(self._listener.links) > MAX_LINKS:
+            self.close(f"{MAX_LINKS} connections are open already")
+            return
+        # the camera does so too (newest SC manual p. 40: published)
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def data_received(self, data: bytes) -> None:
+        with self._station.step():
+            rest = memoryview(data)
+            while rest and not self.closed:
+                size = self._missing()
+                piece, rest = rest[:size], rest[size:]
+                self._tail = (self._tail + piece)[-self._header_size :]
+                self._take(piece)
+                if self._broken and self._station.quirks.bad_frame == "close":
+                    self.close("a broken frame came")
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.closed = True
+        self._listener.links.discard(self)
+        with self._station.step():
+            self._station.lost(self)
+
+    def flush(self) -> None:
+        data = b"".join(self._machine.data_to_send())
+        if not data or self.closed:
+            return
+        if self._transport.get_write_buffer_size() + len(data) > WRITE_LIMIT:
+            self.close(f"it does not read: more than {WRITE_LIMIT} bytes wait for it")
+            return
+        self._transport.write(data)
+
+    def close(self, reason: str) -> None:
+        if not self.closed:
+            self.closed = True
+            _log.info("= %s: connection closed: %s", self.peer, reason)
+            self._transport.abort()
+            self._station.lost(self)
+
+    @property
+    def _header_size(self) -> int:
+        return self._station.spoken.header.size
+
+    def _missing(self) -> int:
+        """Return the bytes to the end of the header or frame that is being received.
+
+        The machine gets no more than one frame at a time: the answer to a message must be on its
+        way before the next one is looked at, for that one may be right only after the answer.
+        """
+        kept = self._machine.buffered
+        header = self._station.spoken.header
+        if kept < header.size:
+            return header.size - kept
+        # pieces end with the header, so these were the last bytes when its last one came
+        if kept == header.size:
+            self._payload = header.unpack(self._tail, 0)[1]
+        return header.size + self._payload - kept
+
+
+class Listener(ABC):
+    """The camera's port; it can be shut and opened again."""
+
+    kind: socket.SocketKind
+
+    @property
+    @abstractmethod
+    def all_links(self) -> list[Link]:
+        """The links that are open."""
+
+    @abstractmethod
+    async def serve(self, sock: socket.socket) -> None:
+        """Serve a bound socket."""
+
+    @abstractmethod
+    def shut(self) -> None:
+        """Close the port and every link, at once."""
+
+    async def wait_closed(self) -> None:
+        """Wait until the event loop has let go of all sockets."""
+        # asyncio lets go of a socket one round after abort(), and of one that was just accepted
+        # three rounds after it
+        for _ in range(5):
+            await asyncio.sleep(0)
+
+
+class TcpListener(Listener):
+    """Accepts connections."""
+
+    kind = socket.SOCK_STREAM
+
+    def __init__(self, station: Station) -> None:
+        self.links: set[_TcpLink] = set()
+        self._station = station
+        self._server: asyncio.Server | None = None
+
+    @property
+    def all_links(self) -> list[Link]:
+        """The links that are open."""
+        return list(self.links)
+
+    @property
+    def open(self) -> bool:
+        """Whether the port is open."""
+        return self._server is not None
+
+    async def serve(self, sock: socket.socket) -> None:
+        """Serve a bound socket."""
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(
+            lambda: _TcpLink(self, self._station), sock=sock, start_serving=False
+        )
+        await self._server.start_serving()
+
+    def shut(self) -> None:
+        """Close the port and every link, at once."""
+        server, self._server = self._server, None
+        if server is not None:
+            server.close()
+        for link in self.all_links:
+            link.close("the camera is down")
+
+
+# ---------------------------------------------------------------------- UDP
+
+
+class _UdpLink(Link):
+    """The datagrams of one address; one message is one datagram (SC manual p. 40)."""
+
+    def __init__(self, listener: UdpListener, station: Station, address: Any) -> None:
+        super().__init__(station, Transport.UDP, _peer_text(address))
+        self._listener = listener
+        self._address = address
+
+    def datagram_received(self, data: bytes) -> None:
+        with self._station.step():
+            self._take(data)
+
+    def flush(self) -> None:
+        for frame in self._machine.data_to_send():
+            self._listener.send(frame, self._address)
+
+    def close(self, reason: str) -> None:
+        if not self.closed:
+            self.closed = True
+            _log.debug("= %s: forgotten: %s", self.peer, reason)
+            self._listener.links.pop(self._address, None)
+            self._station.lost(self)
+
+
+class UdpListener(Listener, asyncio.DatagramProtocol):
+    """Sorts datagrams by address."""
+
+    kind = socket.SOCK_DGRAM
+
+    def __init__(self, station: Station) -> None:
+        self.links: dict[Any, _UdpLink] = {}  # the one that was heard last stands last
+        self._station = station
+        self._transport: asyncio.DatagramTransport | None = None
+
+    @property
+    def all_links(self) -> list[Link]:
+        """The links that are open."""
+        return list(self.links.values())
+
+    async def serve(self, sock: socket.socket) -> None:
+        """Serve a bound socket."""
+        loop = asyncio.get_running_loop()
+        self._transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=sock)
+
+    def shut(self) -> None:
+        """Close the port and every link, at once."""
+        transport, self._transport = self._transport, None
+        if transport is not None:
+            transport.abort()
+        for link in self.all_links:
+            link.close("the camera is down")
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        """Pass it to the link of its address; too many links drop the one silent for longest."""
+        if self._transport is None:
+            return  # the port is shut, the loop had this one already
+        link = self.links.pop(addr, None) or _UdpLink(self, self._station, addr)
+        self.links[addr] = link
+        if len(self.links) > MAX_LINKS:
+            next(old for old in self.all_links if not self._station.serves(old)).close("idle")
+        link.datagram_received(data)
+
+    def error_received(self, exc: Exception) -> None:
+        """Nobody reads the answers at a peer any more; the camera does not notice."""
+        _log.debug("! datagram not delivered: %s", exc)
+
+    def send(self, frame: bytes, address: Any) -> None:
+        """Send one datagram."""
+        if self._transport is None:
+            return
+        # the abstract class lacks it, every transport of asyncio has it
+        if cast("asyncio.Transport", self._transport).get_write_buffer_size() > WRITE_LIMIT:
+            _log.warning("! %s: datagram dropped: the network is too slow", _peer_text(address))
+            return
+        self._transport.sendto(frame, address)

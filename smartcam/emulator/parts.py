@@ -1,0 +1,111 @@
+"""Parts of the device with a life of their own: its calendar clock and its input queue."""
+
+from __future__ import annotations
+
+from collections import deque
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any
+
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["LOST_CLOCK", "CalendarClock", "InputQueue"]
+
+LOST_CLOCK = datetime(1970, 1, 1, tzinfo=UTC)
+"""What the clock shows after a restart: it is lost (published for a sibling, the value inferred).
+The camera's clock has no time zone; UTC stands here because a time of ours needs one."""
+
+
+class CalendarClock:
+    """Year to second, without a time zone.
+
+    Args:
+        time: what it shows at first.
+        now: the device's time, nanoseconds.
+    """
+
+    def __init__(self, time: datetime, now: int) -> None:
+        self._time = time.replace(tzinfo=UTC)
+        self._set_at = now
+
+    def read(self, now: int) -> datetime:
+        """Return what it shows; it stops at the end of the year 9999."""
+        try:
+            return self._time + timedelta(microseconds=(now - self._set_at) // 1000)
+        except OverflowError:
+            return datetime.max.replace(tzinfo=UTC)
+
+    def set(self, message: m.SetClock, now: int) -> None:
+        """Set it; what is no time is dropped.
+
+        Source: mvBlueGEMINI manual p. 30 (published): invalid values may be dropped or converted.
+        """
+        try:
+            time = datetime(
+                message.year,
+                message.month,
+                message.day,
+                message.hour,
+                message.minute,
+                message.second,
+                tzinfo=UTC,
+            )
+        except (ValueError, OverflowError):
+            return
+        self._time, self._set_at = time, now
+
+    def answer(self, now: int) -> m.ClockAnswer:
+        """Return what it shows as a message."""
+        time = self.read(now)
+        return m.ClockAnswer(
+            year=time.year,
+            month=time.month,
+            day=time.day,
+            hour=time.hour,
+            minute=time.minute,
+            second=time.second,
+        )
+
+
+class InputQueue:
+    """Input containers, one for each inspection.
+
+    Source: SC manual p. 30 and p. 33 (published): with more containers than inspections one is
+    dropped, with fewer one is reused. Which one, and the depth: unknown.
+
+    Args:
+        depth: containers kept.
+    """
+
+    def __init__(self, depth: int) -> None:
+        self._depth = depth
+        self._queue: deque[Mapping[str, Any]] = deque()
+        self._last: Mapping[str, Any] | None = None
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def put(self, values: Mapping[str, Any]) -> bool:
+        """Queue a container; False if the oldest was dropped for it."""
+        fits = len(self._queue) < self._depth
+        if not fits:
+            self._queue.popleft()
+        self._queue.append(values)
+        return fits
+
+    def take(self) -> tuple[Mapping[str, Any] | None, bool]:
+        """Return the next container, or the last one again and False.
+
+        None stands for the one before the first: zeros.
+        """
+        fits = bool(self._queue)
+        if fits:
+            self._last = self._queue.popleft()
+        return self._last, fits
+
+    def clear(self) -> None:
+        """Forget everything, the last one too."""
+        self._queue.clear()
+        self._last = None

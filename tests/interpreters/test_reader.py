@@ -1,0 +1,174 @@
+"""Reading values from a container, and running interpreters."""
+
+from __future__ import annotations
+
+import struct
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
+from smartcam.interpreters import Context, Interpreter, Reader, run
+from smartcam.layout import Layout
+
+if TYPE_CHECKING:
+    from smartcam.models import ByteOrder
+
+NUMBERS = {
+    "int8": ("b", -5),
+    "int16": ("h", -500),
+    "int32": ("i", -50_000),
+    "int64": ("q", -5_000_000_000),
+    "uint8": ("B", 250),
+    "uint16": ("H", 50_000),
+    "uint32": ("I", 4_000_000_000),
+    "uint64": ("Q", 2**63 + 5),
+    "real32": ("f", 0.5),
+    "real64": ("d", 0.1),
+}
+GETTERS = [*NUMBERS, "bool"]
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize(("order", "sign"), [("little", "<"), ("big", ">")])
+def test_numbers_are_read_in_the_contexts_byte_order(
+    name: str, order: ByteOrder, sign: str
+) -> None:
+    code, value = NUMBERS[name]
+    reader = Reader(b"\x99" + struct.pack(sign + code, value), Context(byte_order=order))
+    assert getattr(reader, f"get_{name}")(1) == value
+
+
+def test_bool_is_zero_or_all_ones() -> None:
+    reader = Reader(b"\x00\xff\x01")
+    assert (reader.get_bool(0), reader.get_bool(1)) == (False, True)
+    with pytest.raises(InterpretationError, match=r"offset 2: expected 0x00 or 0xFF .*, got 0x01"):
+        reader.get_bool(2)
+    assert Reader(b"\x01", Context(lenient=True)).get_bool(0) is True
+
+
+def test_string_ends_at_the_first_zero() -> None:
+    assert Reader(b"xab\0\xff").get_string(1, 4) == "ab"
+    assert Reader("äö".encode()).get_string(0, 4) == "äö"
+    with pytest.raises(InterpretationError) as caught:
+        Reader(b"xab\xffc").get_string(1, 4)
+    assert caught.value.offset == 3
+    assert "expected UTF-8 text, got 0xFF" in str(caught.value)
+
+
+def test_bytes_are_read_as_they_are() -> None:
+    reader = Reader(memoryview(b"abc\0"))
+    assert reader.get_bytes(1, 3) == b"bc\0"
+    assert reader.get_bytes(4, 0) == b""
+    assert len(reader) == 4
+
+
+@pytest.mark.parametrize(
+    ("first_byte", "length", "got"), [(2, 3, 2), (4, 1, 0), (9, 1, 0), (-1, 2, 4), (0, -1, 4)]
+)
+def test_read_outside_names_offset_and_sizes(first_byte: int, length: int, got: int) -> None:
+    with pytest.raises(InterpretationError) as caught:
+        Reader(b"abcd").get_bytes(first_byte, length)
+    error = caught.value
+    assert (error.offset, error.expected, error.got) == (first_byte, length, got)
+    assert f"offset {first_byte}: expected bytes of {length} bytes, got {got}" in str(error)
+
+
+@pytest.mark.parametrize("name", GETTERS)
+def test_every_getter_checks_its_place(name: str) -> None:
+    for first_byte in (-1, 0, 1):
+        with pytest.raises(InterpretationError) as caught:
+            getattr(Reader(b""), f"get_{name}")(first_byte)
+        assert caught.value.offset == first_byte
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=20), st.integers(-30, 30), st.sampled_from(GETTERS))
+def test_any_read_gives_a_value_or_an_interpretation_error(
+    data: bytes, first_byte: int, name: str
+) -> None:
+    reader = Reader(data)
+    try:
+        getattr(reader, f"get_{name}")(first_byte)
+        reader.get_string(first_byte, first_byte)
+    except InterpretationError:
+        pass
+
+
+def test_records_gives_offsets() -> None:
+    assert list(Reader(b"123456").records(2)) == [0, 2, 4]
+    assert list(Reader(b"").records(2)) == []
+
+
+def test_records_refuses_a_remainder() -> None:
+    with pytest.raises(InterpretationError) as caught:
+        Reader(b"12345").records(2)
+    error = caught.value
+    assert (error.offset, error.expected, error.got) == (4, 2, 1)
+    assert "expected whole records of 2 bytes, got 1 bytes (the container has 5)" in str(error)
+
+
+def test_records_of_nothing_is_a_mistake_of_the_interpreter() -> None:
+    with pytest.raises(ValueError, match="at least 1 byte, got 0"):
+        Reader(b"12").records(0)
+
+
+def test_context_has_defaults() -> None:
+    context = Reader(b"").context
+    assert context == Context()
+    assert context.received_at == datetime(1970, 1, 1, tzinfo=UTC)
+
+
+# -- run ------------------------------------------------------------------------------------------
+
+
+class Fails(Interpreter):
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self.error = error
+
+    def interpret(self, reader: Reader) -> object:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    "error", [struct.error("short"), ValueError("no"), KeyError("x"), ConfigurationError("odd")]
+)
+def test_run_turns_any_error_into_an_interpretation_error(error: Exception) -> None:
+    with pytest.raises(InterpretationError) as caught:
+        run(Fails(error), Reader(b"12"))
+    assert caught.value.__cause__ is error
+    assert f"the interpreter failed with {type(error).__name__}" in str(caught.value)
+    assert "the container has 2 bytes" in str(caught.value)
+
+
+@pytest.mark.parametrize("error", [InterpretationError("no"), WrongApplicationError("other")])
+def test_run_leaves_interpretation_errors_as_they_are(error: Exception) -> None:
+    with pytest.raises(InterpretationError) as caught:
+        run(Fails(error), Reader(b""))
+    assert caught.value is error
+
+
+def test_run_gives_the_reader_the_interpreters_layout() -> None:
+    class Sees(Interpreter):
+        default_layout = "a: int8"
+
+        def interpret(self, reader: Reader) -> Any:
+            return reader.layout
+
+    assert run(Sees(), Reader(b"1")) == Layout("a: int8")
+    assert run(Sees(), Reader(b"1", layout=Layout("b: int8"))) == Layout("b: int8")
+
+
+def test_sequence_is_the_layouts() -> None:
+    interpreter = Fails(ValueError())
+    assert interpreter.sequence(Reader(b"1")) is None
+    interpreter.layout = Layout("a: int8")
+    assert interpreter.sequence(Reader(b"")) is None
+    interpreter.layout = Layout("s: uint16 @sequence")
+    assert interpreter.sequence(Reader(b"\0\1", Context(byte_order="big"))) == 1
+    with pytest.raises(InterpretationError):
+        interpreter.sequence(Reader(b"\0"))
