@@ -1,0 +1,77 @@
+"""Hypothesis profiles, and the check that no test leaves a task or an open transport behind."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import os
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import settings
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+settings.register_profile("quick", deadline=None, max_examples=10)
+settings.register_profile("ci", deadline=None, max_examples=50, derandomize=True)
+settings.register_profile("nightly", deadline=None, max_examples=2000, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+GRACE_STEPS = 100
+"""Loop steps that what was cancelled or aborted gets to end itself."""
+
+
+def open_resources(loop: asyncio.AbstractEventLoop) -> set[Any]:
+    """Return what is open in ``loop``: tasks, transports, servers, and whatever else it watches.
+
+    Transports and sockets are those of a selector loop; another kind of loop shows tasks only.
+    """
+    found: set[Any] = {task for task in asyncio.all_tasks(loop) if not task.done()}
+    found.discard(asyncio.current_task(loop))
+    transports = dict(getattr(loop, "_transports", {}))
+    found |= {one for one in transports.values() if getattr(one, "_sock", None) is not None}
+    selector = getattr(loop, "_selector", None)
+    own = getattr(loop, "_ssock", None)
+    for key in selector.get_map().values() if selector is not None else ():
+        if key.fd not in transports and own is not None and key.fd != own.fileno():
+            handle = key.data[0] or key.data[1]
+            servers = [one for one in handle._args or () if isinstance(one, asyncio.Server)]
+            found.add(servers[0] if servers else f"a watch on file descriptor {key.fd}")
+    return found
+
+
+@pytest.fixture
+async def no_leaks() -> AsyncIterator[None]:
+    """Fail a test that leaves a task, a transport or a listening socket behind.
+
+    It is asynchronous because a synchronous fixture runs without a loop and sees nothing.
+    """
+    loop = asyncio.get_running_loop()
+    before = open_resources(loop)
+    yield
+    for _ in range(GRACE_STEPS):
+        if not open_resources(loop) - before:
+            return
+        await asyncio.sleep(0)
+    left = open_resources(loop) - before
+    for one in left:
+        if isinstance(one, asyncio.Task):
+            one.cancel()
+        elif isinstance(one, asyncio.Transport):
+            one.abort()
+        elif hasattr(one, "close"):
+            one.close()
+    await asyncio.sleep(0)
+    if left:
+        names = "; ".join(sorted(repr(one) for one in left))
+        pytest.fail(f"the test left behind: {names}", pytrace=False)
+
+
+@pytest.fixture(autouse=True)
+def _no_leaks_in_async_tests(request: pytest.FixtureRequest) -> None:
+    """Give every asynchronous test the check above; synchronous ones get no loop for it."""
+    test = getattr(request, "function", None)
+    inner = getattr(getattr(test, "hypothesis", None), "inner_test", test)
+    if inspect.iscoroutinefunction(inner):
+        request.getfixturevalue("no_leaks")
