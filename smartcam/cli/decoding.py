@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from smartcam.cli.texts import value_text
+from smartcam.cli.texts import table_text, value_text
 from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
 from smartcam.handshake import load_protocol
 from smartcam.interpreters.base import Context, Interpreter, Reader, resolve, run
-from smartcam.models import jsonable
+from smartcam.protocols._layouts import view_fields
 from smartcam.protocols.framing import Framer
-from smartcam.protocols.messages import ResultContainer, Sender, wire_fields
+from smartcam.protocols.messages import ResultContainer, Sender
 
 if TYPE_CHECKING:
     from smartcam.cli.options import Options
@@ -109,40 +109,40 @@ def _show_frame(
     byte_order: ByteOrder,
     options: Options,
 ) -> None:
-    shown: dict[str, Any] = {
-        "offset": offset,
-        "dialect": dialect.name,
-        "message_id": frame.message_id,
-        "messages": [],
-    }
-    lines = [f"at {offset}: {dialect.name} frame, message {frame.message_id:#04x}"]
+    """Print one frame field by field, as each message that it can be."""
+    raw = dialect.encode_frame(frame)
     for sender in _senders(dialect, frame):
-        message = dialect.decode(sender, frame)
-        fields = {n: jsonable(getattr(message, n)) for n, _ in wire_fields(type(message))}
-        entry = {"sender": sender.value, "message": type(message).__name__, "fields": fields}
-        text = ", ".join(f"{n}={v}" for n, v in fields.items())
-        lines.append(f"  from the {sender.value}: {type(message).__name__}({text})")
-        if isinstance(message, ResultContainer) and interpreter is not None:
-            entry["value"] = _interpret(message.data, interpreter, byte_order)
-            lines.append(value_text(entry["value"]))
-        shown["messages"].append(entry)
-    if not shown["messages"]:
-        lines.append(f"  no message of this dialect: {hex_excerpt(frame.payload)}")
-        shown["payload"] = frame.payload
-    options.show(shown, lambda: "\n".join(lines))
+        name = dialect.message_type(sender, frame.message_id).__name__
+        fields = view_fields(dialect, sender, raw)
+        shown: dict[str, Any] = {
+            "offset": offset,
+            "dialect": dialect.name,
+            "sender": sender.value,
+            "message_id": frame.message_id,
+            "message": name,
+            "fields": fields,
+        }
+        lines = [f"at {offset}: {name} from the {sender.value}, dialect {dialect.name}"]
+        rows = [
+            (f.offset, f.name, hex_excerpt(f.raw), f.value if isinstance(f.value, int) else "")
+            for f in fields
+        ]
+        lines.append(table_text(("offset", "field", "bytes", "value"), rows))
+        if name == ResultContainer.__name__ and interpreter is not None:
+            shown["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
+            lines.append(value_text(shown["value"]))
+        options.show(shown, lambda: "\n".join(lines))  # noqa: B023 - called at once
 
 
 def _senders(dialect: Dialect, frame: Frame) -> list[Sender]:
-    """Return whose messages the frame can be, by id and by size."""
-    return [
+    """Return whose message the frame can be, by id and size; both where neither fits."""
+    exact = [
         sender
         for sender in Sender
         if dialect.knows(sender, frame.message_id) and dialect.surplus(sender, frame) == 0
-    ] or [
-        sender
-        for sender in Sender
-        if dialect.knows(sender, frame.message_id) and dialect.surplus(sender, frame) > 0
     ]
+    known = [sender for sender in Sender if dialect.knows(sender, frame.message_id)]
+    return exact or known[-1:] or [Sender.CAMERA]
 
 
 def _interpret(payload: bytes, interpreter: Interpreter, byte_order: ByteOrder) -> Any:

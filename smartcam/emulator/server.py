@@ -247,7 +247,7 @@ class EmulatedCamera:
             self._socket = self._bind()
             self._port = self._socket.getsockname()[1]
             await self._listener.serve(self._socket)
-        except OSError as exc:
+        except (OSError, ValueError, OverflowError) as exc:
             self._shut()
             raise ConfigurationError(
                 f"emulator: cannot listen on {self.transport} {self.host}:{self._port}: {exc}"

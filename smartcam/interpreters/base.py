@@ -87,9 +87,9 @@ class Reader:
         context: Context | None = None,
         layout: Layout | None = None,
     ) -> None:
-        self.data = bytes(data)
-        self.context = Context() if context is None else context
-        self.layout = layout
+        self.data: bytes = bytes(data)
+        self.context: Context = Context() if context is None else context
+        self.layout: Layout | None = layout
 
     def __len__(self) -> int:
         return len(self.data)
@@ -230,7 +230,7 @@ class Interpreter(ABC):
                 f"interpreter {name}: expected a layout, got none; "
                 f'write one behind the name, as in "{name}: x: real32 mm, y: real32 mm"'
             )
-        self.layout = layout
+        self.layout: Layout | None = layout
 
     @abstractmethod
     def interpret(self, reader: Reader) -> object:

@@ -64,7 +64,7 @@ class Localizations(Interpreter):
         "(feature_id: string[50], quality: real32, photo_index: int32, "
         "x: real32, y: real32, theta: real32)*"
     )
-    layout: Layout
+    layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
     def __init__(self, layout: Layout | None = None) -> None:
         super().__init__(layout)

@@ -17,7 +17,7 @@ class Record(Interpreter):
     """Gives what :meth:`smartcam.Layout.parse` gives; needs a layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
-    layout: Layout
+    layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
     def interpret(self, reader: Reader) -> Any:
         """Return the record, or the list of records.

@@ -19,7 +19,7 @@ class Table(Interpreter):
     """Gives what :meth:`smartcam.Layout.parse_table` gives; needs a layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
-    layout: Layout
+    layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
     def interpret(self, reader: Reader) -> np.ndarray[tuple[int], np.dtype[np.void]]:
         """Return the records as a structured array of one dimension, read-only.

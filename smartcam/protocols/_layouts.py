@@ -1,0 +1,91 @@
+"""construct views of a dialect, generated from its message table.
+
+They describe complete frames field by field, with offsets: for people (``smartcam decode``, the
+documentation) and as a second reading of the same table in tests. The hot path does not use them.
+construct is untyped; it is imported here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import construct as c
+
+from smartcam.exceptions import MessageError, hex_excerpt
+from smartcam.protocols.messages import Wire, wire_fields
+
+if TYPE_CHECKING:
+    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.messages import Sender
+
+__all__ = ["FieldView", "frame_view", "view_fields"]
+
+
+class FieldView(NamedTuple):
+    """One field of a frame.
+
+    Attributes:
+        name: as in the message, or ``magic``, ``length``, ``message_id``.
+        offset: of its first byte in the frame.
+        raw: its bytes.
+        value: an integer, or the bytes.
+    """
+
+    name: str
+    offset: int
+    raw: bytes
+    value: Any
+
+
+@functools.cache
+def frame_view(dialect: Dialect, sender: Sender) -> c.Construct:
+    """Return a construct for whole frames from one sender; it parses and builds."""
+    integer = {"I": c.Int32ul, "H": c.Int16ul}
+    types = {Wire.WORD: integer[dialect.word], Wire.UINT32: c.Int32ul, Wire.DATA: c.GreedyBytes}
+    bodies = {
+        row.message_id: c.Struct(
+            *[name / c.RawCopy(types[wire]) for name, wire in wire_fields(row.type)], c.Terminated
+        )
+        for row in dialect.table
+        if row.type.sender is sender
+    }
+    header = dialect.header
+    size = c.this.length.value - header.length_includes
+    names = ("length", "message_id") if header.order == "length, id" else ("message_id", "length")
+    return c.Struct(
+        *(["magic" / c.RawCopy(c.Const(header.magic))] if header.magic else []),
+        *[name / c.RawCopy(integer[header.code]) for name in names],
+        "body"
+        / c.FixedSized(
+            size,
+            c.Switch(
+                c.this.message_id.value,
+                bodies,
+                default=c.Struct("payload" / c.RawCopy(c.GreedyBytes), c.Terminated),
+            ),
+        ),
+        c.Terminated,
+    )
+
+
+def view_fields(dialect: Dialect, sender: Sender, data: bytes) -> list[FieldView]:
+    """Return every field of one complete frame, in order.
+
+    Raises:
+        MessageError: it is no complete frame of this dialect from this sender.
+    """
+    try:
+        parsed = frame_view(dialect, sender).parse(data)
+    except c.ConstructError as exc:
+        raise MessageError(
+            f"no whole {dialect.name} frame from the {sender.value}: {hex_excerpt(data)}: {exc}",
+            data=data,
+        ) from exc
+    body = parsed.pop("body")
+    return [
+        FieldView(name, field.offset1, field.data, field.value)
+        for part in (parsed, body)
+        for name, field in part.items()
+        if name != "_io"
+    ]
