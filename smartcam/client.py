@@ -158,8 +158,9 @@ class SmartCamera:
         finally:
             if supervisor is not None and session is None:
                 supervisor.cancel()
-            if supervisor is not None and supervisor is not asyncio.current_task():
+            if supervisor is not None:
                 await asyncio.wait({supervisor})
+            self._inbox.finish()
 
     async def __aenter__(self) -> Self:
         return await self.open()
@@ -594,6 +595,7 @@ class SmartCamera:
         finally:
             self._jobs = None
             self._inbox.fail(error)
+            self._inbox.finish()
             if self._session is not None:
                 self._session.link.abort()
             self._tell_opener(error)
@@ -620,7 +622,7 @@ class SmartCamera:
             ours = isinstance(self._inbox.end, ConnectionClosedError)
             reason = "closed by this side" if ours else str(error.__cause__)
             if not ours:
-                logger.warning("%s ! %s", self.name, error)
+                logger.warning("! %s", error)
             self._inbox.publish(
                 Disconnected(camera=self.name, at=datetime.now(UTC), reason=reason, expected=ours)
             )

@@ -275,8 +275,9 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
             self._wakeup.set_result(None)
 
     def _lost_error(self) -> ConnectionLostError:
+        where = "" if self.name == self.peer else f" to {self.peer}"
         error = ConnectionLostError(
-            f"{self.name}: the link to {self.peer} is gone: {self._loss}",
+            f"{self.name}: the link{where} is gone: {self._loss}",
             host=self.host,
             port=self.port,
         )

@@ -132,7 +132,10 @@ class Inbox:
                     pass  # LinkFailed and LinkEnded: the link tells its reader when it is drained
 
     def fail(self, error: SmartCamError) -> None:
-        """The session is over: tell everybody who waits, and everybody who comes later."""
+        """The session is over: tell everybody who waits, and everybody who comes later.
+
+        The first reason stays. Streams go on until :meth:`finish`.
+        """
         if self.end is not None:
             return
         self.end = error
@@ -148,9 +151,11 @@ class Inbox:
                 future.set_exception(error)
         self.next_results.clear()
         self._status_waiters.clear()
-        closed_by_us = isinstance(error, ConnectionClosedError)
+
+    def finish(self) -> None:
+        """Nothing more will come: end the streams, quietly if it was us who closed."""
         for stream in self.streams():
-            stream.end(None if closed_by_us else error)
+            stream.end(None if isinstance(self.end, ConnectionClosedError) else self.end)
 
     # ------------------------------------------------------------------ for the client
 

@@ -71,6 +71,9 @@ def run(
     """
     if debug:
         logging.basicConfig(level=logging.DEBUG, stream=sys.stderr)
+    else:
+        # without a handler Python prints warnings on its own, beside our one line
+        logging.getLogger("smartcam").addHandler(logging.NullHandler())
     ended_by: list[signal.Signals] = []
     try:
         asyncio.run(_with_signals(main, ended_by))

@@ -162,6 +162,7 @@ class _TcpLink(Link, asyncio.Protocol):
                 self._take(piece)
                 if self._broken and self._station.quirks.bad_frame == "close":
                     self.close("a broken frame came")
+            self.flush()  # also what was said before a Disconnect in the same bytes
 
     def connection_lost(self, exc: Exception | None) -> None:
         self.closed = True
@@ -282,6 +283,7 @@ class _UdpLink(Link):
     def datagram_received(self, data: bytes) -> None:
         with self._station.step():
             self._take(data)
+            self.flush()
 
     def flush(self) -> None:
         for frame in self._machine.data_to_send():

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias
 
-from smartcam._layout_text import TYPES
 from smartcam.exceptions import (
     ConfigurationError,
     InterpretationError,
@@ -26,6 +25,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.layout import Layout
+from smartcam.layout.text import TYPES
 from smartcam.registry import INTERPRETERS
 
 if TYPE_CHECKING:

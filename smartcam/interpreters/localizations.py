@@ -6,9 +6,9 @@ import math
 import operator
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
-from smartcam._layout_text import UNITS
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.interpreters.base import Interpreter
+from smartcam.layout.text import UNITS
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:

@@ -156,7 +156,7 @@ class Framer:
         begin = self._start
         found = self._buffer.find(magic, begin + 1) if magic else -1
         if found < 0:
-            keep = min(len(magic) - 1, self.buffered - 1) if magic else 0
+            keep = min(len(magic) - 1, max(self.buffered - 1, 0)) if magic else 0
             while keep and not magic.startswith(self._buffer[-keep:]):
                 keep -= 1
             found = len(self._buffer) - keep

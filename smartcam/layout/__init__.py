@@ -18,9 +18,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from smartcam._layout_codec import Payload, Record, RecordCodec, check_names, named, record_class
-from smartcam._layout_text import Field, parse_text, to_text
 from smartcam.exceptions import ConfigurationError, InterpretationError
+from smartcam.layout.codec import Payload, Record, RecordCodec, check_names, named, record_class
+from smartcam.layout.text import Field, parse_text, to_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -191,7 +191,7 @@ class Layout:
         Raises:
             InterpretationError: the payload does not fit, or a byte is no bool.
         """
-        from smartcam._layout_tables import table
+        from smartcam.layout.tables import table
 
         head, records = self._codecs[byte_order]
         count = self._count(payload, byte_order)
@@ -261,7 +261,7 @@ class Layout:
 
     def dtype_for(self, byte_order: ByteOrder) -> np.dtype[np.void]:
         """Return the wire's dtype of one record in a byte order."""
-        from smartcam._layout_tables import wire_dtype
+        from smartcam.layout.tables import wire_dtype
 
         if self._dtype is None:
             self._dtype = wire_dtype(self.fields)
@@ -275,7 +275,7 @@ class Layout:
         (``json``, ``copy``, ...) has that name as alias.
         """
         if self._model is None:
-            from smartcam._layout_files import make_model
+            from smartcam.layout.files import make_model
 
             self._model = make_model(self._spec)
         return self._model
@@ -289,7 +289,7 @@ class Layout:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout as plain data, which :meth:`from_dict` takes back."""
-        from smartcam._layout_files import to_data
+        from smartcam.layout.files import to_data
 
         return to_data(self._spec, lenient=self._lenient)
 
@@ -305,7 +305,7 @@ class Layout:
             ConfigurationError: unknown keys or values of the wrong type.
             LayoutError: what they say makes no layout.
         """
-        from smartcam._layout_files import from_data
+        from smartcam.layout.files import from_data
 
         text, lenient = from_data(data)
         return cls(text, lenient=lenient)
@@ -316,7 +316,7 @@ class Layout:
         Raises:
             MissingExtraError: PyYAML is not installed.
         """
-        from smartcam._layout_files import dump_yaml
+        from smartcam.layout.files import dump_yaml
 
         return dump_yaml(self.to_dict())
 
@@ -329,7 +329,7 @@ class Layout:
             LayoutError: the text is neither YAML nor a layout text, or makes no layout.
             MissingExtraError: PyYAML is not installed.
         """
-        from smartcam._layout_files import load_yaml
+        from smartcam.layout.files import load_yaml
 
         loaded = load_yaml(text)
         return cls.from_dict(loaded) if isinstance(loaded, Mapping) else cls(loaded)

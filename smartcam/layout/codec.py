@@ -16,14 +16,14 @@ from collections import namedtuple
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
-from smartcam._layout_text import UNITS
 from smartcam.exceptions import ConfigurationError, InterpretationError, hex_excerpt
+from smartcam.layout.text import UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import ClassVar, TypeAlias
 
-    from smartcam._layout_text import Field, Unit
+    from smartcam.layout.text import Field, Unit
     from smartcam.models import ByteOrder
 
     Convert: TypeAlias = Callable[[Sequence[Any]], list[Any]]

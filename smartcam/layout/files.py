@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, RootModel, ValidationError, create_model
 from pydantic import Field as ModelField
 
-from smartcam._layout_text import TYPES, UNITS, LayoutSpec, parse_text, to_text
-from smartcam._layout_text import Field as LayoutField
 from smartcam.exceptions import ConfigurationError, LayoutError, MissingExtraError
+from smartcam.layout.text import TYPES, UNITS, LayoutSpec, parse_text, to_text
+from smartcam.layout.text import Field as LayoutField
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

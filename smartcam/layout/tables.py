@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam._layout_text import UNITS
+from smartcam.layout.text import UNITS
 
 if TYPE_CHECKING:
-    from smartcam._layout_codec import Payload, RecordCodec
-    from smartcam._layout_text import Field
+    from smartcam.layout.codec import Payload, RecordCodec
+    from smartcam.layout.text import Field
 
 __all__ = ["table", "wire_dtype"]
 

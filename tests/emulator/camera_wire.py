@@ -1,0 +1,136 @@
+"""Bytes on the wire, written down by hand: no code of the library makes or reads them.
+
+Vectors from the published pages are marked *published*, those put together from the published
+layouts *derived*.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING, Self
+
+if TYPE_CHECKING:
+    from smartcam.emulator import EmulatedCamera
+
+MAGIC = bytes.fromhex("50535642")
+THESIS_MAGIC = bytes.fromhex("42565350")
+
+CONNECT = bytes.fromhex("50535642 00000000 01000000")  # derived
+CONNECTED = bytes.fromhex("50535642 04000000 01000000 01000000")  # derived
+DISCONNECT = bytes.fromhex("50535642 00000000 02000000")  # derived
+QUERY = bytes.fromhex("50535642 00000000 30000000")  # derived
+ACTIVE_21 = bytes.fromhex("50535642 04000000 30000000 15000000")  # derived
+ACTIVE_1 = bytes.fromhex("50535642 04000000 30000000 01000000")
+SWITCH_21 = bytes.fromhex("50535642 04000000 31000000 15000000")
+SWITCHED_21 = bytes.fromhex("50535642 08000000 31000000 00000000 15000000")
+SWITCH_5 = bytes.fromhex("50535642 04000000 31000000 05000000")  # derived
+REFUSED_1 = bytes.fromhex("50535642 08000000 31000000 01000000 01000000")  # derived
+SET_CLOCK = bytes.fromhex(  # published: vector A-1, 2016-06-25 10:11:12
+    "50535642 18000000 33000000 E0070000 06000000 19000000 0A000000 0B000000 0C000000"
+)
+GET_CLOCK = bytes.fromhex("50535642 00000000 32000000")
+CLOCK = bytes.fromhex(
+    "50535642 18000000 32000000 E0070000 06000000 19000000 0A000000 0B000000 0C000000"
+)
+TRIGGER = bytes.fromhex("50535642 00000000 40000000")  # derived
+START = bytes.fromhex("50535642 00000000 41000000")
+STOP = bytes.fromhex("50535642 00000000 42000000")
+REBOOT = bytes.fromhex("50535642 00000000 43000000")
+NO_BIT = bytes.fromhex("50535642 08000000 12000000 00000000 00000000")
+BUSY = bytes.fromhex("50535642 08000000 12000000 10000000 00000000")  # derived
+RUNNING = bytes.fromhex("50535642 08000000 12000000 80000000 00000000")
+WAITING = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")  # derived
+OVERTRIGGERED = bytes.fromhex("50535642 08000000 12000000 80010000 00000000")  # derived
+OVERTRIGGERED_WAITING = bytes.fromhex("50535642 08000000 12000000 80030000 00000000")
+HELLO_WORLD = bytes.fromhex(  # derived
+    "50535642 18000000 20000000 15000000 48656c6c6f20576f726c64 000000000000000000"
+)
+RESULT_3 = bytes.fromhex(  # derived
+    "50535642 19000000 20000000 03000000 ff 02000000 0000cb42 000050c0 4142430000000000"
+)
+
+TIMEOUT = 5.0
+
+
+def thesis(frame: bytes) -> bytes:
+    """Return a handbook frame as the thesis writes it: other magic, the length counts the id."""
+    length = int.from_bytes(frame[4:8], "little") + 4
+    return THESIS_MAGIC + length.to_bytes(4, "little") + frame[8:]
+
+
+class TcpClient:
+    """A plain TCP client."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader = reader
+        self.writer = writer
+
+    @classmethod
+    async def open(cls, emulator: EmulatedCamera) -> Self:
+        async with asyncio.timeout(TIMEOUT):
+            return cls(*await asyncio.open_connection(emulator.host, emulator.port))
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self.writer.transport.abort()
+        # the transport lets go of its socket in the loop's next round
+        await asyncio.sleep(0)
+
+    def send(self, *frames: bytes) -> None:
+        self.writer.write(b"".join(frames))
+
+    async def expect(self, *frames: bytes) -> None:
+        """Read exactly these bytes."""
+        for expected in frames:
+            async with asyncio.timeout(TIMEOUT):
+                got = await self.reader.readexactly(len(expected))
+            assert got.hex(" ") == expected.hex(" ")
+
+    async def expect_nothing_but(self, request: bytes, answer: bytes) -> None:
+        """See that nothing was on its way: the next bytes answer ``request``."""
+        self.send(request)
+        await self.expect(answer)
+
+    async def expect_end(self) -> None:
+        """See that the camera closes the connection and says nothing more."""
+        async with asyncio.timeout(TIMEOUT):
+            try:
+                rest = await self.reader.read()
+            except ConnectionResetError:
+                rest = b""
+        assert rest == b""
+
+
+class UdpClient:
+    """A plain UDP client."""
+
+    def __init__(self, emulator: EmulatedCamera) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.connect((emulator.host, emulator.port))
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self.socket.close()
+
+    def send(self, *datagrams: bytes) -> None:
+        for datagram in datagrams:
+            self.socket.send(datagram)
+
+    async def expect(self, *datagrams: bytes) -> None:
+        """Receive exactly these datagrams."""
+        for expected in datagrams:
+            async with asyncio.timeout(TIMEOUT):
+                got = await asyncio.get_running_loop().sock_recv(self.socket, 1 << 17)
+            assert got.hex(" ") == expected.hex(" ")
+
+    async def expect_nothing_but(self, request: bytes, answer: bytes) -> None:
+        """See that nothing was on its way: the next datagram answers ``request``."""
+        self.send(request)
+        await self.expect(answer)

@@ -1,0 +1,525 @@
+"""The state machine: every state with every input, policies, counters, answers."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+from machines import DIALECTS, EXAMPLES, camera, client, feed, machine
+
+from smartcam.exceptions import (
+    FrameError,
+    LocalProtocolError,
+    MessageError,
+    RemoteProtocolError,
+)
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import Dialect, Policy, Role, Transport
+from smartcam.protocols.bvs import HANDBOOK
+from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame
+from smartcam.protocols.machine import (
+    TRANSITIONS,
+    Counters,
+    LinkEnded,
+    LinkFailed,
+    Machine,
+    State,
+)
+
+if TYPE_CHECKING:
+    from smartcam.protocols.machine import Event
+
+TCP, UDP = Transport.TCP, Transport.UDP
+CLIENT, CAMERA = m.Sender.CLIENT, m.Sender.CAMERA
+LIVE = [state for state in State if state not in {State.CLOSED, State.FAILED}]
+
+MAGIC = bytes.fromhex("50535642")
+STATUS = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")
+STATUS_MESSAGE = m.StatusReport(status=Status(0x280))
+QUERY = bytes.fromhex("50535642 00000000 30000000")
+QUERY_ANSWER = bytes.fromhex("50535642 04000000 30000000 15000000")
+TRIGGER = bytes.fromhex("50535642 00000000 40000000")
+
+each_message = pytest.mark.parametrize("message", EXAMPLES, ids=lambda one: type(one).__name__)
+each_state = pytest.mark.parametrize("state", State)
+each_transport = pytest.mark.parametrize("transport", Transport)
+
+
+def header(length: int, message_id: int = 0x20) -> bytes:
+    return MAGIC + struct.pack("<II", length, message_id)
+
+
+def failure(events: list[Event]) -> RemoteProtocolError:
+    """Return the error of the only event."""
+    (event,) = events
+    assert isinstance(event, LinkFailed)
+    return event.error
+
+
+# ---------------------------------------------------------------------- the table
+
+
+def test_transitions_camera_says_nothing_without_a_session() -> None:
+    assert not [key for key in TRANSITIONS if key[:2] == (State.IDLE, CAMERA)]
+    connecting = [key[2] for key in TRANSITIONS if key[:2] == (State.CONNECTING, CAMERA)]
+    assert connecting == [m.ConnectAnswer]
+
+
+def test_transitions_ended_links_take_nothing() -> None:
+    assert {state for state, _, _ in TRANSITIONS} == set(LIVE)
+    assert set(TRANSITIONS.values()) == set(LIVE)
+
+
+def test_transitions_disconnect_is_legal_in_every_live_state_and_connect_too() -> None:
+    for state in LIVE:
+        assert TRANSITIONS[state, CLIENT, m.Connect] is State.CONNECTING
+        ends = State.IDLE if state is State.IDLE else State.DISCONNECTED
+        assert TRANSITIONS[state, CLIENT, m.Disconnect] is ends
+
+
+def test_transitions_senders_are_those_of_the_messages() -> None:
+    for _, sender, message in TRANSITIONS:
+        if message is not m.UnknownMessage:
+            assert message.sender is sender
+
+
+def test_transitions_every_message_has_a_place() -> None:
+    assert {message for _, _, message in TRANSITIONS} == {type(one) for one in EXAMPLES}
+
+
+# ---------------------------------------------------------------------- state x input
+
+
+@each_state
+@each_message
+@pytest.mark.parametrize("role", Role)
+def test_send_in_every_state_follows_the_table_or_changes_nothing(
+    role: Role, message: m.Message, state: State
+) -> None:
+    made = machine(role, state)
+    following = TRANSITIONS.get((state, role.sends, type(message)))
+    if following is not None:
+        made.send(message)
+        assert made.state is following
+        assert made.data_to_send() == [HANDBOOK.encode(message)]
+        assert made.counters.frames_sent == 1
+        return
+    with pytest.raises(LocalProtocolError) as caught:
+        made.send(message)
+    assert str(caught.value) == (
+        f"{type(message).__name__} cannot be sent by the {role.value} in state {state.value}"
+    )
+    assert (made.state, made.data_to_send(), made.counters) == (state, [], Counters())
+
+
+@each_state
+@each_transport
+@pytest.mark.parametrize(
+    ("role", "message"),
+    [
+        pytest.param(role, message, id=f"{role.value}-{type(message).__name__}")
+        for role in Role
+        for message in EXAMPLES
+        if getattr(message, "sender", role.receives) is role.receives
+    ],
+)
+def test_receive_in_every_state_follows_the_table_or_the_policy(
+    role: Role, transport: Transport, message: m.Message, state: State
+) -> None:
+    made = machine(role, state, transport=transport)
+    following = TRANSITIONS.get((state, role.receives, type(message)))
+    events = feed(made, HANDBOOK.encode(message))
+    if state in {State.CLOSED, State.FAILED}:
+        assert (events, made.state, made.counters) == ([], state, Counters())
+    elif following is not None:
+        assert (made.state, made.counters.ignored_frames) == (following, 0)
+        unasked = made.counters.unexpected_messages
+        assert events == ([] if unasked else [message])
+        assert not unasked or role is Role.CLIENT
+    elif role is Role.CLIENT and transport is TCP:
+        assert f"came in state {state.value}, where it is not expected" in str(failure(events))
+        assert made.state is State.FAILED
+    else:
+        assert (events, made.state, made.counters.ignored_frames) == ([], state, 1)
+
+
+def test_client_that_hears_its_own_connect_fails() -> None:
+    made = machine(Role.CLIENT)
+    made.send(m.Connect())
+    error = failure(feed(made, *made.data_to_send()))
+    assert str(error) == "ConnectAnswer (0x01) came with 0 bytes, it needs 4: "
+
+
+@each_state
+@pytest.mark.parametrize("role", Role)
+def test_receive_eof_in_every_state_closes_once(role: Role, state: State) -> None:
+    made = machine(role, state)
+    made.receive_data(MAGIC[:3])
+    made.receive_eof()
+    made.receive_eof()
+    if state in {State.CLOSED, State.FAILED}:
+        assert (made.events(), made.state) == ([], state)
+        return
+    assert made.events() == [LinkEnded(pending=3)]
+    assert (made.state, made.buffered) == (State.CLOSED, 0)
+    assert feed(made, STATUS) == []
+
+
+def test_receive_eof_between_frames_leaves_nothing_pending() -> None:
+    made = client()
+    made.receive_data(STATUS)
+    made.receive_eof()
+    assert made.events() == [STATUS_MESSAGE, LinkEnded(pending=0)]
+
+
+# ---------------------------------------------------------------------- the client's policy
+
+
+@pytest.mark.parametrize(
+    ("data", "kind", "text", "offset"),
+    [
+        (b"HTTP", FrameError, "wrong magic number: 48 54 54 50 came", 0),
+        (header(0xFFFFFFFF), FrameError, "announces 4294967295 bytes", 4),
+        (header(DEFAULT_MAX_LENGTH + 1), FrameError, "announces 1048577 bytes", 4),
+        (header(7, 0x12) + bytes(7), MessageError, "StatusReport (0x12) came with 7 bytes", 12),
+        (HANDBOOK.encode(m.ConnectAnswer(version=1)), MessageError, "came in state connected", 0),
+    ],
+)
+def test_client_on_tcp_fails_the_link_and_keeps_the_error(
+    data: bytes, kind: type[RemoteProtocolError], text: str, offset: int
+) -> None:
+    made = client()
+    events = feed(made, STATUS + data + STATUS)
+    assert events[0] == STATUS_MESSAGE
+    error = failure(events[1:])
+    assert type(error) is kind
+    assert text in str(error)
+    assert error.offset == offset
+    assert (made.state, made.error, made.buffered) == (State.FAILED, error, 0)
+    assert feed(made, STATUS) == []
+    assert made.counters.ignored_frames == 0
+
+
+def test_client_on_tcp_status_before_the_connect_answer_fails() -> None:
+    made = machine(Role.CLIENT)
+    made.send(m.Connect())
+    error = failure(feed(made, STATUS))
+    assert str(error) == (
+        "StatusReport (0x12) came in state connecting, where it is not expected"
+    )
+    assert error.data == STATUS[12:]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"H", b"GET / HTTP/1.1", header(0xFFFFFFFF), header(7, 0x12) + bytes(7), STATUS[:-1]],
+)
+def test_client_on_udp_drops_a_broken_datagram_and_counts_it(data: bytes) -> None:
+    made = client(transport=UDP)
+    assert feed(made, data) == []
+    assert made.counters.ignored_frames == 1
+    assert (made.state, made.buffered) == (State.CONNECTED, 0)
+    assert feed(made, STATUS) == [STATUS_MESSAGE]
+
+
+@pytest.mark.parametrize("role", Role)
+def test_udp_datagram_of_two_frames_is_dropped_whole(role: Role) -> None:
+    made = client(transport=UDP) if role is Role.CLIENT else camera(transport=UDP)
+    one = STATUS if role is Role.CLIENT else QUERY
+    assert feed(made, one + one) == []
+    assert made.counters.ignored_frames == 1
+    assert len(feed(made, one)) == 1
+
+
+def test_udp_client_that_shall_fail_tells_what_the_datagram_was() -> None:
+    strict = Policy(fail=True, exact_length=True)
+    made = client(transport=UDP, policy=strict)
+    error = failure(feed(made, STATUS + b"\xaa\xbb"))
+    assert str(error) == "a datagram is not one whole frame: aa bb"
+    assert (made.state, made.buffered) == (State.FAILED, 0)
+
+
+@each_transport
+def test_client_longer_body_is_accepted_and_counted(transport: Transport) -> None:
+    made = client(transport=transport)
+    assert feed(made, header(10, 0x12) + STATUS[12:] + b"\xaa\xbb") == [STATUS_MESSAGE]
+    assert made.counters.long_bodies == 1
+    assert made.counters.ignored_frames == 0
+
+
+def test_client_longer_body_at_the_wrong_time_is_not_counted_as_one() -> None:
+    made = machine(Role.CLIENT, transport=UDP)
+    assert feed(made, header(10, 0x12) + STATUS[12:] + b"\xaa\xbb") == []
+    assert (made.counters.long_bodies, made.counters.ignored_frames) == (0, 1)
+
+
+# ---------------------------------------------------------------------- the camera's policy
+
+
+@pytest.mark.parametrize(
+    ("noise", "ignored"),
+    [
+        (b"noise", 1),
+        (b"noise" + MAGIC[:2], 1),
+        (header(0xFFFFFFFF), 1),
+        (header(DEFAULT_MAX_LENGTH + 1), 1),
+        (header(3, 0x31) + b"\x05\0\0", 1),
+        (header(5, 0x31) + b"\x05\0\0\0\0", 1),
+        (header(4, 0x01) + b"\x01\0\0\0", 1),
+        (header(0, 0x12), 0),
+    ],
+)
+def test_camera_on_tcp_skips_what_is_broken_and_takes_the_next_frame(
+    noise: bytes, ignored: int
+) -> None:
+    made = camera()
+    events = feed(made, TRIGGER + noise + QUERY)
+    assert [one for one in events if not isinstance(one, m.UnknownMessage)] == [
+        m.Trigger(),
+        m.Query(),
+    ]
+    assert made.counters.ignored_frames == ignored
+    assert made.state is State.CONNECTED
+
+
+def test_camera_on_tcp_broken_bytes_in_pieces_find_the_next_magic() -> None:
+    made = camera()
+    data = b"noise" + header(0xFFFFFFFF) + MAGIC[:3] + QUERY
+    events = feed(made, *[bytes([byte]) for byte in data])
+    assert events == [m.Query()]
+    assert made.buffered == 0
+
+
+def test_camera_on_udp_ignores_a_longer_body() -> None:
+    made = camera(transport=UDP)
+    assert feed(made, header(5, 0x31) + bytes(5)) == []
+    assert feed(made, header(4, 0x31) + b"\x05\0\0\0") == [m.SwitchApplication(application=5)]
+    assert made.counters.ignored_frames == 1
+
+
+def test_camera_before_connect_ignores_requests_and_takes_connect() -> None:
+    made = machine(Role.CAMERA)
+    connect = HANDBOOK.encode(m.Connect())
+    assert feed(made, QUERY + TRIGGER + header(1, 0x77) + b"x" + connect) == [m.Connect()]
+    assert made.counters.ignored_frames == 3
+
+
+def test_camera_with_a_failing_policy_ends_the_link() -> None:
+    made = camera(policy=Policy(fail=True, exact_length=True))
+    error = failure(feed(made, header(1, 0x40) + b"x"))
+    assert str(error) == "message 0x40 is 1 bytes too long"
+    assert made.state is State.FAILED
+    with pytest.raises(LocalProtocolError, match="in state failed"):
+        made.send(STATUS_MESSAGE)
+
+
+def test_camera_takes_a_second_connect_and_answers_it() -> None:
+    made = camera()
+    assert feed(made, HANDBOOK.encode(m.Connect())) == [m.Connect()]
+    with pytest.raises(LocalProtocolError, match="in state connecting"):
+        made.send(STATUS_MESSAGE)
+    made.send(m.ConnectAnswer(version=1))
+    made.send(STATUS_MESSAGE)
+    assert made.data_to_send() == [HANDBOOK.encode(m.ConnectAnswer(version=1)), STATUS]
+
+
+# ---------------------------------------------------------------------- limits
+
+
+@pytest.mark.parametrize("length", [0xFFFFFFFF, 101])
+def test_length_bomb_is_refused_before_any_payload_is_kept(length: int) -> None:
+    made = client(max_length=100)
+    assert feed(made, header(length)[:11]) == []
+    assert made.buffered == 11
+    assert f"announces {length} bytes" in str(failure(feed(made, header(length)[11:])))
+    made.receive_data(bytes(1 << 16))
+    assert made.buffered == 0
+
+
+def test_payload_of_exactly_the_limit_is_taken_and_never_more_is_kept() -> None:
+    made = client(max_length=100)
+    data = header(100) + b"\x07\0\0\0" + bytes(96)
+    assert feed(made, *[data[i : i + 1] for i in range(111)]) == []
+    assert made.buffered == 111
+    assert feed(made, data[111:]) == [m.ResultContainer(application=7, data=bytes(96))]
+
+
+def test_wrong_magic_fails_on_the_first_byte() -> None:
+    made = client()
+    error = failure(feed(made, b"\x42"))
+    assert str(error) == "wrong magic number: 42 came, 50 53 56 42 was expected"
+
+
+# ---------------------------------------------------------------------- requests and answers
+
+
+@pytest.mark.parametrize(
+    ("request_", "answer"),
+    [
+        (m.Query(), m.QueryAnswer(application=21)),
+        (m.SwitchApplication(application=5), m.SwitchAnswer(code=1, application=1)),
+        (m.GetClock(), m.ClockAnswer(year=2016, month=6, day=25, hour=10, minute=11, second=12)),
+    ],
+    ids=lambda one: type(one).__name__,
+)
+def test_client_one_open_request_per_id(request_: m.Request, answer: m.Message) -> None:
+    made = client()
+    made.send(request_)
+    sent = dataclasses.replace(made.counters)
+    with pytest.raises(LocalProtocolError) as caught:
+        made.send(request_)
+    message_id = HANDBOOK.message_id(request_)
+    assert str(caught.value) == (
+        f"an answer to message {message_id:#04x} is still owed; one request of an id can be open"
+    )
+    assert (made.data_to_send(), made.counters) == ([HANDBOOK.encode(request_)], sent)
+    assert feed(made, STATUS, HANDBOOK.encode(answer)) == [STATUS_MESSAGE, answer]
+    made.send(request_)
+
+
+def test_client_requests_of_different_ids_are_open_together() -> None:
+    made = client()
+    made.send(m.Query())
+    made.send(m.GetClock())
+    made.send(m.Trigger())
+    made.send(m.Trigger())
+    assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
+
+
+def test_client_unsolicited_answer_is_counted_and_not_delivered() -> None:
+    made = client()
+    assert feed(made, QUERY_ANSWER) == []
+    assert made.counters.unexpected_messages == 1
+    made.send(m.Query())
+    assert feed(made, QUERY_ANSWER + QUERY_ANSWER) == [m.QueryAnswer(application=21)]
+    assert made.counters.unexpected_messages == 2
+    assert made.state is State.CONNECTED
+
+
+def test_client_unknown_id_is_delivered_and_counted() -> None:
+    made = client()
+    expected = m.UnknownMessage(message_id=0x77, payload=b"abc")
+    assert feed(made, header(3, 0x77) + b"abc") == [expected]
+    assert (made.counters.unknown_ids, made.counters.unexpected_messages) == (1, 0)
+
+
+def test_client_unknown_request_awaits_an_answer_under_its_id() -> None:
+    made = client()
+    unknown = m.UnknownMessage(message_id=0x77, payload=b"")
+    made.send(unknown)
+    with pytest.raises(LocalProtocolError, match="0x77 is still owed"):
+        made.send(unknown)
+    assert feed(made, header(1, 0x77) + b"!") == [
+        m.UnknownMessage(message_id=0x77, payload=b"!")
+    ]
+    made.send(unknown)
+
+
+def test_client_request_told_to_be_unanswered_leaves_nothing_owed() -> None:
+    made = client()
+    unknown = m.UnknownMessage(message_id=0x77, payload=b"")
+    made.send(unknown, answered=False)
+    made.send(unknown, answered=False)
+    assert len(made.data_to_send()) == 2
+
+
+def test_client_raw_request_told_to_be_answered_owes_one_under_its_id() -> None:
+    made = client()
+    raw = m.UnknownMessage(message_id=0x40, payload=b"")
+    made.send(raw, answered=True)
+    with pytest.raises(LocalProtocolError, match="0x40 is still owed"):
+        made.send(raw, answered=True)
+    made.send(raw)
+    assert feed(made, header(0, 0x40)) == [m.UnknownMessage(message_id=0x40, payload=b"")]
+
+
+def test_client_raw_query_is_answered_as_a_query() -> None:
+    made = client()
+    made.send(m.UnknownMessage(message_id=0x30, payload=b""))
+    assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
+
+
+def test_client_late_answer_after_disconnect_still_comes() -> None:
+    made = client()
+    made.send(m.Query())
+    made.send(m.Disconnect())
+    assert feed(made, STATUS + QUERY_ANSWER) == [STATUS_MESSAGE, m.QueryAnswer(application=21)]
+    assert made.state is State.DISCONNECTED
+
+
+def test_camera_owes_nothing_and_may_answer_twice() -> None:
+    made = camera()
+    made.send(m.QueryAnswer(application=1))
+    made.send(m.QueryAnswer(application=1))
+    assert len(made.data_to_send()) == 2
+
+
+def test_send_field_that_does_not_fit_changes_nothing() -> None:
+    made = client()
+    sent = dataclasses.replace(made.counters)
+    with pytest.raises(LocalProtocolError, match="does not fit its fields"):
+        made.send(m.SwitchApplication(application=-1))
+    with pytest.raises(LocalProtocolError, match="does not fit the handbook header"):
+        made.send(m.UnknownMessage(message_id=1 << 32, payload=b""))
+    assert (made.data_to_send(), made.counters) == ([], sent)
+    made.send(m.SwitchApplication(application=1))
+
+
+# ---------------------------------------------------------------------- counters and trace
+
+
+def test_counters_tell_frames_and_bytes_of_both_directions() -> None:
+    made = client()
+    made.send(m.Query())
+    made.send(m.Trigger())
+    feed(made, STATUS[:5], STATUS[5:] + QUERY_ANSWER)
+    assert made.counters == Counters(
+        frames_received=3, frames_sent=3, bytes_received=16 + 20 + 16, bytes_sent=12 + 12 + 12
+    )
+
+
+@pytest.mark.parametrize("role", Role)
+@pytest.mark.parametrize("dialect", DIALECTS, ids=lambda one: one.name)
+def test_trace_sees_each_frame_of_both_directions(role: Role, dialect: Dialect) -> None:
+    seen: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
+    made = Machine(
+        dialect, role, TCP, trace=lambda sender, frame: seen.append((sender, frame))
+    )
+    made.state = State.CONNECTED
+    theirs: m.Message = STATUS_MESSAGE if role is Role.CLIENT else m.Trigger()
+    ours: m.Message = m.Trigger() if role is Role.CLIENT else STATUS_MESSAGE
+    made.send(ours)
+    made.receive_data(dialect.encode(theirs))
+    assert seen == [
+        (role.sends, dialect.to_frame(ours)),
+        (role.receives, dialect.to_frame(theirs)),
+    ]
+
+
+def test_trace_sees_the_error_for_bytes_that_make_no_frame() -> None:
+    seen: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
+    made = client(trace=lambda sender, frame: seen.append((sender, frame)))
+    del seen[:]
+    made.receive_data(b"noise")
+    assert seen == [(CAMERA, made.error)]
+
+
+def test_trace_sees_a_frame_that_was_refused_and_why() -> None:
+    seen: list[Frame | RemoteProtocolError] = []
+    made = camera(trace=lambda sender, frame: seen.append(frame))
+    del seen[:]
+    made.receive_data(header(1, 0x40) + b"x")
+    frame, error = seen
+    assert frame == Frame(0x40, b"x")
+    assert str(error) == "message 0x40 is 1 bytes too long"
+
+
+def test_trace_says_nothing_of_what_could_not_be_sent() -> None:
+    seen: list[Frame | RemoteProtocolError] = []
+    made = machine(Role.CLIENT, trace=lambda sender, frame: seen.append(frame))
+    with pytest.raises(LocalProtocolError):
+        made.send(m.Trigger())
+    assert seen == []
