@@ -89,8 +89,8 @@ class Localizations(Interpreter):
     def interpret(self, reader: Reader) -> list[Localization]:
         """Return the parts in the camera's order.
 
-        A record of zero bytes is an unused slot of the camera's array (bvs.md 4): it is skipped
-        and counted in ``reader.context.empty_slots``.
+        A record of zero bytes is an unused slot of the camera's array (HALCON script manual p. 11,
+        published): it is skipped and counted in ``reader.context.empty_slots``.
 
         Raises:
             InterpretationError: the bytes do not fit the layout, or a pose has NaN or infinity.

@@ -1,7 +1,7 @@
 """The layout of a result container: which fields it holds, in which order, in which unit.
 
-A container carries no types and no names (bvs.md 4); the user says what he configured on the
-camera::
+A container carries no types and no names (SC manual p. 33, published); the user says what he
+configured on the camera::
 
     "passed: bool, x: real32 mm, code: string[20]"      exactly one record
     "(x: real32 mm, y: real32 mm)*"                     records to the end: a list

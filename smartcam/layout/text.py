@@ -26,8 +26,8 @@ from smartcam.exceptions import LayoutError
 __all__ = ["TYPES", "UNITS", "Field", "LayoutSpec", "Unit", "WireType", "parse_text", "to_text"]
 
 MAX_TEXT = 20_000
-"""Characters of a layout text. A container holds about 64 kB (bvs.md 4); a thousand fields, each
-of them configured by hand on the camera, still fit."""
+"""Characters of a layout text. A container holds about 64 kB; a thousand fields, each of them
+configured by hand on the camera, still fit."""
 
 MAX_COUNT = 65_535
 """Bytes of a string and number of records: more than a container of about 64 kB holds."""

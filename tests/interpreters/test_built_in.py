@@ -37,7 +37,7 @@ def test_strings50_refuses_a_remainder_and_no_text() -> None:
 
 
 def test_strings50_reads_ascii_published_example() -> None:
-    # bvs.md 7.1, B-4 (KB-res) has a string of 20 bytes; 50 is the thesis' width
+    # Balluff's knowledge base has this text in 20 bytes; 50 is the thesis' width
     data = bytes.fromhex("48656c6c6f20576f726c64").ljust(50, b"\0")
     assert interpret("strings50", data) == ["Hello World"]
 
@@ -56,7 +56,7 @@ def test_record_lenient_takes_any_true() -> None:
 
 
 def test_published_container_of_one_string() -> None:
-    # bvs.md 7.1, B-4 (KB-res), behind the application id
+    # Balluff knowledge base, result container (docs/protocol.md), behind the application id
     data = bytes.fromhex("48656C6C6F20576F726C64000000000000000000")
     assert interpret("text: string[20]", data).text == "Hello World"
 
