@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SmartCamera", "connect"]
 
-logger = logging.getLogger("smartcam.client")
+logger: logging.Logger = logging.getLogger("smartcam.client")
 
 DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""

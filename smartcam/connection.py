@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
 
-logger = logging.getLogger("smartcam.connection")
+logger: logging.Logger = logging.getLogger("smartcam.connection")
 
 MAX_CHUNKS = 256
 """Chunks that wait for the receive task. It only hands events on and never waits, so a few are

@@ -68,9 +68,9 @@ class Conversation:
 
     def __init__(self, inbox: Inbox) -> None:
         self.inbox = inbox
-        self.name = inbox.name
+        self.name: str = inbox.name
         self.link: Link | None = None
-        self.wants_running = False
+        self.wants_running: bool = False
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
 
     def require_link(self) -> Link:

@@ -271,7 +271,7 @@ class RemoteProtocolError(ProtocolError):
     ) -> None:
         super().__init__(message)
         self.offset = offset
-        self.data = bytes(data[:MAX_EXCERPT])
+        self.data: bytes = bytes(data[:MAX_EXCERPT])
 
 
 class FrameError(RemoteProtocolError):

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Session", "Try", "attempt", "establish", "load_protocol"]
 
-logger = logging.getLogger("smartcam.handshake")
+logger: logging.Logger = logging.getLogger("smartcam.handshake")
 
 DETECTION_SHARE = 1.0
 """Seconds that a dialect gets in the first round while others are still untried. A camera answers

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Inbox", "PendingTrigger"]
 
-logger = logging.getLogger("smartcam.client")
+logger: logging.Logger = logging.getLogger("smartcam.client")
 
 Answer = m.Message | SmartCamError
 
@@ -86,7 +86,7 @@ class Inbox:
         self.end: SmartCamError | None = None
         # what the camera is known to be
         self.status: Status | None = None
-        self.endian = 0
+        self.endian: int = 0
         self.active: int | None = None
         self.expected: int | None = None  # the application that was named, if any
         # who waits for what
@@ -101,9 +101,9 @@ class Inbox:
         self.event_streams: weakref.WeakSet[Subscription[CameraEvent]] = weakref.WeakSet()
         # the account
         self.fates: collections.Counter[str] = collections.Counter()
-        self.received = 0
-        self.empty_slots = 0
-        self.overtriggers = 0
+        self.received: int = 0
+        self.empty_slots: int = 0
+        self.overtriggers: int = 0
 
     # ------------------------------------------------------------------ from the receive task
 

@@ -5,7 +5,7 @@ A wrong option is a :exc:`~smartcam.exceptions.ConfigurationError` that names it
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -128,7 +128,9 @@ def _protocols() -> Iterator[Protocol]:
 class CameraSettings(BaseModel):
     """Options of one client. Times are seconds, each bounds one step."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        frozen=True, extra="forbid", arbitrary_types_allowed=True
+    )
 
     address: Address = Field(description="where the camera is")
     name: str = Field("", max_length=200, description="name in logs and results; default HOST:PORT")

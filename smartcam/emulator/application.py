@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -43,7 +43,9 @@ class Application(BaseModel):
         pydantic.ValidationError: a field is wrong, or its values do not fit the layout.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        frozen=True, extra="forbid", arbitrary_types_allowed=True
+    )
 
     id: int = Field(ge=1, le=0xFFFFFFFF, description="what clients switch to; 0 is not allowed")
     name: str = Field(default="", max_length=200, description="for people")

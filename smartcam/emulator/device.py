@@ -111,8 +111,8 @@ class Device:
         scene: TableScene | None = None,
     ) -> None:
         self._applications = _by_id(applications)
-        self.quirks = quirks or Quirks()
-        self.scene = scene or TableScene()
+        self.quirks: Quirks = quirks or Quirks()
+        self.scene: TableScene = scene or TableScene()
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
         self._active = self._applications[
             self._known(next(iter(self._applications)) if active is None else active)

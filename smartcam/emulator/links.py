@@ -184,6 +184,7 @@ class _TcpLink(Link, asyncio.Protocol):
             self.closed = True
             _log.info("= %s: connection closed: %s", self.peer, reason)
             self._transport.abort()
+            self._listener.links.discard(self)
             self._station.lost(self)
 
     @property

@@ -7,7 +7,7 @@ how well that is founded. Grades: *published* in a manual of this product or a s
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -19,7 +19,7 @@ _Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 class Quirks(BaseModel):
     """Behaviour that the documents leave open. Times are seconds."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
     switch_while_running: Literal["refuse", "ignore", "allow"] = Field(
         default="refuse",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -21,7 +21,7 @@ __all__ = ["Scenario", "load_scenario"]
 class Scenario(BaseModel):
     """One camera: its applications, how it stands at first, and its quirks."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(default="camera", min_length=1, max_length=200, description="for logs")
     applications: tuple[Application, ...] = Field(

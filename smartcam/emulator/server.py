@@ -88,7 +88,8 @@ class EmulatedCamera:
         name: as given.
         clock: its clock.
         device: the camera behind the wire. Its operator's methods (``trigger()``,
-            ``set_condition()``, ...) may be called at any time; what they cause is sent.
+            ``set_condition()``, ...) may be called at any time in the event loop's thread; what
+            they cause is sent. Its time is brought up whenever something happens.
         seed: seed of the scene's noise.
 
     Raises:
@@ -127,10 +128,10 @@ class EmulatedCamera:
         self.host = host
         self.transport: Literal["tcp", "udp"] = transport
         self.dialect = dialect
-        self.name = plan.name
-        self.clock = clock if clock is not None else RealClock()
-        self.seed = plan.seed
-        self.device = Device(
+        self.name: str = plan.name
+        self.clock: Clock = clock if clock is not None else RealClock()
+        self.seed: int = plan.seed
+        self.device: Device = Device(
             plan.all_applications,
             active=plan.active,
             running=plan.running,

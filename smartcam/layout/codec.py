@@ -119,8 +119,8 @@ class RecordCodec:
     def __init__(self, fields: tuple[Field, ...], byte_order: ByteOrder, *, lenient: bool) -> None:
         self.fields = fields
         self.lenient = lenient
-        self.offsets = _offsets(fields)
-        self.make = functools.partial(
+        self.offsets: list[int] = _offsets(fields)
+        self.make: functools.partial[Any] = functools.partial(
             Record.__new__, record_class(tuple(field.name for field in fields))
         )
         order = "<" if byte_order == "little" else ">"
@@ -132,7 +132,7 @@ class RecordCodec:
             for index, field in enumerate(fields)
             if (convert := _converter(field, lenient=lenient)) is not None
         ]
-        self.size = self._struct.size
+        self.size: int = self._struct.size
 
     def read(self, payload: Payload, offset: int, count: int, *, what: str = "") -> list[Record]:
         """Return ``count`` records from ``offset`` on; the caller has checked that they are there.

@@ -159,9 +159,9 @@ class Machine:
         self.dialect = dialect
         self.role = role
         self.transport = transport
-        self.state = State.IDLE
+        self.state: State = State.IDLE
         self.error: RemoteProtocolError | None = None
-        self.counters = Counters()
+        self.counters: Counters = Counters()
         self._policy = policy or POLICIES[role, transport]
         self._framer = Framer(dialect.header, max_length)
         self._trace = trace
