@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
-from smartcam.interpreters.base import Context, Interpreter, Reader, resolve, run
+from smartcam.interpreters.base import Context, Interpreter, Reader, resolve, run, run_sequence
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -103,4 +103,4 @@ class Interpretation:
         )
         reader = Reader(container.data, context, interpreter.layout)
         value = run(interpreter, reader)
-        return Interpreted(value, interpreter.sequence(reader), context.empty_slots)
+        return Interpreted(value, run_sequence(interpreter, reader), context.empty_slots)

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias, TypeVar
 
 from smartcam.exceptions import (
     ConfigurationError,
@@ -31,7 +31,18 @@ from smartcam.registry import INTERPRETERS
 if TYPE_CHECKING:
     from smartcam.models import ByteOrder
 
-__all__ = ["Context", "Function", "Interpreter", "Reader", "Spec", "resolve", "run"]
+__all__ = [
+    "Context",
+    "Function",
+    "Interpreter",
+    "Reader",
+    "Spec",
+    "resolve",
+    "run",
+    "run_sequence",
+]
+
+T = TypeVar("T")
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -276,8 +287,8 @@ class _FunctionInterpreter(Interpreter):
 def run(interpreter: Interpreter, reader: Reader) -> object:
     """Return what ``interpreter`` makes of a container.
 
-    The one place where interpreters are called: whatever one raises comes out as an
-    InterpretationError, so a slip in somebody's plug-in is an outcome like any other.
+    Interpreters are called here and in :func:`run_sequence` only: whatever one raises comes out as
+    an InterpretationError, so a slip in somebody's plug-in is an outcome like any other.
 
     Raises:
         InterpretationError: the bytes do not fit, or the interpreter failed; then the cause is
@@ -285,8 +296,17 @@ def run(interpreter: Interpreter, reader: Reader) -> object:
     """
     if reader.layout is None:
         reader.layout = interpreter.layout
+    return _guarded(interpreter.interpret, reader)
+
+
+def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
+    """Return the container's sequence number, None without one; raises as :func:`run`."""
+    return _guarded(interpreter.sequence, reader)
+
+
+def _guarded(function: Callable[[Reader], T], reader: Reader) -> T:
     try:
-        return interpreter.interpret(reader)
+        return function(reader)
     except InterpretationError:
         raise
     except Exception as exc:
