@@ -11,13 +11,11 @@ import asyncio
 import contextlib
 import dataclasses
 import logging
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from smartcam.conversation import Conversation, is_ready
 from smartcam.exceptions import (
-    ConfigurationError,
     ConnectionClosedError,
     ConnectionLostError,
     InterpretationError,
@@ -34,6 +32,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.framing import Frame
 from smartcam.settings import CameraSettings
 from smartcam.streams import Subscription
+from smartcam.turns import Turns
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
@@ -76,15 +75,6 @@ def connect(
     return SmartCamera(CameraSettings.make(url, model, options), trace=trace)
 
 
-@dataclass(frozen=True, slots=True)
-class _Before:
-    """What to go back to after a temporary switch."""
-
-    application: int
-    running: bool
-    expected: int | None
-
-
 class SmartCamera:
     """A smart camera; made by :func:`connect`.
 
@@ -108,10 +98,7 @@ class SmartCamera:
         self._supervisor: asyncio.Task[None] | None = None
         self._opened: asyncio.Future[SmartCamError | None] | None = None
         self._session: Session | None = None
-        self._jobs: asyncio.TaskGroup | None = None
-        self._turn = asyncio.Lock()  # one command at a time
-        self._leaving: set[asyncio.Task[None]] = set()  # jobs that go back to an application
-        self._going_back_failed: SmartCamError | None = None
+        self._turns = Turns(self._talk, settings.switch_timeout)
 
     # ------------------------------------------------------------------ life
 
@@ -137,7 +124,7 @@ class SmartCamera:
             if error is not None:
                 raise error
             if self.settings.application is not None:
-                async with self._command(self.settings.switch_timeout) as deadline:
+                async with self._turns.hold(self.settings.switch_timeout) as deadline:
                     await self._talk.ensure(self.settings.application, deadline)
         except BaseException:
             await self.close()
@@ -295,7 +282,7 @@ class SmartCamera:
         Cancellation: safe.
         """
         self._talk.require_link()
-        return await self._talk.until(predicate, self._deadline(timeout), "the status wanted")
+        return await self._talk.until(predicate, self._talk.deadline(timeout), "the status wanted")
 
     async def wait_ready(self, timeout: float = 10.0) -> Status:
         """Wait until the camera is not BUSY, and Running if a start was asked for.
@@ -307,7 +294,9 @@ class SmartCamera:
         """
         self._talk.require_link()
         predicate = is_ready if self._talk.wants_running else _is_not_busy
-        return await self._talk.until(predicate, self._deadline(timeout), "the camera to be ready")
+        return await self._talk.until(
+            predicate, self._talk.deadline(timeout), "the camera to be ready"
+        )
 
     def next_result(
         self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
@@ -328,7 +317,7 @@ class SmartCamera:
         self._talk.require_link()
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._inbox.next_results.append(future)
-        return self._await_next(future, self._deadline(timeout), timeout)
+        return self._await_next(future, self._talk.deadline(timeout), timeout)
 
     # ------------------------------------------------------------------ commands
 
@@ -378,7 +367,7 @@ class SmartCamera:
         wait = when_busy == "wait"
         data = None if input is None else bytes(input)
         try:
-            async with self._turn_for(application, timeout) as deadline:
+            async with self._turns.hold_in(application, timeout) as deadline:
                 return await self._talk.trigger(interpretation, data, deadline, wait=wait)
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
@@ -402,7 +391,7 @@ class SmartCamera:
         Source: SC manual p. 34 (published).
         """
         limit = self.settings.switch_timeout if timeout is None else timeout
-        async with self._command(limit) as deadline:
+        async with self._turns.hold(limit) as deadline:
             await self._talk.switch(application, deadline, start=Status.RUNNING in self.status)
 
     @contextlib.asynccontextmanager
@@ -414,23 +403,14 @@ class SmartCamera:
 
         Cancellation: going back is finished by the client's supervisor; the next call waits for it.
         """
-        limit = self.settings.switch_timeout
-        async with self._command(limit) as deadline:
-            before = await self._before(deadline)
-            try:
-                await self._talk.ensure(application, deadline)
-            except BaseException:
-                self._go_back(before)
-                raise
+        async with self._turns.hold(self.settings.switch_timeout) as deadline:
+            before = await self._turns.enter(application, deadline)
         try:
             yield self
         except BaseException:
-            self._go_back(before)
+            self._turns.leave(before)
             raise
-        going_back = self._go_back(before)
-        if going_back is not None:
-            await asyncio.wait({going_back})
-            self._raise_going_back()
+        await self._turns.leave_and_wait(before)
 
     async def start(self, *, timeout: float = 10.0) -> None:
         """Enter run mode; returns when the camera reports Running and is not BUSY.
@@ -440,7 +420,7 @@ class SmartCamera:
 
         Cancellation: safe; the command may have been sent.
         """
-        async with self._command(timeout) as deadline:
+        async with self._turns.hold(timeout) as deadline:
             await self._talk.start(deadline)
 
     async def stop(self, *, timeout: float = 10.0) -> None:
@@ -453,7 +433,7 @@ class SmartCamera:
 
         Cancellation: safe; the command may have been sent.
         """
-        async with self._command(timeout) as deadline:
+        async with self._turns.hold(timeout) as deadline:
             await self._talk.stop(deadline)
 
     async def query_application(self, *, timeout: float | None = None) -> int:
@@ -466,7 +446,7 @@ class SmartCamera:
         Cancellation: safe; the answer is dropped when it comes.
         """
         limit = self.settings.request_timeout if timeout is None else timeout
-        return await self._talk.query(self._deadline(limit))
+        return await self._talk.query(self._talk.deadline(limit))
 
     async def get_clock(self, *, timeout: float | None = None) -> datetime:
         """Return the camera's clock: a naive datetime, since it carries no time zone.
@@ -478,7 +458,7 @@ class SmartCamera:
         Cancellation: safe; the answer is dropped when it comes.
         """
         limit = self.settings.request_timeout if timeout is None else timeout
-        clock = await self._talk.ask(m.GetClock(), m.ClockAnswer, self._deadline(limit))
+        clock = await self._talk.ask(m.GetClock(), m.ClockAnswer, self._talk.deadline(limit))
         fields = (clock.year, clock.month, clock.day, clock.hour, clock.minute, clock.second)
         try:
             return datetime(*fields)  # noqa: DTZ001 - the camera's clock has no zone
@@ -570,7 +550,7 @@ class SmartCamera:
         key = dialect.message_type(m.Sender.CAMERA, message_id)
         limit = self.settings.request_timeout if timeout is None else timeout
         answer = await self._talk.exchange(
-            message, message_id if key is m.UnknownMessage else key, self._deadline(limit)
+            message, message_id if key is m.UnknownMessage else key, self._talk.deadline(limit)
         )
         return dialect.to_frame(answer).payload
 
@@ -582,7 +562,7 @@ class SmartCamera:
         try:
             session = await establish(self.settings, self._trace)
             self._adopt(session)
-            async with asyncio.TaskGroup() as self._jobs:
+            async with asyncio.TaskGroup() as self._turns.jobs:
                 self._tell_opener(None)
                 error = await self._read(session.link)
                 self._inbox.fail(error)  # ends the jobs' waits too
@@ -593,7 +573,7 @@ class SmartCamera:
             error = ConnectionLostError(f"{self.name}: {exc!r} in the client")
             error.__cause__ = exc
         finally:
-            self._jobs = None
+            self._turns.jobs = None
             self._inbox.fail(error)
             self._inbox.finish()
             if self._session is not None:
@@ -628,93 +608,10 @@ class SmartCamera:
             )
             return error
 
-    # ------------------------------------------------------------------ turns and going back
-
-    @contextlib.asynccontextmanager
-    async def _command(self, timeout: float) -> AsyncGenerator[float]:
-        """Hold the turn; gives the deadline, the wait for the turn included."""
-        deadline = self._deadline(timeout)
-        self._talk.require_link()
-        try:
-            async with asyncio.timeout_at(deadline):
-                while self._leaving:
-                    await asyncio.wait(self._leaving)
-                await self._turn.acquire()
-        except TimeoutError as exc:
-            raise ResponseTimeoutError(
-                f"{self.name}: another command had the camera for {timeout:g} s", waited=timeout
-            ) from exc
-        try:
-            self._raise_going_back()
-            yield deadline
-        finally:
-            self._turn.release()
-
-    @contextlib.asynccontextmanager
-    async def _turn_for(self, application: int | None, timeout: float) -> AsyncGenerator[float]:
-        """Hold the turn, in ``application`` if one is given; gives the deadline."""
-        if application is None:
-            async with self._command(timeout) as deadline:
-                yield deadline
-            return
-        limit = self.settings.switch_timeout
-        async with self._command(limit) as switch_deadline:
-            before = await self._before(switch_deadline)
-            try:
-                await self._talk.ensure(application, switch_deadline)
-                yield self._deadline(timeout)
-            finally:
-                going_back = self._go_back(before)
-        if going_back is not None:
-            await asyncio.wait({going_back})
-
-    async def _before(self, deadline: float) -> _Before:
-        running = Status.RUNNING in self.status
-        return _Before(await self._talk.query(deadline), running, self._inbox.expected)
-
-    def _go_back(self, before: _Before) -> asyncio.Task[None] | None:
-        """Let the supervisor go back to ``before``; later commands wait for it."""
-        if self._jobs is None or self._inbox.end is not None:
-            return None
-        job = self._jobs.create_task(
-            self._going_back(before), name=f"smartcam[{self.name}].going_back"
-        )
-        self._leaving.add(job)
-        job.add_done_callback(self._leaving.discard)
-        return job
-
-    async def _going_back(self, before: _Before) -> None:
-        """Restore application and run state within ``switch_timeout``; never raises."""
-        talk = self._talk
-        async with self._turn:
-            deadline = self._deadline(self.settings.switch_timeout)
-            try:
-                if await talk.query(deadline) != before.application:
-                    await talk.switch(before.application, deadline, start=before.running)
-                elif before.running and Status.RUNNING not in self.status:
-                    await talk.start(deadline)
-                elif not before.running and Status.RUNNING in self.status:
-                    await talk.stop(deadline)
-            except SmartCamError as error:
-                logger.warning("%s ! going back failed: %s", self.name, error)
-                self._going_back_failed = error
-            finally:
-                self._inbox.expected = before.expected
-
-    def _raise_going_back(self) -> None:
-        error, self._going_back_failed = self._going_back_failed, None
-        if error is not None:
-            raise error
-
     # ------------------------------------------------------------------ small helpers
 
-    def _deadline(self, timeout: float) -> float:
-        if not 0 <= timeout < float("inf"):
-            raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
-        return asyncio.get_running_loop().time() + timeout
-
     async def _tell(self, message: m.Message) -> None:
-        await self._talk.tell(message, self._deadline(self.settings.request_timeout))
+        await self._talk.tell(message, self._talk.deadline(self.settings.request_timeout))
 
     def _interpretation(self, spec: object) -> Interpretation:
         return Interpretation(spec, lenient=self.settings.lenient, y_down=self.settings.y_down)

@@ -90,6 +90,16 @@ class Conversation:
         """The last status; there is one since the session was made."""
         return self.inbox.status or Status(0)
 
+    def deadline(self, timeout: float) -> float:
+        """Return the loop time in ``timeout`` seconds.
+
+        Raises:
+            ConfigurationError: it is no finite number of seconds, 0 or more.
+        """
+        if not 0 <= timeout < float("inf"):
+            raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
+        return asyncio.get_running_loop().time() + timeout
+
     # ------------------------------------------------------------------ say and wait
 
     async def tell(self, message: m.Message, deadline: float) -> None:
