@@ -112,8 +112,8 @@ class SmartCamera:
 
         Cancellation: the link is dropped.
         """
-        if self._supervisor is not None:
-            raise LocalProtocolError(f"{self.name}: opened before; make a new one")
+        if self._supervisor is not None or self._inbox.end is not None:
+            raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
         self._opened = asyncio.get_running_loop().create_future()
         self._supervisor = asyncio.create_task(
             self._supervise(), name=f"smartcam[{self.settings.address.host}].supervisor"
@@ -316,7 +316,7 @@ class SmartCamera:
         """
         self._talk.require_link()
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
-        self._inbox.next_results.append(future)
+        self._inbox.next_results.add(future)
         return self._await_next(future, self._talk.deadline(timeout), timeout)
 
     # ------------------------------------------------------------------ commands
@@ -347,14 +347,15 @@ class SmartCamera:
         Raises:
             NotRunningError: the application is stopped (neither BUSY nor Running).
             TriggerTimeoutError: no result in time; it says what the status was. An application
-                that runs free never waits for a trigger and ends here.
+                that runs free never waits for a trigger and ends here, and so does a switch to
+                ``application`` that takes too long.
             OvertriggeredError: the camera dropped a trigger meanwhile.
             CameraBusyError: with ``when_busy="refuse"``.
             CameraFaultError: the camera reports System Error.
             InputContainerError: with ``input``: it did not belong to this inspection.
             InterpretationError: the result does not fit its layout.
             WrongApplicationError: the result is another application's.
-            CommandRejectedError, ResponseTimeoutError: with ``application``: the switch failed.
+            CommandRejectedError: with ``application``: the camera does not have it.
 
         Cancellation: safe. A result still under way is made impossible (Stop, Query, Start) before
         the next trigger, and counted as late if it comes.
@@ -392,7 +393,7 @@ class SmartCamera:
         """
         limit = self.settings.switch_timeout if timeout is None else timeout
         async with self._turns.hold(limit) as deadline:
-            await self._talk.switch(application, deadline, start=Status.RUNNING in self.status)
+            await self._talk.switch(application, deadline, start=self._talk.runs)
 
     @contextlib.asynccontextmanager
     async def application(self, application: int) -> AsyncGenerator[Self]:
@@ -570,8 +571,9 @@ class SmartCamera:
             error = exc
         except Exception as exc:  # nobody must wait for a dead supervisor
             logger.exception("%s ! the supervisor failed", self.name)
-            error = ConnectionLostError(f"{self.name}: {exc!r} in the client")
-            error.__cause__ = exc
+            cause = exc.exceptions[0] if isinstance(exc, ExceptionGroup) else exc
+            error = ConnectionLostError(f"{self.name}: {cause!r} in the client")
+            error.__cause__ = cause
         finally:
             self._turns.jobs = None
             self._inbox.fail(error)
@@ -640,8 +642,7 @@ class SmartCamera:
                 waited=timeout,
             ) from exc
         finally:
-            if future in self._inbox.next_results:
-                self._inbox.next_results.remove(future)
+            self._inbox.next_results.discard(future)
 
     def _closed_error(self) -> ConnectionClosedError:
         address = self.settings.address

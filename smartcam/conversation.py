@@ -72,6 +72,9 @@ class Conversation:
         self.link: Link | None = None
         self.wants_running: bool = False
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
+        self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
+        self._halted = False  # stopped by a trigger's fence that has not started it again yet
+        self._unconfirmed = False  # a Start or Stop was sent, its status has not come
 
     def require_link(self) -> Link:
         """Return the link.
@@ -80,7 +83,7 @@ class Conversation:
             LinkError: there is none, and why.
         """
         if self.inbox.end is not None:
-            raise self.inbox.end
+            raise self.inbox.end.with_traceback(None)  # raised many times, it would grow each time
         if self.link is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         return self.link
@@ -89,6 +92,11 @@ class Conversation:
     def status(self) -> Status:
         """The last status; there is one since the session was made."""
         return self.inbox.status or Status(0)
+
+    @property
+    def runs(self) -> bool:
+        """Running, or stopped only by a trigger that was interrupted before it started again."""
+        return self._halted or Status.RUNNING in self.status
 
     def deadline(self, timeout: float) -> float:
         """Return the loop time in ``timeout`` seconds.
@@ -140,11 +148,11 @@ class Conversation:
             async with asyncio.timeout_at(deadline):
                 await lock.acquire()
         except TimeoutError as exc:
-            raise self._overdue(message, deadline) from exc
+            raise self._unsent(message) from exc
         try:
             await self._await_owed(key, message, deadline)
-            link = self.require_link()
-            link.send(message)
+            self.require_link().send(message)
+            self._due[key] = deadline
             return await self._await_answer(self.inbox.next_answer(key), message, deadline)
         finally:
             lock.release()
@@ -172,16 +180,33 @@ class Conversation:
     async def start(self, deadline: float) -> None:
         """Enter run mode and wait until the camera reports it."""
         self.wants_running = True
-        await self.tell(m.Start(), deadline)
-        await self.until(is_ready, deadline, "Running and not BUSY after Start")
+        await self._confirm(m.Start(), is_ready, deadline, "Running and not BUSY after Start")
+        self._halted = False
 
     async def stop(self, deadline: float) -> None:
         """Leave run mode and wait until the camera reports it."""
-        self.wants_running = False
-        await self.tell(m.Stop(), deadline)
-        await self.until(
-            lambda status: Status.RUNNING not in status, deadline, "not Running after Stop"
-        )
+        self.wants_running = self._halted = False
+        await self._halt(deadline)
+
+    async def _halt(self, deadline: float) -> None:
+        await self._confirm(m.Stop(), _is_not_running, deadline, "not Running after Stop")
+
+    async def _confirm(
+        self, command: m.Message, predicate: Callable[[Status], bool], deadline: float, what: str
+    ) -> None:
+        self._unconfirmed = True  # and it stays so where the wait is interrupted
+        await self.tell(command, deadline)
+        await self.until(predicate, deadline, what)
+        self._unconfirmed = False
+
+    async def catch_up(self, deadline: float) -> None:
+        """Know the status again where a start or stop was interrupted.
+
+        What these two have caused comes before the answer to a Query that was sent after them.
+        """
+        if self._unconfirmed:
+            await self.query(deadline)
+            self._unconfirmed = False
 
     async def query(self, deadline: float) -> int:
         """Return the active application.
@@ -254,13 +279,14 @@ class Conversation:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
         inbox, loop = self.inbox, asyncio.get_running_loop()
+        self._raise_fault()
         if inbox.debt is not None:
             await self._settle_debt(deadline)
         await self._wait_for_trigger(deadline, wait=wait)
         link = self.require_link()
         outcome: asyncio.Future[Result] = loop.create_future()
         sent_at = loop.time()
-        inbox.pending = PendingTrigger(
+        pending = inbox.pending = PendingTrigger(
             outcome, interpretation, input_data is not None, sent_at, datetime.now(UTC)
         )
         try:
@@ -274,7 +300,7 @@ class Conversation:
         except TimeoutError as exc:
             if outcome.done() and not outcome.cancelled():
                 return outcome.result()
-            inbox.debt = "late"
+            inbox.give_up(pending)
             waited = deadline - sent_at
             raise TriggerTimeoutError(
                 f"{self.name}: no result within {waited:.2g} s of the trigger; "
@@ -283,7 +309,7 @@ class Conversation:
             ) from exc
         except asyncio.CancelledError:
             if not outcome.done() or outcome.cancelled():
-                inbox.debt = "late"
+                inbox.give_up(pending)
             raise
         finally:
             inbox.pending = None
@@ -292,9 +318,8 @@ class Conversation:
         """Wait until the camera takes a trigger, or say why it never will."""
         begin = asyncio.get_running_loop().time()
         while True:
+            self._raise_fault()
             status = self.status
-            if Status.SYSTEM_ERROR in status:
-                raise CameraFaultError(f"{self.name}: the camera reports System Error")
             if takes_trigger(status):
                 return
             if is_stopped(status):
@@ -317,14 +342,19 @@ class Conversation:
                     waited=waited,
                 ) from exc
 
+    def _raise_fault(self) -> None:
+        if Status.SYSTEM_ERROR in self.status:
+            raise CameraFaultError(f"{self.name}: the camera reports System Error")
+
     async def _settle_debt(self, deadline: float) -> None:
         """Make a result that may still come impossible: Stop voids it, a Query is the fence.
 
         Source: that Stop voids the inspection under way is inferred. What comes before the
         Query's answer came from before.
         """
-        if Status.RUNNING in self.status:
-            await self.stop(deadline)
+        if self.runs:
+            self._halted = True  # interrupted here, the next trigger does all of it again
+            await self._halt(deadline)
             await self.query(deadline)
             await self.start(deadline)
         self.inbox.debt = None
@@ -334,34 +364,59 @@ class Conversation:
     async def _await_owed(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
     ) -> None:
+        """Wait for the answer to an earlier request, which is dropped.
+
+        Raises:
+            ResponseTimeoutError: it did not come; the link is given up if its own time is over too.
+        """
         owed = self.inbox.answers.get(key)
-        if owed is not None:
-            await self._await_answer(owed, message, deadline)
+        if owed is None:
+            return
+        try:
+            await self._take_answer(owed, deadline)
+        except TimeoutError as exc:
+            error = self._unsent(message)
+            if asyncio.get_running_loop().time() >= self._due[key]:
+                self.require_link().give_up(error)
+            raise error from exc
 
     async def _await_answer(
         self, answer: asyncio.Future[m.Message | SmartCamError], message: m.Message, deadline: float
+    ) -> m.Message:
+        try:
+            return await self._take_answer(answer, deadline)
+        except TimeoutError as exc:
+            error = self._timeout(message, "no answer to", "in time")
+            self.require_link().give_up(error)
+            raise error from exc
+
+    async def _take_answer(
+        self, answer: asyncio.Future[m.Message | SmartCamError], deadline: float
     ) -> m.Message:
         # asyncio.wait leaves the future alone when this task is cancelled: the answer stays owed
         loop = asyncio.get_running_loop()
         await asyncio.wait({answer}, timeout=max(0.0, deadline - loop.time()))
         if not answer.done():
-            error = self._overdue(message, deadline)
-            if self.link is not None:
-                self.link.give_up(error)
-            raise error
+            raise TimeoutError
         got = answer.result()
         if isinstance(got, SmartCamError):
-            raise got
+            raise got.with_traceback(None)
         return got
 
-    def _overdue(self, message: m.Message, deadline: float) -> ResponseTimeoutError:
-        link = self.require_link()
-        message_id = link.machine.dialect.message_id(message)
+    def _unsent(self, message: m.Message) -> ResponseTimeoutError:
+        return self._timeout(message, "could not send", "in time: an earlier answer is owed")
+
+    def _timeout(self, message: m.Message, what: str, why: str) -> ResponseTimeoutError:
+        message_id = self.require_link().machine.dialect.message_id(message)
         return ResponseTimeoutError(
-            f"{self.name}: no answer to {type(message).__name__} ({message_id:#04x}) in time; "
+            f"{self.name}: {what} {type(message).__name__} ({message_id:#04x}) {why}; "
             f"status: {self.status.describe()}",
             message_id=message_id,
         )
+
+
+def _is_not_running(status: Status) -> bool:
+    return Status.RUNNING not in status
 
 
 def _is_decided(status: Status) -> bool:

@@ -57,6 +57,7 @@ class PendingTrigger:
         has_input: input data was sent with it.
         sent_at: loop time.
         triggered_at: wall clock, UTC.
+        came: its result came when nobody waited any more.
     """
 
     outcome: asyncio.Future[Result]
@@ -64,6 +65,7 @@ class PendingTrigger:
     has_input: bool
     sent_at: float
     triggered_at: datetime
+    came: bool = False
 
 
 @dataclass(slots=True)
@@ -94,7 +96,8 @@ class Inbox:
         self.debt: Literal["late", "streamed"] | None = None  # fate of the result still to come
         # by the answer's type; by id for a message that the dialect does not know
         self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
-        self.next_results: list[asyncio.Future[Result]] = []
+        # weak: a waiter that was made and never awaited must not count as a listener
+        self.next_results: weakref.WeakSet[asyncio.Future[Result]] = weakref.WeakSet()
         self._status_waiters: list[_StatusWaiter] = []
         self.result_streams: weakref.WeakSet[Subscription[Result]] = weakref.WeakSet()
         self.status_streams: weakref.WeakSet[Subscription[Status]] = weakref.WeakSet()
@@ -179,7 +182,7 @@ class Inbox:
             LinkError: the session ended.
         """
         if self.end is not None:
-            raise self.end
+            raise self.end.with_traceback(None)  # raised many times, it would grow each time
         if self.status is not None and predicate(self.status):
             return self.status
         waiter = _StatusWaiter(predicate, asyncio.get_running_loop().create_future())
@@ -190,6 +193,11 @@ class Inbox:
         finally:
             if waiter in self._status_waiters:
                 self._status_waiters.remove(waiter)
+
+    def give_up(self, pending: PendingTrigger) -> None:
+        """Its caller waits no more; a result that still comes is late."""
+        if not pending.came:
+            self.debt = "late"
 
     def set_active(self, application: int, at: datetime) -> None:
         """Note which application is active."""
@@ -269,6 +277,8 @@ class Inbox:
             self.set_active(container.application, at)
         fate = "triggered"
         if pending is None:
+            if self.pending is not None and self.pending.outcome.cancelled():
+                self.debt, self.pending.came = "late", True  # its caller was not woken yet
             listening = self._listening()
             fate = self.debt or ("streamed" if listening else "unclaimed")
             self.debt = None
@@ -312,7 +322,8 @@ class Inbox:
     ) -> None:
         for stream in tuple(self.result_streams):
             stream.offer(result, now)
-        waiting, self.next_results = self.next_results, []
+        waiting = tuple(self.next_results)
+        self.next_results.clear()
         for future in (*waiting, pending.outcome) if pending is not None else waiting:
             if future.done():
                 continue

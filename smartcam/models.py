@@ -312,7 +312,7 @@ def jsonable(value: object) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, (bytes, bytearray)):
+    if isinstance(value, (bytes, bytearray, memoryview)):
         return value.hex()
     return _jsonable_container(value)
 
@@ -329,23 +329,20 @@ def _jsonable_container(value: Any) -> Any:
         return [jsonable(item) for item in cast("Iterable[Any]", value)]
     if isinstance(value, datetime):
         return value.isoformat()
-    if numpy is not None and isinstance(value, numpy.ndarray):
-        return _jsonable_array(value)
-    if numpy is not None and isinstance(value, numpy.generic):
-        return jsonable(value.item())
+    if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
+        return _jsonable_array(value.tolist(), value.dtype.names)
     if hasattr(value, "model_dump"):
         return jsonable(value.model_dump())
     return str(value)
 
 
-def _jsonable_array(array: Any) -> Any:
-    names = array.dtype.names
+def _jsonable_array(value: Any, names: tuple[str, ...] | None) -> Any:
     if names is None:
-        return [jsonable(item) for item in array.tolist()]
-    return [
-        {name: _text_or_hex(item) for name, item in zip(names, row, strict=True)}
-        for row in array.tolist()
-    ]
+        return jsonable(value)
+    if isinstance(value, list):
+        rows: list[Any] = value
+        return [_jsonable_array(row, names) for row in rows]
+    return {name: _text_or_hex(item) for name, item in zip(names, value, strict=True)}
 
 
 def _text_or_hex(item: object) -> Any:

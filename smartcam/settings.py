@@ -71,7 +71,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     surplus = [
         name
         for name, value in [
-            ("a user", parts.username),
+            ("a user", "@" in parts.netloc),
             ("a path", parts.path.strip("/")),
             ("a fragment", parts.fragment),
         ]
@@ -122,7 +122,8 @@ def _protocols() -> Iterator[Protocol]:
             if info.origin == "built-in":
                 raise
             continue  # a broken plug-in costs only its own name
-        yield protocol
+        if hasattr(protocol, "schemes"):  # so does one that gives something else
+            yield protocol
 
 
 class CameraSettings(BaseModel):

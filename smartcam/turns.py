@@ -68,9 +68,7 @@ class Turns:
         self._talk.require_link()
         try:
             async with asyncio.timeout_at(deadline):
-                while self._leaving:
-                    await asyncio.wait(self._leaving)
-                await self._lock.acquire()
+                await self._acquire()
         except TimeoutError as exc:
             raise ResponseTimeoutError(
                 f"{self._talk.name}: another command had the camera for {timeout:g} s",
@@ -78,6 +76,7 @@ class Turns:
             ) from exc
         try:
             self._raise_failed()
+            await self._talk.catch_up(deadline)
             yield deadline
         finally:
             self._lock.release()
@@ -93,6 +92,7 @@ class Turns:
             async with self.hold(timeout) as deadline:
                 yield deadline
             return
+        self._talk.deadline(timeout)  # a wrong one is refused before anything is switched
         async with self.hold(self._switch_timeout) as switch_deadline:
             before = await self.enter(application, switch_deadline)
             try:
@@ -104,7 +104,7 @@ class Turns:
 
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""
-        running = Status.RUNNING in self._talk.status
+        running = self._talk.runs
         active = await self._talk.query(deadline)
         before = Before(active, running, self._talk.inbox.expected)
         try:
@@ -151,6 +151,19 @@ class Turns:
                 self._failed = error
             finally:
                 talk.inbox.expected = before.expected
+
+    async def _acquire(self) -> None:
+        """Take the lock, but behind every job that goes back.
+
+        Who had the turn before may have left such a job behind while this command was in line.
+        """
+        while True:
+            while self._leaving:
+                await asyncio.wait(self._leaving)
+            await self._lock.acquire()
+            if not self._leaving:
+                return
+            self._lock.release()
 
     def _raise_failed(self) -> None:
         error, self._failed = self._failed, None

@@ -20,11 +20,15 @@ def emulator_main() -> None:
 
 def _run(program: str, module: str) -> None:
     try:
-        importlib.import_module("click")
-        importlib.import_module("yaml")
-    except ModuleNotFoundError:
-        sys.exit(_missing(program))
-    importlib.import_module(f"smartcam.cli.{module}").command(prog_name=program)
+        try:
+            importlib.import_module("click")
+            importlib.import_module("yaml")
+        except ModuleNotFoundError:
+            sys.exit(_missing(program))
+        command = importlib.import_module(f"smartcam.cli.{module}").command
+    except KeyboardInterrupt:  # Ctrl-C while still importing
+        sys.exit(130)
+    command(prog_name=program)
 
 
 def _missing(program: str) -> int:

@@ -19,7 +19,7 @@ from smartcam.cli.options import (
 from smartcam.cli.running import run
 from smartcam.cli.texts import result_text, table_text
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
-from smartcam.exceptions import TriggerTimeoutError
+from smartcam.exceptions import NotRunningError, TriggerTimeoutError
 from smartcam.handshake import load_protocol
 from smartcam.models import Status, jsonable
 from smartcam.registry import INTERPRETERS, PROTOCOLS
@@ -83,7 +83,13 @@ async def _trigger(url: str, input_hex: str | None, options: Options) -> None:
             count = options.count or (None if end else 1)
             done = 0
             while (count is None or done < count) and (end is None or loop.time() < end):
-                result = await camera.trigger(input=data, timeout=timeout)
+                try:
+                    result = await camera.trigger(input=data, timeout=timeout)
+                except NotRunningError as exc:
+                    raise NotRunningError(
+                        f"{exc}. To start it: smartcam start {camera.url}, or trigger with "
+                        f"--application {camera.active_application}"
+                    ) from exc
                 options.show(result, lambda: result_text(result))  # noqa: B023 - called at once
                 done += 1
 

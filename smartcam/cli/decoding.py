@@ -38,6 +38,8 @@ def from_hex(text: str, where: str) -> bytes:
 def decode(data: str, options: Options, *, big_endian: bool) -> None:
     """Print what ``data`` means."""
     payload = _load(data)
+    if not payload:
+        raise ConfigurationError("decode: there are no bytes to decode")
     byte_order: ByteOrder = "big" if big_endian else "little"
     interpreter = None if options.interpret_as is None else resolve(options.interpret_as)
     dialect = _dialect_of(payload)
@@ -55,7 +57,7 @@ def decode(data: str, options: Options, *, big_endian: bool) -> None:
 
 def _load(data: str) -> bytes:
     if data == "-":
-        raw = sys.stdin.buffer.read()
+        raw = sys.stdin.buffer.read() if sys.stdin is not None else b""
     else:
         try:
             path = Path(data)
@@ -86,7 +88,7 @@ def _decode_frames(
     byte_order: ByteOrder,
     options: Options,
 ) -> None:
-    framer = Framer(dialect.header, max(16, len(payload)))
+    framer = Framer(dialect.header, dialect.header.max_payload)
     framer.feed(payload)
     offset = 0
     while (frame := framer.next_frame()) is not None:

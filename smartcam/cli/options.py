@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
+import math
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,19 @@ __all__ = ["CONNECTS", "Options", "camera_options", "output_options", "result_op
 F = TypeVar("F", bound="Callable[..., Any]")
 
 CONNECTS = "Connecting takes the camera from another client: it serves one, and the newcomer wins."
-SECONDS = click.FloatRange(min=0, min_open=True, max=86_400)
+
+
+class _Seconds(click.FloatRange):
+    """Seconds; NaN, which is below no bound and above none, is refused too."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        seconds = super().convert(value, param, ctx)
+        if math.isnan(seconds):
+            self.fail(f"{value!r} is not a number.", param, ctx)
+        return seconds
+
+
+SECONDS = _Seconds(min=0, min_open=True, max=86_400)
 
 _output = [
     click.option("--json", "as_json", is_flag=True, help="One JSON object a line on stdout."),
@@ -124,11 +136,26 @@ class Options:
             stream = Path(self.trace).open("w", encoding="utf-8", buffering=1)  # noqa: SIM115
         except OSError as exc:
             raise ConfigurationError(f"--trace {self.trace}: {exc.strerror}") from exc
-        with stream:
-            yield lambda entry: print(json.dumps(jsonable(entry)), file=stream)
+        failed: list[OSError] = []
+
+        def write(entry: TraceEntry) -> None:
+            # called from the link, which would take an OSError for one of its own
+            if not failed:
+                try:
+                    stream.write(json.dumps(jsonable(entry)) + "\n")
+                except OSError as exc:
+                    failed.append(exc)
+
+        try:
+            yield write
+        finally:
+            try:
+                stream.close()
+            except OSError as exc:
+                failed.append(exc)
+        if failed:
+            raise ConfigurationError(f"--trace {self.trace}: {failed[0].strerror}") from failed[0]
 
     def show(self, value: object, text: Callable[[], str]) -> None:
         """Print ``value`` as a line of JSON, or ``text()`` for people; flushed."""
-        line = json.dumps(jsonable(value)) if self.as_json else text()
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
+        click.echo(json.dumps(jsonable(value)) if self.as_json else text())

@@ -39,11 +39,14 @@ async def probe(host_or_url: str, options: Options) -> None:
                     write(entry)
 
             session = await _try(candidate, progress, share, note)
-            _show_try(progress, frames, options)
-            if session is not None:
-                _show_session(session, options)
-                await session.link.close(1.0)
-                return
+            try:
+                _show_try(progress, frames, options)
+                if session is not None:
+                    _show_session(session, options)
+                    return
+            finally:
+                if session is not None:
+                    await session.link.close(1.0)
             failed.append(str(progress))
     raise ConnectFailedError(
         f"no session with {address.host}:{address.port}: " + "; ".join(failed),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import io
 import logging
 import os
 import signal
@@ -16,6 +17,7 @@ from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
     InterpretationError,
+    LayoutError,
     LinkError,
     ProtocolError,
     SmartCamError,
@@ -74,6 +76,9 @@ def run(
     else:
         # without a handler Python prints warnings on its own, beside our one line
         logging.getLogger("smartcam").addHandler(logging.NullHandler())
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # a camera's texts may have letters that the terminal's encoding lacks
+        sys.stdout.reconfigure(errors="backslashreplace")
     ended_by: list[signal.Signals] = []
     try:
         asyncio.run(_with_signals(main, ended_by))
@@ -87,11 +92,18 @@ def run(
     except Exception as exc:  # noqa: BLE001 - the last place: one line instead of a traceback
         if debug:
             traceback.print_exc()
-        known = isinstance(exc, (SmartCamError, OSError))
-        text = str(exc) if known else f"unexpected {exc!r}; --debug shows where"
-        sys.stderr.write(f"{program}: error: {text}\n")
+        sys.stderr.write(f"{program}: error: {_one_line(exc)}\n")
         sys.exit(exit_code(exc))
     sys.exit(0)
+
+
+def _one_line(error: Exception) -> str:
+    if not isinstance(error, (SmartCamError, OSError)):
+        return f"unexpected {error!r}; --debug shows where"
+    lines = str(error).splitlines()
+    if isinstance(error, LayoutError):
+        del lines[1:]  # the text with a mark below it; the first line tells the position
+    return " ".join(line.strip() for line in lines)
 
 
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:

@@ -61,7 +61,12 @@ class Application(BaseModel):
         default=0.3,
         description="seconds that a switch to it takes: several 100 ms (SC manual p. 34)",
     )
-    processing_time: _Seconds = Field(default=0.05, description="seconds from trigger to result")
+    processing_time: _Seconds = Field(
+        default=0.05,
+        description=(
+            "seconds from trigger to result; a free run ends when the next begins at the latest"
+        ),
+    )
     input: _LayoutText | None = Field(
         default=None,
         description='layout of the input data: one record; None: no "receive data" tool',
@@ -160,7 +165,8 @@ class Application(BaseModel):
             raise ValueError(f"{sources[0]} needs a layout")
         if self.layout is not None and not sources:
             raise ValueError("a layout needs values: constant, cycle or generator")
-        if self.rate is not None and self.processing_time * self.rate > 1:
+        given = "processing_time" in self.model_fields_set  # the default gives way to the rate
+        if given and self.rate is not None and self.processing_time * self.rate > 1:
             raise ValueError(
                 f"a run of {self.processing_time} s does not fit a rate of {self.rate} per second"
             )

@@ -505,7 +505,7 @@ class Device:
         self._plan_free_run(origin, count + 1)
         if not self._faulty:
             self._begin_run()
-            # both were rounded to nanoseconds; a run never reaches into the next
+            # a run never reaches into the next, however both were rounded
             (ends, action), (following, _) = (
                 self._events[_Event.INSPECTED],
                 self._events[_Event.FREE_RUN],

@@ -7,9 +7,11 @@ has a :class:`~smartcam.protocols.machine.Machine` in the camera's role.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from smartcam.protocols.framing import Frame
 
 __all__ = [
+    "ACCEPT_PAUSE",
     "MAX_INPUT",
     "MAX_LINKS",
     "WRITE_LIMIT",
@@ -43,6 +46,9 @@ script manual p. 35, published for that side)."""
 
 MAX_LINKS = 32
 """Clients that are looked at. The camera serves one; a few more may wait to take over."""
+
+ACCEPT_PAUSE = 1.0
+"""Seconds until the next try where the system has no socket left."""
 
 WRITE_LIMIT = 1 << 20
 """Bytes kept for a client that does not read; more end its connection."""
@@ -150,7 +156,8 @@ class _TcpLink(Link, asyncio.Protocol):
             self.close(f"{MAX_LINKS} connections are open already")
             return
         # the camera does so too (newest SC manual p. 40: published)
-        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with contextlib.suppress(OSError):  # the client may be gone already
+            transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def data_received(self, data: bytes) -> None:
         with self._station.step():
@@ -161,6 +168,7 @@ class _TcpLink(Link, asyncio.Protocol):
                 self._tail = (self._tail + piece)[-self._header_size :]
                 self._take(piece)
                 if self._broken and self._station.quirks.bad_frame == "close":
+                    self.flush()
                     self.close("a broken frame came")
             self.flush()  # also what was said before a Disconnect in the same bytes
 
@@ -227,21 +235,26 @@ class Listener(ABC):
 
     async def wait_closed(self) -> None:
         """Wait until the event loop has let go of all sockets."""
-        # asyncio lets go of a socket one round after abort(), and of one that was just accepted
-        # three rounds after it
-        for _ in range(5):
+        # transports that were aborted call connection_lost in the loop's next round
+        for _ in range(2):
             await asyncio.sleep(0)
 
 
 class TcpListener(Listener):
-    """Accepts connections."""
+    """Accepts connections.
+
+    Not by ``asyncio.Server``: a connection that it has accepted but not yet wrapped when it is
+    closed stays open until the garbage collector finds it, and a client would wait for ever.
+    """
 
     kind = socket.SOCK_STREAM
 
     def __init__(self, station: Station) -> None:
         self.links: set[_TcpLink] = set()
         self._station = station
-        self._server: asyncio.Server | None = None
+        self._socket: socket.socket | None = None
+        self._waiting: asyncio.Task[None] | asyncio.TimerHandle | None = None
+        self._adopting: set[asyncio.Task[Any]] = set()
 
     @property
     def all_links(self) -> list[Link]:
@@ -251,23 +264,80 @@ class TcpListener(Listener):
     @property
     def open(self) -> bool:
         """Whether the port is open."""
-        return self._server is not None
+        return self._socket is not None
 
     async def serve(self, sock: socket.socket) -> None:
-        """Serve a bound socket."""
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(
-            lambda: _TcpLink(self, self._station), sock=sock, start_serving=False
-        )
-        await self._server.start_serving()
+        """Serve a bound socket that listens."""
+        self._socket = sock
+        self._listen(sock)
 
     def shut(self) -> None:
-        """Close the port and every link, at once."""
-        server, self._server = self._server, None
-        if server is not None:
-            server.close()
+        """Close the port and every link, at once; the socket is its owner's to close."""
+        sock, self._socket = self._socket, None
+        if sock is not None:
+            with contextlib.suppress(NotImplementedError):
+                asyncio.get_running_loop().remove_reader(sock)
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
         for link in self.all_links:
             link.close("the camera is down")
+
+    async def wait_closed(self) -> None:
+        """Wait until the event loop has let go of all sockets."""
+        if self._adopting:
+            await asyncio.wait(self._adopting)
+        await super().wait_closed()
+
+    def _listen(self, sock: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            loop.add_reader(sock, self._accept, sock)
+        except NotImplementedError:  # Windows' proactor
+            self._waiting = loop.create_task(
+                self._accept_for_ever(sock), name="smartcam.emulator.accept"
+            )
+
+    def _accept(self, sock: socket.socket) -> None:
+        try:
+            connection, _ = sock.accept()
+        except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+            return  # the client has changed its mind
+        except OSError as exc:  # no file descriptor is left: the reader would call without end
+            _log.warning("! a connection cannot be accepted: %s", exc)
+            loop = asyncio.get_running_loop()
+            loop.remove_reader(sock)
+            self._waiting = loop.call_later(ACCEPT_PAUSE, self._listen, sock)
+            return
+        connection.setblocking(False)
+        self._adopt(connection)
+
+    async def _accept_for_ever(self, sock: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(sock)
+            except OSError as exc:
+                _log.warning("! a connection cannot be accepted: %s", exc)
+                await asyncio.sleep(ACCEPT_PAUSE)
+            else:
+                self._adopt(connection)
+
+    def _adopt(self, connection: socket.socket) -> None:
+        """Make a link of an accepted connection; one that is too late is closed by its link."""
+        loop = asyncio.get_running_loop()
+        task = loop.create_task(
+            loop.connect_accepted_socket(lambda: _TcpLink(self, self._station), connection),
+            name="smartcam.emulator.adopt",
+        )
+        self._adopting.add(task)
+        task.add_done_callback(partial(self._adopted, connection))
+
+    def _adopted(self, connection: socket.socket, task: asyncio.Task[Any]) -> None:
+        self._adopting.discard(task)
+        if task.cancelled() or task.exception() is not None:
+            _log.warning("! an accepted connection was lost: %s", task)
+            connection.close()
 
 
 # ---------------------------------------------------------------------- UDP

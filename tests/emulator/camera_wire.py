@@ -11,6 +11,8 @@ import socket
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam.emulator import EmulatedCamera
 
 MAGIC = bytes.fromhex("50535642")
@@ -57,6 +59,13 @@ def thesis(frame: bytes) -> bytes:
     """Return a handbook frame as the thesis writes it: other magic, the length counts the id."""
     length = int.from_bytes(frame[4:8], "little") + 4
     return THESIS_MAGIC + length.to_bytes(4, "little") + frame[8:]
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Let the loop turn until ``condition`` holds."""
+    async with asyncio.timeout(TIMEOUT):
+        while not condition():  # noqa: ASYNC110  what is waited for has no event to set
+            await asyncio.sleep(0)
 
 
 class TcpClient:

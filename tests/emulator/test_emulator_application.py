@@ -218,6 +218,10 @@ def test_register_generator_can_be_named_and_not_taken() -> None:
         register_generator("tangram", seven)
 
 
+def test_default_processing_time_gives_way_to_the_rate() -> None:
+    assert Application(id=2, rate=1000).rate == 1000
+
+
 # ---------------------------------------------------------------------- what is wrong
 
 

@@ -17,7 +17,7 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 CHECK = Application(
     id=3, layout="n: uint8 @sequence", constant={"n": 0}, load_time=0.4, processing_time=0.05
@@ -140,7 +140,7 @@ def rebooting() -> Device:
     return device
 
 
-TABLE = {
+TABLE: dict[Callable[[], Device], dict[str, list[str]]] = {
     stopped: {
         "Query": ["active 3"],
         "Switch": ["[busy]"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.emulator import Application, Device, Quirks
@@ -101,7 +101,6 @@ def drive(device: Device, steps: list[Any]) -> None:
             assert (last.status, last.endian) == (device.status, device.endian)
 
 
-@settings(max_examples=300, deadline=None)
 @given(steps=STEPS, reboot_time=st.floats(0, 3), depth=st.integers(1, 3))
 def test_device_any_messages_and_ticks_keep_the_promises(
     steps: list[Any], reboot_time: float, depth: int
@@ -113,7 +112,6 @@ def test_device_any_messages_and_ticks_keep_the_promises(
     drive(device, [m.Connect(), *steps])
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     steps=STEPS,
     quirks=st.builds(
@@ -129,7 +127,6 @@ def test_device_with_any_quirks_keeps_the_promises(steps: list[Any], quirks: Qui
     drive(Device([*BUILTIN_APPLICATIONS, ECHO], quirks=quirks), steps)
 
 
-@settings(max_examples=100, deadline=None)
 @given(cuts=st.lists(st.floats(0, 0.3), max_size=30))
 def test_device_ticks_cut_anyhow_give_the_same(cuts: list[float]) -> None:
     one, other = (Device(BUILTIN_APPLICATIONS, active=9, running=True) for _ in range(2))
