@@ -1,0 +1,269 @@
+"""Sphinx configuration, and the tables that are made from the code when the documents are built.
+
+A page asks for one with::
+
+    ```{generated} messages
+    ```
+
+The functions in :data:`GENERATED` need nothing of Sphinx; ``tests/test_docs.py`` calls them too.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import itertools
+import struct
+import textwrap
+import tomllib
+import typing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import smartcam
+from smartcam.emulator import Quirks
+from smartcam.protocols.base import POLICIES
+from smartcam.protocols.bvs import HANDBOOK, MESSAGES, THESIS
+from smartcam.protocols.machine import TRANSITIONS, State
+from smartcam.protocols.messages import Request, Sender, Wire, wire_fields
+from smartcam.settings import CameraSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from smartcam.protocols.base import MessageRow
+
+project = "smartcam"
+version = release = smartcam.__version__
+copyright = "the smartcam maintainers"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"smartcam {release}"
+myst_heading_anchors = 4
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+napoleon_use_ivar = True
+napoleon_custom_sections = ["Cancellation", "Source"]
+
+ROOT = Path(__file__).parents[1]
+
+TYPES = {
+    Wire.WORD: ("UINT32", struct.calcsize(f"<{HANDBOOK.word}")),
+    Wire.UINT32: ("UINT32", 4),
+    Wire.DATA: ("bytes", None),
+}
+"""A field's name and size in the dialects with a magic number, whose word has 32 bits."""
+
+LIMITS = (
+    "protocols.framing.DEFAULT_MAX_LENGTH",
+    "connection.MAX_CHUNKS",
+    "client.DEFAULT_MAX_QUEUE",
+    "client.DEFAULT_TRIGGER_TIMEOUT",
+    "handshake.DETECTION_SHARE",
+    "conversation.MAX_APPLICATION_ID",
+    "exceptions.MAX_EXCERPT",
+    "emulator.links.MAX_INPUT",
+    "emulator.links.MAX_LINKS",
+    "emulator.links.WRITE_LIMIT",
+    "emulator.application.MAX_CONTAINER",
+    "emulator.traffic.MAX_ENTRIES",
+)
+"""Constants that bound something, below ``smartcam.``."""
+
+
+# ---------------------------------------------------------------------- tables made from the code
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    def line(cells: Iterable[object]) -> str:
+        return "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
+
+    head = list(head)
+    return "\n".join([line(head), line("---" for _ in head), *map(line, rows)]) + "\n"
+
+
+def _type_name(row: MessageRow) -> str:
+    return f"`{row.type.__name__}`"
+
+
+def _answer(row: MessageRow) -> str:
+    if not issubclass(row.type, Request):
+        return ""
+    return f"`{row.type.answer.__name__}`" if row.type.answer else "none"
+
+
+def messages() -> str:
+    """Return every message with its id, its sender, its answer and its source."""
+    rows = [
+        (
+            f"`{row.message_id:#04x}`",
+            row.title,
+            _type_name(row),
+            row.type.sender.value,
+            _answer(row),
+            *row.source.rsplit(", ", 1),
+        )
+        for row in MESSAGES
+    ]
+    head = ("id", "manual's name", "class", "from", "answer", "source", "grade")
+    return _table(head, rows)
+
+
+def bodies() -> str:
+    """Return every body field by field, and what the two length fields say about it."""
+    rows: list[tuple[object, ...]] = []
+    for row in MESSAGES:
+        fields = wire_fields(row.type)
+        sizes = [TYPES[wire][1] for _, wire in fields]
+        known = sum(size for size in sizes if size)
+        open_end = " + n" if None in sizes else ""
+        lengths = [f"{known + d.header.length_includes}{open_end}" for d in (HANDBOOK, THESIS)]
+        start = [f"`{row.message_id:#04x}`", _type_name(row)]
+        offset = HANDBOOK.header.size
+        for name, wire in fields:
+            kind, size = TYPES[wire]
+            rows.append((*start, offset, f"`{name}`", kind, size or "n", *lengths))
+            start, lengths = ["", ""], ["", ""]
+            offset += size or 0
+        if not fields:
+            rows.append((*start, "", "none", "", "", *lengths))
+    head = (
+        "id",
+        "class",
+        "offset",
+        "field",
+        "type",
+        "bytes",
+        "length in `handbook`",
+        "in `thesis`",
+    )
+    return _table(head, rows)
+
+
+def quirks() -> str:
+    """Return the emulator's open questions, as the descriptions of their fields tell them."""
+    rows = [
+        (f"`{name}`", f"`{field.default}`", _choices(field.annotation), field.description)
+        for name, field in Quirks.model_fields.items()
+    ]
+    return _table(("quirk", "default", "values", "why"), rows)
+
+
+def settings() -> str:
+    """Return the options of ``connect()``."""
+    rows = [
+        (f"`{name}`", "" if field.is_required() else f"`{field.default!r}`", field.description)
+        for name, field in CameraSettings.model_fields.items()
+        if name != "address"
+    ]
+    return _table(("option", "default", "meaning"), rows)
+
+
+def transitions() -> str:
+    """Return the session's states and what leads from one to another."""
+    ways: dict[tuple[State, State], dict[Sender, list[str]]] = {}
+    for (state, sender, message), following in TRANSITIONS.items():
+        ways.setdefault((state, following), {}).setdefault(sender, []).append(message.__name__)
+    lines: list[str] = []
+    for state in State:
+        for (start, following), senders in ways.items():
+            if start is state:
+                lines.append(f"{state.name} --> {following.name}")
+                lines += [f"    {who.value} sends {_wrap(names)}" for who, names in senders.items()]
+    inner = " | ".join(state.name for state in State if state not in {State.CLOSED, State.FAILED})
+    lines += [f"{inner} --> CLOSED", "    the peer ends the link"]
+    lines += [f"{inner} --> FAILED", "    broken input, where the policy says so"]
+    return "```text\n" + "\n".join(lines) + "\n```\n"
+
+
+def _wrap(names: list[str]) -> str:
+    return ("\n" + 17 * " ").join(textwrap.wrap(", ".join(names), 60))
+
+
+def policies() -> str:
+    """Return what each role does with broken input."""
+    rows = [
+        (
+            role.value,
+            transport.value.upper(),
+            "ends the link" if policy.fail else "is dropped and counted",
+            "is broken" if policy.exact_length else "is accepted and counted",
+        )
+        for (role, transport), policy in POLICIES.items()
+    ]
+    return _table(("role", "transport", "broken input", "a body longer than documented"), rows)
+
+
+def layers() -> str:
+    """Return the import contract, the top first."""
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
+    contracts = tools["importlinter"]["contracts"]
+    lines = next(one["layers"] for one in contracts if one["type"] == "layers")
+    text = "\n".join(lines).replace("smartcam.", "").replace(" :", ",")
+    return f"```text\n{text}\n```\n"
+
+
+def limits() -> str:
+    """Return the constants of :data:`LIMITS` with their values and the reasons in the source."""
+    rows: list[tuple[object, ...]] = []
+    for path in LIMITS:
+        place, _, name = path.rpartition(".")
+        module = importlib.import_module(f"smartcam.{place}")
+        reason = " ".join(_constant_doc(module, name).split())
+        rows.append((f"`{path}`", f"{getattr(module, name):,}", reason))
+    return _table(("constant", "value", "why"), rows)
+
+
+def _choices(annotation: Any) -> str:
+    if typing.get_origin(annotation) is typing.Literal:
+        return ", ".join(f"`{value}`" for value in typing.get_args(annotation))
+    names = {bool: "true or false", float: "seconds", int: "a number"}
+    return names.get(annotation, str(annotation))
+
+
+def _constant_doc(module: Any, name: str) -> str:
+    """Return the text that stands below a constant in the source."""
+    body = ast.parse(inspect.getsource(module)).body
+    for node, following in itertools.pairwise(body):
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name:
+            text = getattr(getattr(following, "value", None), "value", "")
+            return text if isinstance(text, str) else ""
+    return ""
+
+
+GENERATED: dict[str, Callable[[], str]] = {
+    one.__name__: one
+    for one in (messages, bodies, quirks, settings, transitions, policies, layers, limits)
+}
+"""What ``{generated}`` knows."""
+
+
+def setup(app: Any) -> None:
+    """Sphinx: add the directive ``{generated}``."""
+    from docutils import nodes
+    from docutils.statemachine import StringList
+    from sphinx.util.docutils import SphinxDirective
+
+    class Generated(SphinxDirective):
+        """Puts a table made from the code into the page."""
+
+        required_arguments = 1
+
+        def run(self) -> list[nodes.Node]:
+            text = GENERATED[self.arguments[0]]()
+            box = nodes.container(classes=["generated"])
+            source = StringList(text.splitlines(), source=f"generated {self.arguments[0]}")
+            self.state.nested_parse(source, self.content_offset, box)
+            return box.children
+
+    app.add_directive("generated", Generated)
+    app.connect("autodoc-skip-member", _skip)
+
+
+def _skip(_app: Any, _what: str, _name: str, member: object, skip: bool, _options: Any) -> bool:
+    """Leave out a NamedTuple's fields: its docstring describes them."""
+    text = getattr(member, "__doc__", None) or ""
+    return skip or text.startswith("Alias for field number")

@@ -1,0 +1,304 @@
+"""The documents: their examples run, their tables are complete, every page is in the contents.
+
+``python`` blocks run as scripts of their own. ``console`` blocks run line by line, each block with
+an emulator of its own unless it starts one; what they show must be what is printed, numbers aside.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import pytest
+
+from smartcam.emulator import Quirks
+from smartcam.models import Status
+from smartcam.protocols.bvs import MESSAGES
+from smartcam.protocols.machine import TRANSITIONS, State
+from smartcam.protocols.messages import wire_fields
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+CAMERA = "bvs://192.168.0.10"
+"""The address of a real camera in examples; an emulator's takes its place here."""
+LOCAL = re.compile(r"127\.0\.0\.1:\d{4,5}")
+SECONDS = 20
+
+
+class Block(NamedTuple):
+    """A fenced block of a page; ``line`` is that of its first line."""
+
+    page: Path
+    line: int
+    text: str
+
+
+def blocks(language: str, pages: list[Path]) -> list[Any]:
+    """Return the blocks of one language as test parameters."""
+    fence = re.compile(rf"^```{language}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+    found = [
+        Block(page, text[: match.start(1)].count("\n") + 1, match[1])
+        for page in pages
+        for text in [page.read_text(encoding="utf-8")]
+        for match in fence.finditer(text)
+    ]
+    return [pytest.param(block, id=f"{block.page.name}:{block.line}") for block in found]
+
+
+# ---------------------------------------------------------------------- running
+
+MAINS = {"smartcam": "main", "smartcam-emulator": "emulator_main"}
+
+
+class Shell:
+    """Runs the lines of a console block as a reader would type them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.address = ""  # host and port of the emulator last started
+        self.running: list[subprocess.Popen[str]] = []
+
+    def start(self, arguments: list[str]) -> subprocess.Popen[str]:
+        """Start a command; what needs an emulator gets the present one's address."""
+        if arguments[0] != "smartcam-emulator" and any(map(LOCAL.search, arguments)):
+            if not self.address:
+                self.emulate(["smartcam-emulator"], 1)
+            arguments = [LOCAL.sub(self.address, one) for one in arguments]
+        program, *rest = arguments
+        if program in MAINS:
+            code = f"from smartcam.cli import {MAINS[program]}; {MAINS[program]}()"
+            arguments = [sys.executable, "-c", code, *rest]
+        process = subprocess.Popen(  # noqa: S603 - what stands in our own documents
+            arguments,
+            cwd=self.folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            encoding="utf-8",
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        )
+        self.running.append(process)
+        return process
+
+    def emulate(self, arguments: list[str], cameras: int) -> str:
+        """Start an emulator on a free port and return its first lines, one for each camera."""
+        free = ["0" if before == "--port" else one for before, one in pairs(arguments)]
+        process = self.start(free)
+        assert process.stdout is not None
+        printed = "".join(process.stdout.readline() for _ in range(cameras))
+        address = LOCAL.search(printed)
+        assert address is not None, printed
+        self.address = address[0]
+        return printed
+
+    def run(self, arguments: list[str], shown: list[str]) -> tuple[str, int]:
+        """Run a command to its end, or to the Ctrl-C that is shown; return output and code."""
+        process = self.start(arguments)
+        assert process.stdout is not None
+        begin = ""
+        if "^C" in shown:
+            begin = "".join(process.stdout.readline() for _ in range(shown.index("^C")))
+            process.send_signal(signal.SIGINT)
+        rest, _ = process.communicate(timeout=SECONDS)
+        return begin + rest, process.returncode
+
+    def end(self) -> None:
+        """End what still runs."""
+        for process in self.running:
+            process.terminate()
+            process.communicate(timeout=SECONDS)
+
+
+def pairs(arguments: list[str]) -> list[tuple[str, str]]:
+    return list(zip(["", *arguments], arguments, strict=False))
+
+
+@pytest.fixture
+def shell(tmp_path: Path) -> Iterator[Shell]:
+    shell = Shell(tmp_path)
+    yield shell
+    shell.end()
+
+
+def steps(text: str, line: int) -> Iterator[tuple[int, str, list[str]]]:
+    """Yield each command of a console block with its line and the lines shown below it."""
+    for part in re.split(r"^(?=\$ )", text, flags=re.MULTILINE):
+        if part.startswith("$ "):
+            command, *shown = part.replace("\\\n", " ").splitlines()
+            yield line, command[2:], [one for one in shown if one.strip()]
+        line += part.count("\n")
+
+
+def shape(text: str) -> str:
+    """Return a line without its numbers, times and widths."""
+    return " ".join(re.sub(r"-?\b\d[\w.:+-]*", "#", text).split())
+
+
+def missing_line(shown: list[str], printed: str) -> str | None:
+    """Return the first line shown that was not printed, in this order; ``...`` cuts a line."""
+    actual = iter([shape(one) for one in printed.splitlines()])
+    for one in shown:
+        wanted = shape(one)
+        if wanted not in {"...", "^C"} and not any(
+            line.startswith(wanted[:-4]) if wanted.endswith(" ...") else line == wanted
+            for line in actual
+        ):
+            return one
+    return None
+
+
+# ---------------------------------------------------------------------- examples
+
+
+@pytest.mark.parametrize("block", blocks("python", PAGES))
+def test_python_block_runs(block: Block, shell: Shell) -> None:
+    text = block.text
+    if CAMERA in text:
+        text = text.replace(CAMERA, shell.emulate(["smartcam-emulator"], 1).strip())
+    # empty lines in front, so that a traceback names the page's own lines
+    code = compile("\n" * (block.line - 1) + text, str(block.page), "exec", dont_inherit=True)
+    exec(code, {"__name__": "__main__"})  # noqa: S102 - what stands in our own documents
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a POSIX shell's examples")
+@pytest.mark.parametrize("block", blocks("console", PAGES))
+def test_console_block_runs(block: Block, shell: Shell) -> None:
+    todo = list(steps(block.text, block.line))
+    for (line, command, shown), (_, following, code) in zip(
+        todo, [*todo[1:], (0, "", [])], strict=True
+    ):
+        arguments = shlex.split(command)
+        where = f"{block.page}:{line}: $ {command}\n"
+        if arguments[0] == "smartcam-emulator" and "^C" not in shown and "--help" not in arguments:
+            printed, ended = shell.emulate(arguments, len(shown) or 1), 0
+        elif arguments[0] in {*MAINS, "cat", "head", "tail"}:
+            printed, ended = shell.run(arguments, shown)
+        else:
+            continue
+        wanted = int(code[0]) if following == "echo $?" else 0
+        assert ended == wanted, f"{where}exit code {ended}, not {wanted}:\n{printed}"
+        missing = missing_line(shown, printed)
+        assert missing is None, f"{where}shown but not printed: {missing}\n{printed}"
+
+
+@pytest.mark.parametrize("block", blocks("sh", [ROOT / "README.md"]))
+def test_sh_block_of_the_readme_runs(block: Block, shell: Shell) -> None:
+    if "pip install" in block.text:
+        pytest.skip("sets up an environment: a step of its own in CI")
+    process = shell.start(["bash", "-euo", "pipefail", "-c", block.text])
+    printed, _ = process.communicate(timeout=SECONDS)
+    assert process.returncode == 0, f"{block.page}:{block.line}\n{printed}"
+
+
+# ---------------------------------------------------------------------- contents
+
+
+def test_every_page_is_in_the_contents() -> None:
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    trees = re.findall(r"^```\{toctree\}\n(.*?)^```$", index, re.DOTALL | re.MULTILINE)
+    entries = re.findall(r"^([a-z][a-z-]*)$", "".join(trees), re.MULTILINE)
+    assert sorted([*entries, "index"]) == sorted(page.stem for page in DOCS.glob("*.md"))
+
+
+def test_every_page_the_readme_names_is_there() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^):]+?)(?:#[^)]*)?\)", text)
+    assert [target for target in targets if not (ROOT / target).exists()] == []
+
+
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")),
+    reason="needs the extra docs",
+)
+def test_documents_build_without_warnings(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    done = subprocess.run(  # noqa: S603
+        [*build, "-d", str(tmp_path / "cache"), str(DOCS), str(tmp_path / "html")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+# ---------------------------------------------------------------------- tables
+
+
+@pytest.fixture(scope="module")
+def tables() -> dict[str, str]:
+    """Return every table that the documents make from the code."""
+    spec = importlib.util.spec_from_file_location("docs_conf", DOCS / "conf.py")
+    assert spec is not None
+    assert spec.loader is not None
+    conf = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(conf)
+    return {name: make() for name, make in conf.GENERATED.items()}
+
+
+def rows(table: str) -> list[list[str]]:
+    lines = [line.strip("|").split("|") for line in table.splitlines()[2:]]
+    return [[cell.strip(" `") for cell in line] for line in lines]
+
+
+def test_message_table_has_every_message(tables: dict[str, str]) -> None:
+    shown = [(int(row[0], 16), row[2], f"{row[5]}, {row[6]}") for row in rows(tables["messages"])]
+    assert shown == [(row.message_id, row.type.__name__, row.source) for row in MESSAGES]
+
+
+def test_body_table_has_every_field_at_its_offset(tables: dict[str, str]) -> None:
+    names = [row[3] for row in rows(tables["bodies"])]
+    assert names == [
+        name for row in MESSAGES for name in [f for f, _ in wire_fields(row.type)] or ["none"]
+    ]
+    seconds = [row for row in rows(tables["bodies"]) if row[3] == "second"]
+    assert [row[2] for row in seconds] == ["32", "32"]
+
+
+def test_quirk_table_has_every_quirk(tables: dict[str, str]) -> None:
+    shown = {row[0]: row[3] for row in rows(tables["quirks"])}
+    assert shown == {name: field.description for name, field in Quirks.model_fields.items()}
+
+
+def test_session_diagram_has_every_transition(tables: dict[str, str]) -> None:
+    text = tables["transitions"]
+    for (state, _, message), following in TRANSITIONS.items():
+        assert f"\n{state.name} --> {following.name}\n" in text
+        assert re.search(rf"\b{message.__name__}\b", text)
+    assert all(state.name in text for state in State)
+
+
+def test_limits_table_says_why(tables: dict[str, str]) -> None:
+    without = [row[0] for row in rows(tables["limits"]) if not row[2]]
+    assert without == ["client.DEFAULT_TRIGGER_TIMEOUT", "conversation.MAX_APPLICATION_ID"]
+
+
+def test_architecture_names_every_module() -> None:
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    modules = [path.stem for path in (ROOT / "smartcam").iterdir() if not path.name.startswith("_")]
+    assert [name for name in modules if name != "py" and f"| `{name}` |" not in page] == []
+
+
+def test_import_contract_is_shown(tables: dict[str, str]) -> None:
+    assert "protocols" in tables["layers"]
+    assert "camera | TCP" in tables["policies"]
+
+
+def test_protocol_page_has_every_status_bit() -> None:
+    page = (DOCS / "protocol.md").read_text(encoding="utf-8")
+    assert [bit for bit in Status if f"| `{bit.value:#05x}` | `{bit.name}` |" not in page] == []
+
+
+def test_every_generated_table_is_in_a_page(tables: dict[str, str]) -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    assert set(re.findall(r"^```\{generated\} (\w+)$", text, re.MULTILINE)) == set(tables)
