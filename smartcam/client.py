@@ -49,6 +49,7 @@ DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
 
 DEFAULT_TRIGGER_TIMEOUT = 5.0
+"""Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
 
 
 def connect(
@@ -637,8 +638,7 @@ class SmartCamera:
             if future.done() and not future.cancelled():
                 return future.result()
             raise TriggerTimeoutError(
-                f"{self.name}: no result came within {timeout:g} s; "
-                f"status: {self.status.describe()}",
+                f"{self.name}: no result came within {timeout:g} s; status: {self.status}",
                 waited=timeout,
             ) from exc
         finally:

@@ -42,6 +42,7 @@ __all__ = ["Conversation"]
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
+"""The id is a UINT32 on the wire (SC manual p. 34, published)."""
 
 
 def is_ready(status: Status) -> bool:
@@ -171,7 +172,7 @@ class Conversation:
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
-                f"{self.name}: waited {waited:.1f} s for {what}; status: {self.status.describe()}",
+                f"{self.name}: waited {waited:.1f} s for {what}; status: {self.status}",
                 waited=waited,
             ) from exc
 
@@ -252,9 +253,10 @@ class Conversation:
         if code != 0 or active != application:
             if was_running and Status.RUNNING not in self.status:
                 await self.start(deadline)
+            why = f"status {code}" if application else "no application may have the id 0"
             raise CommandRejectedError(
-                f"{self.name}: the camera refused to switch to application {application} "
-                f"(status {code}); application {active} is active",
+                f"{self.name}: switching to application {application} was refused: {why}; "
+                f"application {active} is active",
                 message_id=self.require_link().machine.dialect.message_id(m.SwitchApplication),
                 code=code,
                 active_application=active,
@@ -304,7 +306,7 @@ class Conversation:
             waited = deadline - sent_at
             raise TriggerTimeoutError(
                 f"{self.name}: no result within {waited:.2g} s of the trigger; "
-                f"status: {self.status.describe()}",
+                f"status: {self.status}",
                 waited=waited,
             ) from exc
         except asyncio.CancelledError:
@@ -325,11 +327,11 @@ class Conversation:
             if is_stopped(status):
                 raise NotRunningError(
                     f"{self.name}: application {self.inbox.active} is stopped: start it, or name "
-                    f"it so that it is started; status: {status.describe()}"
+                    f"it so that it is started; status: {status}"
                 )
             if not wait:
                 raise CameraBusyError(
-                    f"{self.name}: the camera does not wait for a trigger: {status.describe()}"
+                    f"{self.name}: the camera does not wait for a trigger: {status}"
                 )
             try:
                 await self.inbox.wait_status(_is_decided, deadline)
@@ -338,7 +340,7 @@ class Conversation:
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
                     f"{self.name}: the camera did not wait for a trigger within {waited:.2g} s; "
-                    f"status: {self.status.describe()}{free}",
+                    f"status: {self.status}{free}",
                     waited=waited,
                 ) from exc
 
@@ -410,7 +412,7 @@ class Conversation:
         message_id = self.require_link().machine.dialect.message_id(message)
         return ResponseTimeoutError(
             f"{self.name}: {what} {type(message).__name__} ({message_id:#04x}) {why}; "
-            f"status: {self.status.describe()}",
+            f"status: {self.status}",
             message_id=message_id,
         )
 

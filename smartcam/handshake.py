@@ -49,6 +49,9 @@ in milliseconds, one that speaks another dialect is silent; later rounds have th
 for slow links."""
 
 
+OPENING = "opening the link"
+
+
 class Session(NamedTuple):
     """A link with a session on it.
 
@@ -74,7 +77,7 @@ class Try:
 
     dialect: str
     transport: str
-    step: str = "opening the link"
+    step: str = OPENING
     outcome: str = ""
     received: int = 0
 
@@ -198,7 +201,10 @@ async def establish(
     deadline = loop.time() + settings.connect_timeout
     tries: list[Try] = []
     cause: BaseException | None = None
+    unreachable = False
     for number, name in enumerate(rounds):
+        if unreachable and number % len(names):
+            continue  # no link, so another dialect would fare no better in this round
         share = (deadline - loop.time()) / (len(rounds) - number)
         if len(names) > 1 and number < len(names):
             share = min(share, DETECTION_SHARE)
@@ -220,6 +226,7 @@ async def establish(
             progress.outcome, cause = f"{what} for {share:.1f} s", exc
         except (OSError, SmartCamError) as exc:
             progress.outcome, cause = str(exc), exc
+        unreachable = progress.step == OPENING
         logger.debug("%s ! attempt %d: %s", settings.name, number + 1, progress)
     texts = tuple(f"attempt {n}: {one}" for n, one in enumerate(tries, 1))
     raise ConnectFailedError(

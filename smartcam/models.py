@@ -75,7 +75,7 @@ class Status(enum.IntFlag):
                 names.append(name or f"{value:#x}")
         return names
 
-    def describe(self) -> str:
+    def __str__(self) -> str:
         """Return the set bits as text, ``"no bit set"`` for none."""
         return " + ".join(self.names) or "no bit set"
 

@@ -121,7 +121,7 @@ async def _watch(url: str, options: Options) -> None:
                         except TimeoutError as exc:
                             raise TriggerTimeoutError(
                                 f"{camera.name}: no result within {each:g} s; "
-                                f"status: {camera.status.describe()}"
+                                f"status: {camera.status}"
                             ) from exc
                         options.show(result, lambda: result_text(result))  # noqa: B023
                         done += 1
@@ -257,6 +257,6 @@ def _show_camera(camera: smartcam.SmartCamera, options: Options) -> None:
         jsonable(value),
         lambda: (
             f"{camera.url}\n  application {camera.active_application}, {running}\n"
-            f"  status: {camera.status.describe()}\n  protocol version {camera.protocol_version}"
+            f"  status: {camera.status}\n  protocol version {camera.protocol_version}"
         ),
     )

@@ -49,10 +49,7 @@ async def demo(options: Options) -> None:
         async with smartcam.connect(
             emulator.url, name="demo", application=HELLO, interpret_as=interpret_as
         ) as camera:
-            say.step(
-                f"Connected, application {camera.active_application} runs: "
-                f"{camera.status.describe()}"
-            )
+            say.step(f"Connected, application {camera.active_application} runs: {camera.status}")
             await _switch(camera, say)
             await _localize(camera, emulator, say)
             await _stream(camera, say)
@@ -82,7 +79,7 @@ async def _switch(camera: smartcam.SmartCamera, say: _Steps) -> None:
         event = await anext(events)
         match event:
             case StatusChanged(status=status):
-                say.detail(f"   status: {status.describe()}", status=status)
+                say.detail(f"   status: {status}", status=status)
             case ApplicationChanged(application=application):
                 say.detail(f"   application {application} is active", application=application)
             case _:

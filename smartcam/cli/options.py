@@ -20,7 +20,14 @@ if TYPE_CHECKING:
 
     from smartcam.connection import TraceEntry
 
-__all__ = ["CONNECTS", "Options", "camera_options", "output_options", "result_options"]
+__all__ = [
+    "CONNECTS",
+    "Options",
+    "camera_options",
+    "camera_url",
+    "output_options",
+    "result_options",
+]
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
@@ -94,6 +101,11 @@ def result_options(function: F) -> F:
     return _apply([*_result, *_camera, *_output], function)
 
 
+def camera_url(text: str) -> str:
+    """Return a camera's URL; a bare host is one that speaks BVS over TCP."""
+    return text if "://" in text else f"bvs://{text}"
+
+
 @dataclass(slots=True)
 class Options:
     """The shared options as a command uses them."""
@@ -117,7 +129,7 @@ class Options:
         """Give an unopened camera; the trace file is open around it."""
         with self.tracing() as trace:
             yield connect(
-                url,
+                camera_url(url),
                 trace=trace,
                 application=self.application,
                 interpret_as=self.interpret_as,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+from smartcam.cli.options import camera_url
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.handshake import Session, Try, attempt, load_protocol
 from smartcam.models import Status, jsonable
@@ -24,7 +25,7 @@ __all__ = ["probe"]
 
 async def probe(host_or_url: str, options: Options) -> None:
     """Try transports and dialects, one after the other on fresh links, until one answers."""
-    address = parse_address(host_or_url if "://" in host_or_url else f"bvs://{host_or_url}")
+    address = parse_address(camera_url(host_or_url))
     candidates = _candidates(address)
     share = options.step(10.0) / len(candidates)
     failed: list[str] = []
@@ -131,5 +132,5 @@ def _show_session(session: Session, options: Options) -> None:
     }
     options.show(
         jsonable(value),
-        lambda: f"status: {status.describe()}\nuse: {session.address.url}",
+        lambda: f"status: {status}\nuse: {session.address.url}",
     )

@@ -70,7 +70,7 @@ def _localizations_text(parts: list[Localization]) -> str:
 
 def _cell(value: object) -> str:
     if isinstance(value, float):
-        return f"{value:.4f}"
+        return f"{value:.6g}"
     text = str(value)
     # a camera's text stays in its cell: no line breaks, nothing that a terminal obeys
     return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)

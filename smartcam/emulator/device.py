@@ -328,8 +328,7 @@ class Device:
         """
         if condition & ~OPERATOR_CONDITIONS:
             raise ConfigurationError(
-                f"device: only {OPERATOR_CONDITIONS.describe()} can be set, "
-                f"got {condition.describe()}"
+                f"device: only {OPERATOR_CONDITIONS} can be set, got {condition}"
             )
         with self.around():
             self._conditions = self._conditions | condition if on else self._conditions & ~condition

@@ -681,9 +681,9 @@ def test_operators_actions_happen_inside_around() -> None:
 
     @contextmanager
     def around() -> Iterator[None]:
-        seen.append(f"before {device.status.describe()}")
+        seen.append(f"before {device.status}")
         yield
-        seen.append(f"after {device.status.describe()}")
+        seen.append(f"after {device.status}")
 
     device.around = around
     device.start()
