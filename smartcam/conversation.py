@@ -253,10 +253,13 @@ class Conversation:
         if code != 0 or active != application:
             if was_running and Status.RUNNING not in self.status:
                 await self.start(deadline)
-            why = f"status {code}" if application else "no application may have the id 0"
+            refusal = (
+                f"the camera refused to switch to application {application} (status {code})"
+                if application
+                else "no application may have the id 0"
+            )
             raise CommandRejectedError(
-                f"{self.name}: switching to application {application} was refused: {why}; "
-                f"application {active} is active",
+                f"{self.name}: {refusal}; application {active} is active",
                 message_id=self.require_link().machine.dialect.message_id(m.SwitchApplication),
                 code=code,
                 active_application=active,

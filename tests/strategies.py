@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from hypothesis import strategies as st
@@ -79,4 +80,4 @@ def chunkings(size: int) -> st.SearchStrategy[list[int]]:
 def split(data: bytes, cuts: list[int]) -> list[bytes]:
     """Cut ``data`` at ``cuts``; empty pieces are left in, a socket's reader must bear them."""
     edges = [0, *cuts, len(data)]
-    return [data[a:b] for a, b in zip(edges, edges[1:], strict=False)]
+    return [data[a:b] for a, b in pairwise(edges)]

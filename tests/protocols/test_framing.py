@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import struct
+from typing import TYPE_CHECKING
 
 import pytest
 from machines import DIALECTS, SIXTEEN
 
 from smartcam.exceptions import FrameError
-from smartcam.protocols.base import Dialect
 from smartcam.protocols.bvs import HANDBOOK, THESIS
 from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
+
+if TYPE_CHECKING:
+    from smartcam.protocols.base import Dialect
 
 MAGIC = bytes.fromhex("50535642")
 STATUS = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")
@@ -114,7 +117,8 @@ def test_framer_any_buffer_kind_is_taken_and_may_change_later(
 
 def test_framer_bytearray_changed_after_feed_does_not_change_the_frame() -> None:
     source = bytearray(STATUS)
-    framer = fed(source)
+    framer = Framer(HANDBOOK.header)
+    framer.feed(source)
     source[12] = 0xEE
     assert framer.next_frame() == STATUS_FRAME
 

@@ -207,9 +207,7 @@ def test_client_on_tcp_status_before_the_connect_answer_fails() -> None:
     made = machine(Role.CLIENT)
     made.send(m.Connect())
     error = failure(feed(made, STATUS))
-    assert str(error) == (
-        "StatusReport (0x12) came in state connecting, where it is not expected"
-    )
+    assert str(error) == ("StatusReport (0x12) came in state connecting, where it is not expected")
     assert error.data == STATUS[12:]
 
 
@@ -412,9 +410,7 @@ def test_client_unknown_request_awaits_an_answer_under_its_id() -> None:
     made.send(unknown)
     with pytest.raises(LocalProtocolError, match="0x77 is still owed"):
         made.send(unknown)
-    assert feed(made, header(1, 0x77) + b"!") == [
-        m.UnknownMessage(message_id=0x77, payload=b"!")
-    ]
+    assert feed(made, header(1, 0x77) + b"!") == [m.UnknownMessage(message_id=0x77, payload=b"!")]
     made.send(unknown)
 
 
@@ -485,9 +481,7 @@ def test_counters_tell_frames_and_bytes_of_both_directions() -> None:
 @pytest.mark.parametrize("dialect", DIALECTS, ids=lambda one: one.name)
 def test_trace_sees_each_frame_of_both_directions(role: Role, dialect: Dialect) -> None:
     seen: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
-    made = Machine(
-        dialect, role, TCP, trace=lambda sender, frame: seen.append((sender, frame))
-    )
+    made = Machine(dialect, role, TCP, trace=lambda sender, frame: seen.append((sender, frame)))
     made.state = State.CONNECTED
     theirs: m.Message = STATUS_MESSAGE if role is Role.CLIENT else m.Trigger()
     ours: m.Message = m.Trigger() if role is Role.CLIENT else STATUS_MESSAGE
