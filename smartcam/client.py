@@ -20,6 +20,7 @@ from smartcam.exceptions import (
     ConnectionLostError,
     InterpretationError,
     LocalProtocolError,
+    RemoteProtocolError,
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from typing import Literal, Self
 
     from smartcam.connection import Link, TraceEntry
+    from smartcam.protocols.base import Dialect
 
 __all__ = ["SmartCamera", "connect"]
 
@@ -525,12 +527,12 @@ class SmartCamera:
         Args:
             message_id: its id.
             payload: its body.
-            answered: whether an answer under the same id is expected; by default what the message
+            answered: whether to wait for an answer under the same id; by default what the message
                 table says, True for an unknown id.
             timeout: seconds for the answer.
 
         Returns:
-            The answer's body, None where no answer is expected: returned once written.
+            The answer's body, None where none is waited for: returned once written.
 
         Raises:
             LocalProtocolError: Connect and Disconnect (sessions are the client's own).
@@ -539,22 +541,24 @@ class SmartCamera:
         Cancellation: safe; the answer is dropped when it comes.
         """
         dialect = self._talk.require_link().machine.dialect
-        message: m.Message = m.UnknownMessage(message_id=message_id, payload=bytes(payload))
-        with contextlib.suppress(SmartCamError):
-            message = dialect.decode(m.Sender.CLIENT, Frame(message_id, bytes(payload)))
-        if isinstance(message, (m.Connect, m.Disconnect)):
+        known = dialect.message_type(m.Sender.CLIENT, message_id)
+        if known in {m.Connect, m.Disconnect}:
             raise LocalProtocolError(f"{self.name}: the session is the client's own")
-        answer_id = dialect.answer_id(message_id)
-        expected = answer_id is not None if answered is None else answered
-        if not expected:
-            await self._tell(message)
-            return None
-        key = dialect.message_type(m.Sender.CAMERA, message_id)
-        limit = self.settings.request_timeout if timeout is None else timeout
-        answer = await self._talk.exchange(
-            message, message_id if key is m.UnknownMessage else key, self._talk.deadline(limit)
+        message = _as_named(dialect, Frame(message_id, bytes(payload)))
+        documented = dialect.answer_id(message_id) is not None
+        answer = dialect.message_type(m.Sender.CAMERA, message_id)
+        key = message_id if answer is m.UnknownMessage else answer
+        deadline = self._talk.deadline(
+            self.settings.request_timeout if timeout is None else timeout
         )
-        return dialect.to_frame(answer).payload
+        if documented if answered is None else answered:
+            return dialect.to_frame(await self._talk.exchange(message, key, deadline)).payload
+        if documented and known is not m.UnknownMessage:
+            # answered it is nevertheless, and that must not pass for the next one's answer
+            await self._talk.post(message, key, deadline)
+        else:
+            await self._talk.tell(message, deadline, answered=False)
+        return None
 
     # ------------------------------------------------------------------ the supervisor
 
@@ -650,6 +654,15 @@ class SmartCamera:
         return ConnectionClosedError(
             f"{self.name}: the connection is {state}", host=address.host, port=address.port
         )
+
+
+def _as_named(dialect: Dialect, frame: Frame) -> m.Message:
+    """Return the message that a frame is; one without a name where that would change its bytes."""
+    with contextlib.suppress(RemoteProtocolError):
+        message = dialect.decode(m.Sender.CLIENT, frame)
+        if dialect.to_frame(message) == frame:
+            return message
+    return m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
 
 
 def _is_not_busy(status: Status) -> bool:

@@ -98,8 +98,12 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
 
     # ------------------------------------------------------------------ for the client
 
-    def send(self, *messages: Message) -> None:
+    def send(self, *messages: Message, answered: bool | None = None) -> None:
         """Write messages at once: one write on TCP, a datagram each on UDP.
+
+        Args:
+            *messages: what to say.
+            answered: whether they are answered, where the protocol does not know.
 
         Raises:
             LocalProtocolError: the protocol's state forbids one; those before it were written.
@@ -109,7 +113,7 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
             raise self._lost_error()
         try:
             for message in messages:
-                self.machine.send(message)
+                self.machine.send(message, answered=answered)
         finally:
             self._flush()
 

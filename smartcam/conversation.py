@@ -111,14 +111,21 @@ class Conversation:
 
     # ------------------------------------------------------------------ say and wait
 
-    async def tell(self, message: m.Message, deadline: float) -> None:
+    async def tell(
+        self, message: m.Message, deadline: float, *, answered: bool | None = None
+    ) -> None:
         """Send what the camera never answers; returns once written.
+
+        Args:
+            message: what to say.
+            deadline: loop time.
+            answered: False for a message without a name that is not answered either.
 
         Raises:
             ResponseTimeoutError: the camera takes no bytes.
         """
         link = self.require_link()
-        link.send(message)
+        link.send(message, answered=answered)
         try:
             async with asyncio.timeout_at(deadline):
                 await link.drain()
@@ -144,6 +151,16 @@ class Conversation:
         self, message: m.Message, key: type[m.Message] | int, deadline: float
     ) -> m.Message:
         """Send a request and return the answer registered under ``key``; as :meth:`ask`."""
+        return await self._await_answer(await self.post(message, key, deadline), message, deadline)
+
+    async def post(
+        self, message: m.Message, key: type[m.Message] | int, deadline: float
+    ) -> asyncio.Future[m.Message | SmartCamError]:
+        """Send a request as soon as none of its kind is open; its answer is owed from then on.
+
+        Raises:
+            ResponseTimeoutError: an earlier one was open until ``deadline``.
+        """
         lock = self._locks[key]
         try:
             async with asyncio.timeout_at(deadline):
@@ -154,7 +171,7 @@ class Conversation:
             await self._await_owed(key, message, deadline)
             self.require_link().send(message)
             self._due[key] = deadline
-            return await self._await_answer(self.inbox.next_answer(key), message, deadline)
+            return self.inbox.next_answer(key)
         finally:
             lock.release()
 
@@ -172,7 +189,7 @@ class Conversation:
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
-                f"{self.name}: waited {waited:.1f} s for {what}; status: {self.status}",
+                f"{self.name}: waited {round(waited, 2):g} s for {what}; status: {self.status}",
                 waited=waited,
             ) from exc
 
@@ -308,7 +325,7 @@ class Conversation:
             inbox.give_up(pending)
             waited = deadline - sent_at
             raise TriggerTimeoutError(
-                f"{self.name}: no result within {waited:.2g} s of the trigger; "
+                f"{self.name}: no result within {round(waited, 2):g} s of the trigger; "
                 f"status: {self.status}",
                 waited=waited,
             ) from exc
@@ -342,7 +359,7 @@ class Conversation:
                 free = "; an application that runs free never does" if is_ready(status) else ""
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
-                    f"{self.name}: the camera did not wait for a trigger within {waited:.2g} s; "
+                    f"{self.name}: the camera did not wait for a trigger within {round(waited, 2):g} s; "
                     f"status: {self.status}{free}",
                     waited=waited,
                 ) from exc

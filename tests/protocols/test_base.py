@@ -87,6 +87,8 @@ def test_message_type_unknown_id_or_wrong_sender_is_an_unknown_message() -> None
     assert HANDBOOK.message_type(CAMERA, 0x77) is m.UnknownMessage
     assert HANDBOOK.message_type(CLIENT, 0x20) is m.UnknownMessage
     assert HANDBOOK.message_type(CAMERA, 0x40) is m.UnknownMessage
+    assert HANDBOOK.knows(CLIENT, 0x40)
+    assert not HANDBOOK.knows(CAMERA, 0x40)
 
 
 @pytest.mark.parametrize(
