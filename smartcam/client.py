@@ -97,6 +97,7 @@ class SmartCamera:
         self.settings = settings
         self._trace = trace
         self._inbox = Inbox(settings.name, self._interpretation(settings.interpret_as))
+        self._inbox.expected = settings.application
         self._talk = Conversation(self._inbox)
         self._supervisor: asyncio.Task[None] | None = None
         self._opened: asyncio.Future[SmartCamError | None] | None = None

@@ -359,8 +359,8 @@ class Conversation:
                 free = "; an application that runs free never does" if is_ready(status) else ""
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
-                    f"{self.name}: the camera did not wait for a trigger within {round(waited, 2):g} s; "
-                    f"status: {self.status}{free}",
+                    f"{self.name}: the camera did not wait for a trigger within "
+                    f"{round(waited, 2):g} s; status: {self.status}{free}",
                     waited=waited,
                 ) from exc
 

@@ -67,7 +67,7 @@ def command(
                     port=port + index if port else 0,
                     dialect=dialect,
                     transport=transport,
-                    name=f"camera{index + 1}",
+                    name=f"camera{index + 1}" if cameras > 1 else None,
                 )
                 await stack.enter_async_context(emulator)
                 _announce(emulator, options)

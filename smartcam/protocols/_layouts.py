@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["FieldView", "frame_view", "view_fields"]
 
 
+# what a body is longer than documented
+_SURPLUS: Any = c.Default(c.RawCopy(c.GreedyBytes), {"value": b""})
+
+
 class FieldView(NamedTuple):
     """One field of a frame.
 
@@ -45,7 +49,8 @@ def frame_view(dialect: Dialect, sender: Sender) -> c.Construct:
     types = {Wire.WORD: integer[dialect.word], Wire.UINT32: c.Int32ul, Wire.DATA: c.GreedyBytes}
     bodies = {
         row.message_id: c.Struct(
-            *[name / c.RawCopy(types[wire]) for name, wire in wire_fields(row.type)], c.Terminated
+            *[name / c.RawCopy(types[wire]) for name, wire in wire_fields(row.type)],
+            "surplus" / _SURPLUS,
         )
         for row in dialect.table
         if row.type.sender is sender
@@ -62,7 +67,7 @@ def frame_view(dialect: Dialect, sender: Sender) -> c.Construct:
             c.Switch(
                 c.this.message_id.value,
                 bodies,
-                default=c.Struct("payload" / c.RawCopy(c.GreedyBytes), c.Terminated),
+                default=c.Struct("payload" / c.RawCopy(c.GreedyBytes)),
             ),
         ),
         c.Terminated,
@@ -70,7 +75,7 @@ def frame_view(dialect: Dialect, sender: Sender) -> c.Construct:
 
 
 def view_fields(dialect: Dialect, sender: Sender, data: bytes) -> list[FieldView]:
-    """Return every field of one complete frame, in order.
+    """Return every field of one complete frame, in order; bytes behind them as ``surplus``.
 
     Raises:
         MessageError: it is no complete frame of this dialect from this sender.
@@ -87,5 +92,5 @@ def view_fields(dialect: Dialect, sender: Sender, data: bytes) -> list[FieldView
         FieldView(name, field.offset1, field.data, field.value)
         for part in (parsed, body)
         for name, field in part.items()
-        if name != "_io"
+        if name != "_io" and (name != "surplus" or field.data)
     ]

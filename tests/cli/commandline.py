@@ -1,0 +1,326 @@
+"""A bench for the command line: commands, emulated cameras, and cameras that misbehave.
+
+Bytes of the wire stand here as constants, worked out by hand from the published layouts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import select
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from unittest import mock
+
+import smartcam.cli
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+CONNECT = bytes.fromhex("50535642 00000000 01000000")
+CONNECTED = bytes.fromhex("50535642 04000000 01000000 01000000")
+DISCONNECT = bytes.fromhex("50535642 00000000 02000000")
+QUERY = bytes.fromhex("50535642 00000000 30000000")
+ACTIVE_21 = bytes.fromhex("50535642 04000000 30000000 15000000")
+SWITCH_5 = bytes.fromhex("50535642 04000000 31000000 05000000")
+SWITCHED_5 = bytes.fromhex("50535642 08000000 31000000 00000000 05000000")
+TRIGGER = bytes.fromhex("50535642 00000000 40000000")
+START = bytes.fromhex("50535642 00000000 41000000")
+STOPPED = bytes.fromhex("50535642 08000000 12000000 00000000 00000000")
+BUSY = bytes.fromhex("50535642 08000000 12000000 10000000 00000000")
+WAITING = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")
+HELLO_WORLD = bytes.fromhex(
+    "50535642 18000000 20000000 15000000 48656c6c6f20576f726c64 000000000000000000"
+)
+BOMB = bytes.fromhex("50535642 ffffffff 20000000")
+"""A header that announces 4 GiB."""
+
+DIE = b"die"
+"""As an answer: reset the connection."""
+
+SESSION: Mapping[bytes, bytes] = {CONNECT: CONNECTED + WAITING, QUERY: ACTIVE_21}
+"""What a camera in application 21 says until it is triggered."""
+
+PATIENCE = 15.0
+"""Seconds; no wait of the bench is longer."""
+
+MARGIN = 4.0
+"""Seconds that a command may take beside its own time-outs, on a busy machine."""
+
+SCENARIO = """\
+applications:
+  - {id: 2, layout: "n: int32 @sequence", generator: sequence, load_time: 0, processing_time: 0}
+  - {id: 4, layout: "text: string[8]", constant: {text: "a\\nb\\e[m"},
+     load_time: 0, processing_time: 0}
+  - {id: 5, layout: "n: int32", generator: sequence, rate: 100, load_time: 0,
+     processing_time: 0.001}
+  - {id: 6, layout: "n: int32", constant: {n: 1}, load_time: 0, processing_time: 60}
+  - {id: 8, layout: "(name: string[8], x: real32 mm)*", load_time: 0, processing_time: 0,
+     constant: [{name: "bolt", x: 0.112}, {name: "nut", x: 0.187}]}
+  - id: 7
+    layout: "(feature_id: string[50], quality: real32, photo_index: int32,
+      x: real32, y: real32, theta: real32)*"
+    generator: tangram
+    load_time: 0
+    processing_time: 0
+  - {id: 11, layout: "a: string[50], b: string[50]", constant: {a: "one", b: ""},
+     load_time: 0, processing_time: 0}
+  - {id: 13, layout: "order: int32", input: "order: int32", generator: input,
+     load_time: 0, processing_time: 0}
+  - {id: 21, layout: "text: string[20]", constant: {text: "Hello World"},
+     load_time: 0, processing_time: 0}
+"""
+
+
+def thesis(frame: bytes) -> bytes:
+    """Return a handbook frame as the thesis writes it: other magic, the length counts the id."""
+    length = int.from_bytes(frame[4:8], "little") + 4
+    return bytes.fromhex("42565350") + length.to_bytes(4, "little") + frame[8:]
+
+
+# ---------------------------------------------------------------------- commands
+
+
+class Outcome(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float = 0.0
+
+    @property
+    def lines(self) -> list[Any]:
+        """The lines of stdout, each read as JSON."""
+        return [json.loads(line) for line in self.out.splitlines()]
+
+    def done(self) -> Self:
+        """See that it ended well and said nothing on stderr."""
+        assert (self.code, self.err) == (0, "")
+        return self
+
+    def failed(self, code: int, *texts: str, within: float = 0.0) -> Self:
+        """See that it ended with ``code`` and one line that holds ``texts``, in time."""
+        assert self.err.startswith(("smartcam: error: ", "smartcam-emulator: error: "))
+        assert self.err.count("\n") == 1
+        assert self.err.endswith("\n")
+        assert "Traceback" not in self.err
+        for text in texts:
+            assert text in self.err
+        assert self.code == code
+        assert self.seconds < within + MARGIN
+        return self
+
+
+def run(
+    *args: str,
+    stdin: bytes = b"",
+    program: str = "smartcam",
+    main: Callable[[], None] | None = None,
+) -> Outcome:
+    """Run a command in this process."""
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
+    begin, code = time.monotonic(), 0
+    with (
+        mock.patch.object(sys, "argv", [program, *args]),
+        mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin), encoding="utf-8")),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            (main or smartcam.cli.main)()
+        except SystemExit as exc:
+            code = exc.code if isinstance(exc.code, int) else 0
+    seconds = time.monotonic() - begin
+    out.seek(0)
+    err.seek(0)
+    return Outcome(code, out.read(), err.read(), seconds)
+
+
+def run_emulator(*args: str) -> Outcome:
+    """Run ``smartcam-emulator`` in this process, where it is to end by itself."""
+    return run(*args, program="smartcam-emulator", main=smartcam.cli.emulator_main)
+
+
+def script(name: str) -> str:
+    """Return the path of a console script of this environment."""
+    found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+    assert found is not None
+    return found
+
+
+class Process:
+    """A console script in a process of its own.
+
+    Args:
+        command: its name and its arguments; a bare name of ours is looked up.
+        env: variables beside the present ones.
+    """
+
+    def __init__(self, *command: str, env: Mapping[str, str] | None = None) -> None:
+        self._popen = subprocess.Popen(  # noqa: S603 - commands of the tests
+            [script(command[0]), *command[1:]],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            bufsize=0,
+            env={**os.environ, "PYTHONUNBUFFERED": "", **(env or {})},
+        )
+        self._begin = time.monotonic()
+        self._seen: dict[str, bytes] = {"stdout": b"", "stderr": b""}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._popen.poll() is None:
+            self._popen.kill()
+        for stream in (self._popen.stdout, self._popen.stderr):
+            if stream is not None:
+                stream.close()
+        self._popen.wait(PATIENCE)
+
+    def read_until(self, text: bytes, *, count: int = 1, stream: str = "stdout") -> str:
+        """Return what was said until ``text`` had come ``count`` times."""
+        pipe = getattr(self._popen, stream)
+        end = time.monotonic() + PATIENCE
+        while self._seen[stream].count(text) < count:
+            ready, _, _ = select.select([pipe], [], [], max(0.0, end - time.monotonic()))
+            data = os.read(pipe.fileno(), 65536) if ready else b""
+            assert data, f"{text!r} did not come: {self._seen}"
+            self._seen[stream] += data
+        return self._seen[stream].decode(errors="replace")
+
+    def close_stdout(self) -> None:
+        """Read no more."""
+        assert self._popen.stdout is not None
+        self._popen.stdout.close()
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal."""
+        self._popen.send_signal(number)
+
+    def wait(self) -> Outcome:
+        """Return how it ended, with everything it said."""
+        if self._popen.stdout is not None and self._popen.stdout.closed:
+            self._popen.stdout = None
+        out, err = self._popen.communicate(timeout=PATIENCE)
+        seconds = time.monotonic() - self._begin
+        return Outcome(
+            self._popen.returncode,
+            (self._seen["stdout"] + (out or b"")).decode(),
+            (self._seen["stderr"] + err).decode(),
+            seconds,
+        )
+
+
+# ---------------------------------------------------------------------- cameras
+
+
+@contextlib.contextmanager
+def emulators(folder: Path, *options: tuple[str, ...]) -> Iterator[list[str]]:
+    """Run an emulator for each tuple of options; gives their URLs."""
+    scenario = folder / "quick.yaml"
+    scenario.write_text(SCENARIO, encoding="utf-8")
+    with contextlib.ExitStack() as stack:
+        started = [
+            stack.enter_context(Process("smartcam-emulator", str(scenario), *each))
+            for each in options
+        ]
+        yield [process.read_until(b"\n").strip() for process in started]
+        for process in started:
+            process.send_signal(15)
+        for process in started:
+            process.wait().done()
+
+
+class Peer:
+    """Something at the other end that does exactly what a table says, on loopback TCP.
+
+    Args:
+        answers: what it sends for a whole frame; nothing for a frame that is not in it.
+        greeting: what it sends as soon as a connection is there.
+    """
+
+    def __init__(self, answers: Mapping[bytes, bytes] | None = None, greeting: bytes = b"") -> None:
+        self._answers = answers or {}
+        self._greeting = greeting
+        self._received = b""
+        self._more = threading.Condition()
+        self._closing = False
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._thread = threading.Thread(target=self._serve, name="peer")
+        self._thread.start()
+
+    @property
+    def host_and_port(self) -> str:
+        """Where it listens."""
+        return f"127.0.0.1:{self._listener.getsockname()[1]}"
+
+    @property
+    def url(self) -> str:
+        """Its address, the dialect pinned."""
+        return f"bvs://{self.host_and_port}?dialect=handbook"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._closing = True
+        # wakes the thread where it waits for a connection
+        socket.create_connection(self._listener.getsockname(), PATIENCE).close()
+        self._thread.join(PATIENCE)
+        self._listener.close()
+        assert not self._thread.is_alive()
+
+    def wait_received(self, data: bytes) -> None:
+        """Wait until these bytes have come."""
+        with self._more:
+            assert self._more.wait_for(lambda: data in self._received, PATIENCE)
+
+    def wait_last(self, data: bytes) -> None:
+        """Wait until the last bytes that came are these."""
+        with self._more:
+            assert self._more.wait_for(lambda: self._received.endswith(data), PATIENCE)
+
+    def _serve(self) -> None:
+        while not self._closing:
+            connection, _ = self._listener.accept()
+            connection.settimeout(PATIENCE)
+            with connection, contextlib.suppress(OSError):
+                self._converse(connection)
+
+    def _converse(self, connection: socket.socket) -> None:
+        connection.sendall(self._greeting)
+        buffer = b""
+        while data := connection.recv(4096):
+            with self._more:
+                self._received += data
+                self._more.notify_all()
+            buffer += data
+            while len(buffer) >= 12:
+                size = 12 + int.from_bytes(buffer[4:8], "little")
+                frame, buffer = buffer[:size], buffer[size:]
+                answer = self._answers.get(frame, b"")
+                if answer is DIE:
+                    linger = struct.pack("ii", 1, 0)
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+                    return
+                connection.sendall(answer)
+
+
+@contextlib.contextmanager
+def closed_port() -> Iterator[str]:
+    """Give host and port of an address where nothing listens."""
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))
+        yield f"127.0.0.1:{reserved.getsockname()[1]}"

@@ -1,0 +1,280 @@
+"""Every way to fail: exit code, one line on stderr, in time."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+from commandline import (
+    BOMB,
+    BUSY,
+    CONNECT,
+    CONNECTED,
+    DIE,
+    SCENARIO,
+    SESSION,
+    TRIGGER,
+    Peer,
+    Process,
+    closed_port,
+    emulators,
+    run,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+COMMANDS = [
+    ("status", []),
+    ("trigger", []),
+    ("watch", []),
+    ("start", []),
+    ("stop", []),
+    ("switch", ["3"]),
+    ("probe", []),
+]
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with emulators(tmp_path_factory.mktemp("errors"), ()) as (one,):
+        yield one
+
+
+# ---------------------------------------------------------------------- no session: 3
+
+
+@pytest.mark.parametrize(("command", "more"), COMMANDS)
+def test_command_nothing_listens_exits_3(command: str, more: list[str]) -> None:
+    with closed_port() as address:
+        outcome = run(command, f"bvs://{address}", *more, "--timeout", "1")
+    outcome.failed(3, address, "handbook over TCP: opening the link: ", within=1)
+    assert command == "probe" or outcome.out == ""
+
+
+def test_status_silent_peer_exits_3() -> None:
+    with Peer() as peer:
+        outcome = run("status", f"bvs://{peer.host_and_port}", "--timeout", "0.4")
+    outcome.failed(3, "waiting for the answer to Connect", "silence", within=0.4)
+
+
+def test_status_silent_udp_peer_exits_3() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        url = f"bvs+udp://127.0.0.1:{silent.getsockname()[1]}"
+        outcome = run("status", url, "--timeout", "0.4")
+    outcome.failed(3, "handbook over UDP", "thesis over UDP", "silence", within=0.4)
+
+
+def test_status_garbage_exits_3() -> None:
+    with Peer(greeting=b"HTTP/1.1 400 Bad Request\r\n\r\n") as peer:
+        outcome = run("status", f"bvs://{peer.host_and_port}", "--timeout", "1")
+    outcome.failed(3, "wrong magic number: 48 54 54 50", within=1)
+
+
+def test_status_length_bomb_at_connect_exits_3() -> None:
+    with Peer(greeting=BOMB) as peer:
+        outcome = run("status", peer.url, "--timeout", "1")
+    outcome.failed(3, "announces 4294967295 bytes", within=1)
+
+
+def test_status_peer_closes_at_once_exits_3() -> None:
+    with Peer({CONNECT: DIE}) as peer:
+        run("status", peer.url, "--timeout", "1").failed(3, "answer to Connect", within=1)
+
+
+def test_status_no_first_status_exits_3() -> None:
+    with Peer({CONNECT: CONNECTED}) as peer:
+        outcome = run("status", peer.url, "--timeout", "0.4")
+    outcome.failed(3, "waiting for the first status", within=0.4)
+
+
+def test_status_no_answer_to_query_exits_3() -> None:
+    with Peer({CONNECT: SESSION[CONNECT]}) as peer:
+        outcome = run("status", peer.url, "--timeout", "0.4")
+    outcome.failed(3, "waiting for the answer to Query", within=0.4)
+
+
+def test_trigger_length_bomb_exits_3() -> None:
+    with Peer({**SESSION, TRIGGER: BOMB}) as peer:
+        outcome = run("trigger", peer.url, "--timeout", "5")
+    outcome.failed(3, "announces 4294967295 bytes", within=0)
+
+
+def test_trigger_garbage_exits_3() -> None:
+    with Peer({**SESSION, TRIGGER: b"garbage"}) as peer:
+        run("trigger", peer.url, "--timeout", "5").failed(3, "wrong magic number", within=0)
+
+
+def test_trigger_connection_reset_exits_3() -> None:
+    with Peer({**SESSION, TRIGGER: DIE}) as peer:
+        run("trigger", peer.url, "--timeout", "5").failed(3, "the link is gone", within=0)
+
+
+def test_trigger_emulator_killed_exits_3(tmp_path: Path) -> None:
+    scenario = tmp_path / "slow.yaml"
+    scenario.write_text(SCENARIO, encoding="utf-8")
+    with Process("smartcam-emulator", str(scenario), "--debug") as emulator:
+        url = emulator.read_until(b"\n").strip()
+        with Process("smartcam", "trigger", url, "--application", "6") as command:
+            emulator.read_until(b"Trigger", stream="stderr")
+            emulator.send_signal(signal.SIGKILL)
+            command.wait().failed(3, "the link is gone")
+
+
+# ---------------------------------------------------------------------- a wait ran out: 4
+
+
+def test_trigger_busy_for_ever_exits_4() -> None:
+    with Peer({**SESSION, CONNECT: CONNECTED + BUSY}) as peer:
+        outcome = run("trigger", peer.url, "--timeout", "0.3")
+    outcome.failed(4, "did not wait for a trigger within 0.3 s", "status: BUSY", within=0.3)
+
+
+def test_trigger_switch_never_answered_exits_4() -> None:
+    with Peer({**SESSION, CONNECT: CONNECTED + BUSY}) as peer:
+        outcome = run("trigger", peer.url, "--application", "5", "--timeout", "0.3")
+    outcome.failed(4, "no answer to SwitchApplication (0x31)", within=0.6)
+
+
+def test_start_never_running_exits_4() -> None:
+    with Peer({**SESSION, CONNECT: CONNECTED + BUSY}) as peer:
+        run("start", peer.url, "--timeout", "0.3").failed(4, "after Start", within=0.6)
+
+
+def test_trigger_no_result_exits_4() -> None:
+    with Peer(SESSION) as peer:
+        outcome = run("trigger", peer.url, "--timeout", "0.3")
+    outcome.failed(4, "no result within 0.3 s", "WAITING_FOR_TRIGGER", within=0.3)
+
+
+def test_trigger_free_running_exits_4_and_says_so(url: str) -> None:
+    outcome = run("trigger", url, "--application", "5", "--timeout", "0.5")
+    outcome.failed(4, "runs free", within=1)
+
+
+def test_watch_count_without_result_exits_4() -> None:
+    with Peer(SESSION) as peer:
+        outcome = run("watch", peer.url, "--count", "1", "--timeout", "0.3")
+    outcome.failed(4, "no result within 0.3 s", "WAITING_FOR_TRIGGER", within=0.6)
+
+
+# ---------------------------------------------------------------------- refused, not running: 5
+
+
+@pytest.mark.parametrize("application", ["0", "99"])
+@pytest.mark.parametrize("command", ["switch", "trigger", "watch"])
+def test_command_unknown_application_exits_5(url: str, command: str, application: str) -> None:
+    name = [application] if command == "switch" else ["--application", application]
+    text = "id 0" if application == "0" else f"refused to switch to application {application}"
+    run(command, url, *name).failed(5, text)
+
+
+def test_trigger_stopped_exits_5_and_tells_how_to_start(url: str) -> None:
+    run("switch", url, "2").done()
+    run("stop", url).done()
+    outcome = run("trigger", url)
+    outcome.failed(5, "application 2 is stopped", f"smartcam start {url}", "--application 2")
+
+
+# ---------------------------------------------------------------------- not interpretable: 6
+
+
+@pytest.mark.parametrize("command", ["trigger", "watch"])
+def test_command_layout_too_long_exits_6(url: str, command: str) -> None:
+    application = "2" if command == "trigger" else "5"
+    layout = "n: int32, more: real32"
+    outcome = run(command, url, "--application", application, "--interpret-as", layout)
+    outcome.failed(6, "'more' (real32) at offset 4", "expected 4 bytes, got 0")
+
+
+def test_trigger_layout_too_short_exits_6(url: str) -> None:
+    run("trigger", url, "--application", "2", "--interpret-as", "n: int16").failed(6, "got 4")
+
+
+# ---------------------------------------------------------------------- wrong usage: 2
+
+
+def test_trigger_wrong_layout_text_exits_2_with_the_position() -> None:
+    # nothing listens on port 1: what is wrong is seen before anything is tried
+    outcome = run("trigger", "bvs://127.0.0.1:1", "--interpret-as", "n: int33")
+    outcome.failed(2, "'int33'", "did you mean int32?", "at character 3")
+
+
+@pytest.mark.parametrize("spec", ["nonsense", ""])
+def test_watch_unknown_interpreter_exits_2_and_lists_known_ones(spec: str) -> None:
+    outcome = run("watch", "bvs://127.0.0.1:1", "--interpret-as", spec)
+    outcome.failed(2, f"{spec!r} is unknown", "localizations, raw, record, strings50, table")
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("", "no host"),
+        ("ftp://127.0.0.1", "known are bvs://, bvs+udp://"),
+        ("bvs://", "no host"),
+        ("bvs://127.0.0.1:99999", "ort"),
+        ("bvs://127.0.0.1/path", "a path"),
+        ("bvs://127.0.0.1?dialect=latin", "handbook, thesis"),
+        ("bvs://127.0.0.1?colour=red", "known is 'dialect'"),
+    ],
+)
+@pytest.mark.parametrize(("command", "more"), [c for c in COMMANDS if c[0] != "probe"])
+def test_command_bad_url_exits_2(command: str, more: list[str], url: str, text: str) -> None:
+    run(command, url, *more).failed(2, text)
+
+
+@pytest.mark.parametrize("url", ["ftp://127.0.0.1", "", "127.0.0.1:port", "bvs://h?dialect=latin"])
+def test_probe_bad_url_exits_2(url: str) -> None:
+    run("probe", url).failed(2, "camera address")
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--count", "0"),
+        ("--count", "many"),
+        ("--seconds", "0"),
+        ("--seconds", "-1"),
+        ("--seconds", "nan"),
+        ("--timeout", "0"),
+        ("--timeout", "inf"),
+        ("--timeout", "nan"),
+        ("--application", "-1"),
+        ("--application", "4294967296"),
+        ("--trace", "/"),
+    ],
+)
+@pytest.mark.parametrize("command", ["trigger", "watch"])
+def test_command_bad_option_exits_2(command: str, option: str, value: str) -> None:
+    outcome = run(command, "bvs://127.0.0.1:1", option, value)
+    assert (outcome.code, outcome.out) == (2, "")
+    last = outcome.err.splitlines()[-1]
+    assert last.startswith("Error: ")
+    assert option in last
+
+
+def test_trigger_bad_input_exits_2() -> None:
+    run("trigger", "bvs://127.0.0.1:1", "--input", "4g").failed(2, "--input", "'4g' is no hex")
+
+
+def test_trigger_trace_unwritable_exits_2(tmp_path: Path) -> None:
+    path = tmp_path / "missing" / "trace.jsonl"
+    outcome = run("trigger", "bvs://127.0.0.1:1", "--trace", str(path))
+    outcome.failed(2, f"--trace {path}: No such file or directory")
+
+
+def test_unexpected_error_exits_1_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("smartcam.cli.demo.EmulatedCamera", None)
+    run("demo").failed(1, "unexpected TypeError", "--debug shows where")
+
+
+def test_status_debug_shows_the_traceback() -> None:
+    with Process("smartcam", "status", "bvs://127.0.0.1:1", "--debug") as command:
+        outcome = command.wait()
+    assert outcome.code == 3
+    assert "Traceback" in outcome.err
+    assert outcome.err.splitlines()[-1].startswith("smartcam: error: ")

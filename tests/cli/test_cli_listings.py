@@ -1,0 +1,101 @@
+"""Commands that need no camera: lists, help, the demo, and what is said without the extra."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from commandline import Process, run, run_emulator
+
+import smartcam
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CONNECTING = ("probe", "status", "trigger", "watch", "switch", "start", "stop")
+OTHERS = ("decode", "protocols", "interpreters", "demo")
+
+
+def test_protocols_lists_dialects_and_transports() -> None:
+    out = run("protocols").done().out
+    for text in ("bvs (built-in)", "bvs://", "bvs+udp://", "36701", "BVS002C", "thesis"):
+        assert text in out
+
+
+def test_protocols_json_has_one_object_for_each() -> None:
+    (bvs,) = [one for one in run("protocols", "--json").done().lines if one["name"] == "bvs"]
+    assert (bvs["default_port"], bvs["schemes"]) == (36701, ["bvs", "bvs+udp"])
+    assert [one["name"] for one in bvs["dialects"]][:2] == ["handbook", "thesis"]
+    assert all(one["about"] and one["source"] for one in bvs["dialects"])
+
+
+def test_interpreters_lists_the_built_in_ones() -> None:
+    names = {"localizations", "raw", "record", "strings50", "table"}
+    lines = run("interpreters", "--json").done().lines
+    assert {line["name"] for line in lines if line["origin"] == "built-in"} == names
+    out = run("interpreters").done().out
+    assert {line.split()[0] for line in out.splitlines()} >= names
+
+
+def test_demo_tells_its_story() -> None:
+    out = run("demo").done().out
+    for text in ("BUSY", "7 parts", "parallelogram", "1. ", "6. Disconnected", "received 12 = "):
+        assert text in out
+
+
+def test_demo_json_is_json_with_a_balanced_account() -> None:
+    lines = run("demo", "--json").done().lines
+    assert [line["step"] for line in lines if "step" in line] == [1, 2, 3, 4, 5, 6]
+    (result,) = [line["result"] for line in lines if "result" in line]
+    assert len(result["value"]) == 7
+    account = lines[-1]["statistics"]
+    fates = (
+        "triggered",
+        "streamed",
+        "unclaimed",
+        "late",
+        "wrong_application",
+        "uninterpretable",
+    )
+    assert account["received"] == sum(account[fate] for fate in fates) == 12
+
+
+@pytest.mark.parametrize("option", ["--help", "-h"])
+@pytest.mark.parametrize("command", [*CONNECTING, *OTHERS])
+def test_help_of_every_command_warns_where_it_connects(command: str, option: str) -> None:
+    text = " ".join(run(command, option).done().out.split())
+    assert f"Usage: smartcam {command} " in text
+    assert ("Connecting takes the camera from another client" in text) is (command in CONNECTING)
+
+
+def test_help_names_every_command_and_exit_code() -> None:
+    text = " ".join(run("--help").done().out.split())
+    for word in (*CONNECTING, *OTHERS):
+        assert f" {word} " in text
+    for code in range(7):
+        assert f"{code} " in text.partition("Exit codes:")[2]
+    assert "Usage: smartcam-emulator " in run_emulator("--help").done().out
+
+
+def test_version_is_told() -> None:
+    assert run("--version").done().out == f"smartcam, version {smartcam.__version__}\n"
+    assert smartcam.__version__ in run_emulator("--version").done().out
+
+
+def test_unknown_command_exits_2() -> None:
+    outcome = run("dance")
+    assert outcome.code == 2
+    assert "No such command 'dance'" in outcome.err
+
+
+@pytest.mark.parametrize("missing", ["click", "yaml"])
+@pytest.mark.parametrize("program", ["smartcam", "smartcam-emulator"])
+def test_command_without_the_extra_exits_2_and_names_it(
+    tmp_path: Path, program: str, missing: str
+) -> None:
+    shim = f'raise ModuleNotFoundError("{missing}")\n'
+    (tmp_path / f"{missing}.py").write_text(shim, encoding="utf-8")
+    with Process(program, "--version", env={"PYTHONPATH": str(tmp_path)}) as process:
+        outcome = process.wait()
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err == f'{program}: needs the extra "cli": pip install "smartcam[cli]"\n'

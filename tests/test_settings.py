@@ -1,0 +1,274 @@
+"""Camera addresses and the options of a connection."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from smartcam.exceptions import ConfigurationError, PluginError
+from smartcam.registry import PROTOCOLS
+from smartcam.settings import Address, CameraSettings, parse_address, validation_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+ACME = """
+from smartcam.protocols.base import Protocol, Transport
+from smartcam.protocols.bvs import HANDBOOK
+
+PROTOCOL = Protocol(
+    name="acme",
+    schemes={"acme": Transport.TCP},
+    default_port=4242,
+    models=("ACME1",),
+    dialects={"handbook": HANDBOOK},
+)
+SOMETHING = object()
+"""
+
+
+@pytest.fixture
+def provide(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[str, str], None]]:
+    """Return a function that puts a distribution with one protocol on the path."""
+
+    def add(name: str, target: str) -> None:
+        info = tmp_path / f"{name}_{target.partition(':')[0]}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: maker-of-{name}\nVersion: 1.0\n", encoding="utf-8"
+        )
+        (info / "entry_points.txt").write_text(
+            f"[smartcam.protocols]\n{name} = {target}\n", encoding="utf-8"
+        )
+        (tmp_path / "acme_camera.py").write_text(ACME, encoding="utf-8")
+        PROTOCOLS.refresh()
+
+    monkeypatch.syspath_prepend(tmp_path)
+    yield add
+    monkeypatch.undo()
+    PROTOCOLS.refresh()
+
+
+# ---------------------------------------------------------------------- addresses
+
+
+@pytest.mark.parametrize(
+    ("url", "address"),
+    [
+        ("bvs://192.168.0.10", Address("bvs", "bvs", "192.168.0.10", 36701)),
+        ("bvs://192.168.0.10:4000", Address("bvs", "bvs", "192.168.0.10", 4000)),
+        ("bvs+udp://camera", Address("bvs", "bvs+udp", "camera", 36701)),
+        ("  BVS://Camera.local/ ", Address("bvs", "bvs", "camera.local", 36701)),
+        ("bvs://h:?dialect=thesis", Address("bvs", "bvs", "h", 36701, "thesis")),
+        ("bvs://h:65535/?dialect=handbook", Address("bvs", "bvs", "h", 65535, "handbook")),
+        ("bvs://[::1]", Address("bvs", "bvs", "::1", 36701)),
+        ("bvs://[fe80::1]:7?dialect=thesis", Address("bvs", "bvs", "fe80::1", 7, "thesis")),
+    ],
+)
+def test_parse_address_good_url_is_read_and_written_back(url: str, address: Address) -> None:
+    assert parse_address(url) == address
+    assert parse_address(address.url) == address
+
+
+@pytest.mark.parametrize(
+    ("address", "url"),
+    [
+        (Address("bvs", "bvs", "h", 36701), "bvs://h:36701"),
+        (Address("bvs", "bvs+udp", "::1", 7, "thesis"), "bvs+udp://[::1]:7?dialect=thesis"),
+    ],
+)
+def test_address_url_has_everything_that_is_known(address: Address, url: str) -> None:
+    assert address.url == url
+
+
+@pytest.mark.parametrize("model", ["BVS002C", "bvs002c"])
+@pytest.mark.parametrize(
+    ("host", "address"),
+    [
+        ("camera", Address("bvs", "bvs", "camera", 36701)),
+        ("camera:7", Address("bvs", "bvs", "camera", 7)),
+        ("[::1]:7", Address("bvs", "bvs", "::1", 7)),
+        ("bvs+udp://camera", Address("bvs", "bvs+udp", "camera", 36701)),
+    ],
+)
+def test_parse_address_bare_host_with_model_is_its_protocols(
+    host: str, address: Address, model: str
+) -> None:
+    assert parse_address(host, model=model) == address
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("", "'' is a bare host: give a URL such as bvs://HOST, or a model"),
+        ("camera", "is a bare host: give a URL such as bvs://camera, or a model"),
+        ("http://h", "unknown scheme 'http'; known are bvs://, bvs+udp://"),
+        ("://h", "unknown scheme ''; known are"),
+        ("bvs://", "has no host"),
+        ("bvs://:36701", "has no host"),
+        ("bvs://?dialect=thesis", "has no host"),
+        ("bvs://h:0", "port 0 is no camera's port"),
+        ("bvs://h:65536", "Port out of range 0-65535"),
+        ("bvs://h:-1", "Port could not be cast to integer value"),
+        ("bvs://h:port", "Port could not be cast to integer value as 'port'"),
+        ("bvs://[::1", "Invalid IPv6 URL"),
+        ("bvs://::1", "Port could not be cast"),
+        ("bvs://me@h", "has a user, which means nothing"),
+        ("bvs://:secret@h", "has a user, which means nothing"),
+        ("bvs://h/path", "has a path, which means nothing"),
+        ("bvs://h#part", "has a fragment, which means nothing"),
+        ("bvs://h?colour=red", "unknown 'colour'; known is 'dialect'"),
+        ("bvs://h?dialect=latin", "bvs has no dialect 'latin'; it has handbook, thesis"),
+        ("bvs://h?dialect", "bvs has no dialect ''"),
+    ],
+)
+def test_parse_address_bad_url_says_what_is_wrong(url: str, text: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_address(url)
+    assert str(caught.value).startswith(f"camera address {url!r}")
+    assert text in str(caught.value)
+
+
+def test_parse_address_unknown_model_names_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_address("camera", model="BVS1")
+    assert str(caught.value) == "unknown camera model 'BVS1'; known are BVS002C"
+
+
+# ---------------------------------------------------------------------- plug-ins
+
+
+def test_parse_address_scheme_of_a_plugin_is_known(provide: Callable[[str, str], None]) -> None:
+    provide("acme", "acme_camera:PROTOCOL")
+    assert parse_address("acme://h") == Address("acme", "acme", "h", 4242)
+    assert parse_address("h:5", model="acme1") == Address("acme", "acme", "h", 5)
+    with pytest.raises(ConfigurationError, match="known are acme://, bvs://"):
+        parse_address("http://h")
+
+
+@pytest.mark.parametrize(
+    "target", ["acme_nowhere:PROTOCOL", "acme_camera:MISSING", "acme_camera:SOMETHING"]
+)
+def test_parse_address_broken_plugin_costs_only_its_own_name(
+    provide: Callable[[str, str], None], target: str
+) -> None:
+    provide("acme", target)
+    assert parse_address("bvs://h").protocol == "bvs"
+    assert parse_address("h", model="BVS002C").protocol == "bvs"
+    with pytest.raises(ConfigurationError, match=r"unknown scheme 'acme'; known are bvs://"):
+        parse_address("acme://h")
+
+
+def test_parse_address_plugin_with_our_own_name_is_told(
+    provide: Callable[[str, str], None],
+) -> None:
+    provide("bvs", "acme_camera:PROTOCOL")
+    with pytest.raises(PluginError, match="'bvs' is smartcam's own, but maker-of-bvs also"):
+        parse_address("bvs://h")
+
+
+# ---------------------------------------------------------------------- options
+
+
+def make(**options: Any) -> CameraSettings:
+    return CameraSettings.make("bvs://h", None, options)
+
+
+def test_settings_defaults_are_the_documented_ones() -> None:
+    settings = make()
+    assert settings.address == Address("bvs", "bvs", "h", 36701)
+    assert settings.name == "h:36701"
+    assert (settings.application, settings.interpret_as) == (None, None)
+    assert (settings.y_down, settings.lenient) == (False, False)
+    assert (settings.connect_timeout, settings.switch_timeout) == (10.0, 10.0)
+    assert (settings.request_timeout, settings.close_timeout) == (5.0, 1.0)
+    assert (settings.connect_attempts, settings.max_length) == (3, 1 << 20)
+
+
+def test_settings_options_are_taken_as_given() -> None:
+    spec = {7: "localizations"}
+    settings = make(
+        name="cell 1", application=0, interpret_as=spec, y_down=True, connect_timeout=0.5
+    )
+    assert (settings.name, settings.application) == ("cell 1", 0)
+    assert settings.interpret_as is spec
+    assert (settings.y_down, settings.connect_timeout) == (True, 0.5)
+
+
+def test_settings_are_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        make().name = "other"
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "text"),
+    [
+        ("application", -1, "greater than or equal to 0 (got -1)"),
+        ("application", 1 << 32, "less than or equal to 4294967295"),
+        ("application", "seven", "valid integer"),
+        ("connect_timeout", 0, "greater than 0 (got 0)"),
+        ("connect_timeout", float("nan"), "(got nan)"),
+        ("switch_timeout", float("inf"), "(got inf)"),
+        ("request_timeout", -1.0, "greater than 0"),
+        ("close_timeout", 86_401, "less than or equal to 86400"),
+        ("connect_attempts", 0, "greater than or equal to 1"),
+        ("connect_attempts", 101, "less than or equal to 100"),
+        ("max_length", 15, "greater than or equal to 16"),
+        ("max_length", (1 << 30) + 1, "less than or equal to 1073741824"),
+        ("name", "n" * 201, "at most 200 characters"),
+        ("y_down", "down", "valid boolean"),
+        ("colour", "red", "Extra inputs are not permitted (got 'red')"),
+    ],
+)
+def test_settings_wrong_option_is_named_with_what_came(
+    option: str, value: object, text: str
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        make(**{option: value})
+    assert str(caught.value).startswith(f"connect: {option}: ")
+    assert text in str(caught.value)
+    assert isinstance(caught.value.__cause__, ValidationError)
+
+
+def test_settings_several_wrong_options_are_all_named() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        make(application=-1, connect_attempts=0)
+    assert str(caught.value).count("; ") == 1
+    assert "application: " in str(caught.value)
+    assert "connect_attempts: " in str(caught.value)
+
+
+def test_settings_address_is_no_option() -> None:
+    with pytest.raises(ConfigurationError, match=r"^connect: .*'address'"):
+        make(address="bvs://other")
+
+
+def test_settings_bad_address_comes_first() -> None:
+    with pytest.raises(ConfigurationError, match="unknown scheme"):
+        CameraSettings.make("http://h", None, {"application": -1})
+
+
+def test_settings_model_picks_the_protocol_of_a_bare_host() -> None:
+    assert CameraSettings.make("h", "BVS002C", {}).address.url == "bvs://h:36701"
+
+
+def test_validation_text_cuts_long_input_and_names_the_whole_value() -> None:
+    class Inner(BaseModel):
+        number: int
+
+    class Outer(BaseModel):
+        inner: list[Inner]
+
+    with pytest.raises(ValidationError) as caught:
+        Outer.model_validate({"inner": [{"number": "x" * 500}]})
+    text = validation_text(caught.value)
+    assert text.startswith("inner.0.number: ")
+    assert text.endswith(f"(got '{'x' * 79})")
+    with pytest.raises(ValidationError) as caught:
+        Outer.model_validate(3)
+    assert validation_text(caught.value).startswith("value: ")

@@ -1,0 +1,338 @@
+"""Bounded streams and their account."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import gc
+import weakref
+from typing import Any
+
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectionLostError,
+    InterpretationError,
+    SmartCamError,
+    SubscriberOverflowError,
+)
+from smartcam.models import SubscriberStatistics
+from smartcam.streams import Overflow, Subscription
+
+
+def subscription(
+    max_queue: int = 3, overflow: str = "drop_oldest", min_interval: float = 0.0
+) -> Subscription[int]:
+    return Subscription(
+        "results", max_queue=max_queue, overflow=overflow, min_interval=min_interval
+    )
+
+
+def account(stream: Subscription[int]) -> tuple[int, int, int, int]:
+    """Return offered, taken, dropped, queued."""
+    seen = stream.statistics()
+    assert seen.offered == seen.taken + seen.dropped + seen.queued
+    return seen.offered, seen.taken, seen.dropped, seen.queued
+
+
+async def take(stream: Subscription[int], count: int) -> list[int]:
+    return [await anext(stream) for _ in range(count)]
+
+
+async def waiting(stream: Subscription[int]) -> asyncio.Task[int]:
+    """Return a task that waits for the next item."""
+    task = asyncio.create_task(anext(stream))
+    await asyncio.sleep(0)
+    assert not task.done()
+    return task
+
+
+# ---------------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"max_queue": 0}, "max_queue must be 1 or more (got 0)"),
+        ({"min_interval": -0.1}, "min_interval 0 or more seconds (got -0.1)"),
+        ({"min_interval": float("inf")}, "(got inf)"),
+        ({"min_interval": float("nan")}, "(got nan)"),
+        ({"overflow": "wait"}, "overflow is 'drop_oldest' or 'error', not 'wait'"),
+    ],
+)
+def test_subscription_wrong_argument_is_named(options: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        subscription(**options)
+    assert str(caught.value).startswith("results(): ")
+    assert text in str(caught.value)
+
+
+def test_subscription_statistics_name_what_it_is() -> None:
+    assert subscription(overflow="error").statistics() == SubscriberStatistics(
+        name="results", policy="error", offered=0, taken=0, dropped=0, queued=0
+    )
+    assert [one.value for one in Overflow] == ["drop_oldest", "error"]
+
+
+# ---------------------------------------------------------------------- overflow
+
+
+async def test_drop_oldest_full_queue_keeps_the_newest() -> None:
+    stream = subscription(max_queue=3)
+    for number in range(5):
+        stream.offer(number, 0.0)
+    assert account(stream) == (5, 0, 2, 3)
+    assert await take(stream, 3) == [2, 3, 4]
+    assert account(stream) == (5, 3, 2, 0)
+
+
+async def test_error_full_queue_ends_after_what_is_queued() -> None:
+    stream = subscription(max_queue=2, overflow="error")
+    for number in range(5):
+        stream.offer(number, 0.0)
+    assert stream.ended
+    assert account(stream) == (3, 0, 1, 2)
+    assert await take(stream, 2) == [0, 1]
+    for _ in range(2):
+        with pytest.raises(SubscriberOverflowError) as caught:
+            await anext(stream)
+        assert str(caught.value) == "results(): more than 2 items were waiting"
+    assert account(stream) == (3, 2, 1, 0)
+
+
+async def test_error_queue_that_is_read_in_time_never_ends() -> None:
+    stream = subscription(max_queue=1, overflow="error")
+    for number in range(5):
+        stream.offer(number, 0.0)
+        assert await anext(stream) == number
+    assert not stream.ended
+
+
+async def test_min_interval_drops_what_comes_too_soon_after_the_last_kept() -> None:
+    stream = subscription(max_queue=9, min_interval=1.0)
+    for number, now in enumerate([10.0, 10.5, 10.99, 11.0, 11.9, 12.5]):
+        stream.offer(number, now)
+    assert account(stream) == (6, 0, 3, 3)
+    assert await take(stream, 3) == [0, 3, 5]
+
+
+async def test_min_interval_too_soon_never_overflows() -> None:
+    stream = subscription(max_queue=1, overflow="error", min_interval=1.0)
+    stream.offer(1, 0.0)
+    stream.offer(2, 0.5)
+    assert not stream.ended
+    stream.offer(3, 1.0)
+    assert stream.ended
+
+
+async def test_min_interval_zero_keeps_items_of_the_same_moment() -> None:
+    stream = subscription()
+    stream.offer(1, 5.0)
+    stream.offer(2, 5.0)
+    assert await take(stream, 2) == [1, 2]
+
+
+# ---------------------------------------------------------------------- reading
+
+
+async def test_anext_waits_for_an_item() -> None:
+    stream = subscription()
+    task = await waiting(stream)
+    stream.offer(7, 0.0)
+    assert await task == 7
+
+
+async def test_anext_several_subscribers_have_each_their_own_items() -> None:
+    fast, slow = subscription(), subscription(max_queue=1)
+    for number in range(3):
+        fast.offer(number, 0.0)
+        slow.offer(number, 0.0)
+    assert await take(fast, 3) == [0, 1, 2]
+    assert await take(slow, 1) == [2]
+    assert (account(fast), account(slow)) == ((3, 3, 0, 0), (3, 1, 2, 0))
+
+
+async def test_anext_two_readers_of_one_subscription_share_its_items() -> None:
+    stream = subscription()
+    tasks = [await waiting(stream), await waiting(stream)]
+    stream.offer(1, 0.0)
+    done, pending = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    assert (len(done), len(pending)) == (1, 1)
+    stream.offer(2, 0.0)
+    assert sorted(await asyncio.gather(*tasks)) == [1, 2]
+
+
+async def test_anext_cancelled_loses_nothing() -> None:
+    stream = subscription()
+    for item_came in (False, True):
+        task = await waiting(stream)
+        if item_came:
+            stream.offer(1, 0.0)
+        task.cancel()
+        await asyncio.wait({task})
+        assert task.cancelled()
+    assert account(stream) == (1, 0, 0, 1)
+    assert await anext(stream) == 1
+
+
+async def test_anext_item_that_is_an_error_is_raised_and_the_stream_goes_on() -> None:
+    stream = subscription()
+    stream.offer(InterpretationError("does not fit"), 0.0)
+    stream.offer(2, 0.0)
+    with pytest.raises(InterpretationError, match="does not fit"):
+        await anext(stream)
+    assert await anext(stream) == 2
+    assert account(stream) == (2, 2, 0, 0)
+
+
+# ---------------------------------------------------------------------- ends
+
+
+async def test_end_with_an_error_comes_after_queued_items_and_stays() -> None:
+    stream = subscription()
+    stream.offer(1, 0.0)
+    lost = ConnectionLostError("gone")
+    stream.end(lost)
+    stream.end(None)
+    stream.offer(2, 0.0)
+    assert account(stream) == (1, 0, 0, 1)
+    assert await anext(stream) == 1
+    for _ in range(2):
+        with pytest.raises(ConnectionLostError) as caught:
+            await anext(stream)
+        assert caught.value is lost
+
+
+async def test_end_without_an_error_ends_the_loop() -> None:
+    stream = subscription()
+    stream.offer(1, 0.0)
+    stream.end(None)
+    assert [item async for item in stream] == [1]
+
+
+@pytest.mark.parametrize("error", [None, ConnectionLostError("gone")])
+async def test_end_wakes_a_waiting_reader(error: SmartCamError | None) -> None:
+    stream = subscription()
+    task = await waiting(stream)
+    stream.end(error)
+    with pytest.raises(type(error) if error else StopAsyncIteration):
+        await task
+
+
+async def test_close_drops_what_is_queued_and_counts_it() -> None:
+    stream = subscription()
+    stream.offer(1, 0.0)
+    stream.offer(2, 0.0)
+    stream.close()
+    stream.close()
+    stream.offer(3, 0.0)
+    assert stream.ended
+    assert account(stream) == (2, 0, 2, 0)
+    assert [item async for item in stream] == []
+
+
+async def test_context_closes_at_its_end() -> None:
+    stream = subscription()
+    async with stream as entered:
+        assert entered is stream
+        stream.offer(1, 0.0)
+    assert account(stream) == (1, 0, 1, 0)
+
+
+async def test_context_left_by_an_error_closes_and_passes_it_on() -> None:
+    stream = subscription()
+    with pytest.raises(ZeroDivisionError):
+        async with stream:
+            stream.offer(1 // 0, 0.0)
+    assert stream.ended
+
+
+async def test_subscription_nobody_refers_to_is_collected() -> None:
+    stream = subscription()
+    known = weakref.WeakSet([stream])
+    stream.offer(1, 0.0)
+    async for _ in stream:
+        break
+    del stream
+    gc.collect()
+    assert not known
+
+
+# ---------------------------------------------------------------------- the account, by a model
+
+
+class AccountMachine(RuleBasedStateMachine):
+    """Any order of offers, reads and ends against a plain model."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+        self.last = float("-inf")
+        self.model: collections.deque[int] = collections.deque()
+        self.offered = self.taken = self.dropped = 0
+        self.ended = False
+        self.overflow = "drop_oldest"
+        self.interval = 0.0
+        self.stream = subscription()
+
+    @precondition(lambda self: self.offered == 0 and not self.ended)
+    @rule(overflow=st.sampled_from(["drop_oldest", "error"]), interval=st.sampled_from([0.0, 1.0]))
+    def choose(self, overflow: str, interval: float) -> None:
+        self.overflow, self.interval = overflow, interval
+        self.stream = subscription(overflow=overflow, min_interval=interval)
+
+    @rule(step=st.sampled_from([0.0, 0.5, 1.0]))
+    def offer(self, step: float) -> None:
+        self.now += step
+        self.stream.offer(self.offered, self.now)
+        if self.ended:
+            return
+        number, self.offered = self.offered, self.offered + 1
+        if self.now - self.last < self.interval:
+            self.dropped += 1
+        elif len(self.model) < 3 or self.overflow == "drop_oldest":
+            self.last = self.now
+            self.model.append(number)
+            if len(self.model) > 3:
+                self.model.popleft()
+                self.dropped += 1
+        else:
+            self.dropped += 1
+            self.ended = True
+
+    @precondition(lambda self: self.model or self.ended)
+    @rule()
+    def take(self) -> None:
+        step = self.stream.__anext__()
+        with pytest.raises((StopIteration, StopAsyncIteration, SubscriberOverflowError)) as caught:
+            step.send(None)
+        if self.model:
+            assert isinstance(caught.value, StopIteration)
+            assert caught.value.value == self.model.popleft()
+            self.taken += 1
+        else:
+            assert not isinstance(caught.value, StopIteration)
+
+    @rule()
+    def end(self) -> None:
+        self.stream.end(None)
+        self.ended = True
+
+    @rule()
+    def close(self) -> None:
+        self.stream.close()
+        self.dropped += len(self.model)
+        self.model.clear()
+        self.ended = True
+
+    @invariant()
+    def account_is_the_models(self) -> None:
+        expected = (self.offered, self.taken, self.dropped, len(self.model))
+        assert account(self.stream) == expected
+        assert self.stream.ended == self.ended
+
+
+TestAccount = AccountMachine.TestCase
