@@ -364,10 +364,11 @@ async def test_close_with_reading_paused_still_ends_in_order(
         await deliver(link, peer, STATUS)
     assert not link._transport.is_reading()
     peer.write(BUSY * 10)
-    closing = asyncio.create_task(link.close(LIMIT))
+    closing = asyncio.create_task(link.close(60))
     assert await peer.rest() == DISCONNECT
     peer.close()
-    await closing
+    async with asyncio.timeout(LIMIT):
+        await closing
     assert await take(link, 2) == [RUNNING, RUNNING]
 
 
