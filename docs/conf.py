@@ -189,7 +189,7 @@ def policies() -> str:
         (
             role.value,
             transport.value.upper(),
-            "ends the link" if policy.fail else "is dropped and counted",
+            "ends the link" if policy.fatal else "is dropped and counted",
             "is broken" if policy.exact_length else "is accepted and counted",
         )
         for (role, transport), policy in POLICIES.items()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.conversation import Conversation, is_ready
 from smartcam.exceptions import (
+    ConfigurationError,
     ConnectionClosedError,
     ConnectionLostError,
     InterpretationError,
@@ -98,7 +99,7 @@ class SmartCamera:
         self._trace = trace
         self._inbox = Inbox(settings.name, self._interpretation(settings.interpret_as))
         self._inbox.expected = settings.application
-        self._talk = Conversation(self._inbox)
+        self._talk = Conversation(self._inbox, settings.request_timeout)
         self._supervisor: asyncio.Task[None] | None = None
         self._opened: asyncio.Future[SmartCamError | None] | None = None
         self._session: Session | None = None
@@ -356,7 +357,9 @@ class SmartCamera:
             OvertriggeredError: the camera dropped a trigger meanwhile.
             CameraBusyError: with ``when_busy="refuse"``.
             CameraFaultError: the camera reports System Error.
-            InputContainerError: with ``input``: it did not belong to this inspection.
+            InputContainerError: with ``input``: it did not belong to this inspection, or the input
+                of an earlier trigger without a result may still be queued in the camera; loading
+                an application (:meth:`switch_application`) empties its queue (inferred).
             InterpretationError: the result does not fit its layout.
             WrongApplicationError: the result is another application's.
             CommandRejectedError: with ``application``: the camera does not have it.
@@ -369,6 +372,8 @@ class SmartCamera:
             if interpret_as is None
             else self._interpretation(interpret_as)
         )
+        if when_busy not in {"wait", "refuse"}:
+            raise ConfigurationError(f"trigger: when_busy is 'wait' or 'refuse', not {when_busy!r}")
         wait = when_busy == "wait"
         data = None if input is None else bytes(input)
         try:

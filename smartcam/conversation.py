@@ -20,6 +20,7 @@ from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
     ConnectionClosedError,
+    InputContainerError,
     NotRunningError,
     RemoteProtocolError,
     ResponseTimeoutError,
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
 __all__ = ["Conversation"]
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
+
+TIMER_RESOLUTION = 0.02
+"""Seconds that a timer may be early: Windows' clock ticks every 16 ms."""
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
 """The id is a UINT32 on the wire (SC manual p. 34, published)."""
@@ -65,10 +69,12 @@ class Conversation:
 
     Args:
         inbox: the receiving half.
+        patience: seconds that an answer may take, however short the deadline of who asks.
     """
 
-    def __init__(self, inbox: Inbox) -> None:
+    def __init__(self, inbox: Inbox, patience: float) -> None:
         self.inbox = inbox
+        self._patience = patience
         self.name: str = inbox.name
         self.link: Link | None = None
         self.wants_running: bool = False
@@ -148,15 +154,40 @@ class Conversation:
         return got
 
     async def exchange(
-        self, message: m.Message, key: type[m.Message] | int, deadline: float
+        self,
+        message: m.Message,
+        key: type[m.Message] | int,
+        deadline: float,
+        *,
+        due: float | None = None,
     ) -> m.Message:
-        """Send a request and return the answer registered under ``key``; as :meth:`ask`."""
-        return await self._await_answer(await self.post(message, key, deadline), message, deadline)
+        """Send a request and return the answer registered under ``key``; as :meth:`ask`.
+
+        With ``due`` behind the deadline, an answer that has not come at the deadline stays owed.
+        """
+        answer = await self.post(message, key, deadline, due=due)
+        try:
+            return await self._take_answer(answer, deadline)
+        except TimeoutError as exc:
+            error = self._timeout(message, "no answer to", "in time")
+            self._give_up_overdue(key, error)
+            raise error from exc
 
     async def post(
-        self, message: m.Message, key: type[m.Message] | int, deadline: float
+        self,
+        message: m.Message,
+        key: type[m.Message] | int,
+        deadline: float,
+        *,
+        due: float | None = None,
     ) -> asyncio.Future[m.Message | SmartCamError]:
         """Send a request as soon as none of its kind is open; its answer is owed from then on.
+
+        Args:
+            message: the request.
+            key: what its answer is registered under.
+            deadline: loop time until when to wait for earlier ones.
+            due: until when the answer may come before the link is given up; default ``deadline``.
 
         Raises:
             ResponseTimeoutError: an earlier one was open until ``deadline``.
@@ -170,7 +201,7 @@ class Conversation:
         try:
             await self._await_owed(key, message, deadline)
             self.require_link().send(message)
-            self._due[key] = deadline
+            self._due[key] = deadline if due is None else due
             return self.inbox.next_answer(key)
         finally:
             lock.release()
@@ -223,8 +254,17 @@ class Conversation:
         What these two have caused comes before the answer to a Query that was sent after them.
         """
         if self._unconfirmed:
-            await self.query(deadline)
+            await self._fence(deadline)
             self._unconfirmed = False
+
+    async def _fence(self, deadline: float) -> None:
+        """Have heard everything that the camera said before now.
+
+        The deadline may be a trigger's and as short as it likes: it does not cost the link.
+        """
+        due = max(deadline, asyncio.get_running_loop().time() + self._patience)
+        await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
+        await self.exchange(m.Query(), m.QueryAnswer, deadline, due=due)
 
     async def query(self, deadline: float) -> int:
         """Return the active application.
@@ -255,7 +295,7 @@ class Conversation:
             raise ConfigurationError(
                 f"{self.name}: application id {application} is not 0 to {MAX_APPLICATION_ID}"
             )
-        was_running = Status.RUNNING in self.status
+        was_running = self.runs
         if application == 0:
             # Never allowed, several applications may carry it (SC manual p. 34, published): so
             # nothing is stopped for it.
@@ -302,6 +342,12 @@ class Conversation:
         """
         inbox, loop = self.inbox, asyncio.get_running_loop()
         self._raise_fault()
+        if input_data is not None and inbox.input_in_doubt:
+            raise InputContainerError(
+                f"{self.name}: input data of an earlier trigger, which had no result, may still be "
+                "queued in the camera and would be taken for this one's; switch_application() "
+                "empties the queue"
+            )
         if inbox.debt is not None:
             await self._settle_debt(deadline)
         await self._wait_for_trigger(deadline, wait=wait)
@@ -313,6 +359,7 @@ class Conversation:
         )
         try:
             if input_data is not None:
+                inbox.input_in_doubt = True  # until its result is there
                 link.send(m.SetInput(data=input_data), m.Trigger())
             else:
                 link.send(m.Trigger())
@@ -377,7 +424,7 @@ class Conversation:
         if self.runs:
             self._halted = True  # interrupted here, the next trigger does all of it again
             await self._halt(deadline)
-            await self.query(deadline)
+            await self._fence(deadline)
             await self.start(deadline)
         self.inbox.debt = None
 
@@ -398,19 +445,14 @@ class Conversation:
             await self._take_answer(owed, deadline)
         except TimeoutError as exc:
             error = self._unsent(message)
-            if asyncio.get_running_loop().time() >= self._due[key]:
-                self.require_link().give_up(error)
+            self._give_up_overdue(key, error)
             raise error from exc
 
-    async def _await_answer(
-        self, answer: asyncio.Future[m.Message | SmartCamError], message: m.Message, deadline: float
-    ) -> m.Message:
-        try:
-            return await self._take_answer(answer, deadline)
-        except TimeoutError as exc:
-            error = self._timeout(message, "no answer to", "in time")
+    def _give_up_overdue(self, key: type[m.Message] | int, error: ResponseTimeoutError) -> None:
+        """Give the link up if the answer that is owed should have come by now."""
+        loop = asyncio.get_running_loop()
+        if loop.time() + TIMER_RESOLUTION >= self._due[key]:
             self.require_link().give_up(error)
-            raise error from exc
 
     async def _take_answer(
         self, answer: asyncio.Future[m.Message | SmartCamError], deadline: float

@@ -224,7 +224,7 @@ async def establish(
         except TimeoutError as exc:
             what = f"{progress.received} bytes, then silence" if progress.received else "silence"
             progress.outcome, cause = f"{what} for {share:.1f} s", exc
-        except (OSError, SmartCamError) as exc:
+        except (OSError, UnicodeError, SmartCamError) as exc:  # UnicodeError: no host name
             progress.outcome, cause = str(exc), exc
         unreachable = progress.step == OPENING
         logger.debug("%s ! attempt %d: %s", settings.name, number + 1, progress)

@@ -94,6 +94,8 @@ class Inbox:
         # who waits for what
         self.pending: PendingTrigger | None = None
         self.debt: Literal["late", "streamed"] | None = None  # fate of the result still to come
+        # the input data of a trigger without a result may still be queued in the camera
+        self.input_in_doubt: bool = False
         # by the answer's type; by id for a message that the dialect does not know
         self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
         # weak: a waiter that was made and never awaited must not count as a listener
@@ -117,8 +119,10 @@ class Inbox:
             match event:
                 case m.ResultContainer():
                     self._on_result(event, chunk.received_at, at)
+                    self._on_answer(m.ResultContainer, event)
                 case m.StatusReport():
                     self._on_status(event, chunk.received_at, at)
+                    self._on_answer(m.StatusReport, event)
                 case m.UnknownMessage():
                     self._on_answer(event.message_id, event)
                 case m.QueryAnswer():
@@ -127,6 +131,7 @@ class Inbox:
                 case m.SwitchAnswer():
                     if event.code == 0:
                         self.expected = event.application
+                        self.input_in_doubt = False
                     self.set_active(event.application, at)
                     self._on_answer(type(event), event)
                 case m.Message():
@@ -320,6 +325,8 @@ class Inbox:
     def _deliver(
         self, result: Result | InterpretationError, pending: PendingTrigger | None, now: float
     ) -> None:
+        if pending is not None and pending.has_input:
+            self.input_in_doubt = False
         for stream in tuple(self.result_streams):
             stream.offer(result, now)
         waiting = tuple(self.next_results)

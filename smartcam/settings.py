@@ -83,6 +83,8 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     for key, value in parse_qsl(parts.query, keep_blank_values=True):
         if key != "dialect":
             raise ConfigurationError(f"camera address {url!r}: unknown {key!r}; known is 'dialect'")
+        if dialect is not None:
+            raise ConfigurationError(f"camera address {url!r} names two dialects")
         dialect = value
     if dialect is not None and dialect not in protocol.dialects:
         raise ConfigurationError(

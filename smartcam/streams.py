@@ -106,7 +106,7 @@ class Subscription(Generic[T]):
         while not self._items:
             if self._ended:
                 if self._end_error is not None:
-                    raise self._end_error
+                    raise self._end_error.with_traceback(None)  # it would grow with each raise
                 raise StopAsyncIteration
             self._ready.clear()
             await self._ready.wait()

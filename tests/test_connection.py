@@ -149,8 +149,8 @@ async def test_send_illegal_message_raises_after_the_legal_ones_were_written(
     peer = await server.accept()
     with pytest.raises(LocalProtocolError, match="Query cannot be sent"):
         link.send(m.Query())
-    with pytest.raises(LocalProtocolError, match="Trigger cannot be sent"):
-        link.send(m.Connect(), m.Trigger())
+    with pytest.raises(LocalProtocolError, match="QueryAnswer cannot be sent"):
+        link.send(m.Connect(), m.QueryAnswer(application=1))
     assert await peer.read(12) == CONNECT
     link.abort()
 

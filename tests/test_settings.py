@@ -107,6 +107,7 @@ def test_parse_address_bare_host_with_model_is_its_protocols(
     [
         ("", "'' is a bare host: give a URL such as bvs://HOST, or a model"),
         ("camera", "is a bare host: give a URL such as bvs://camera, or a model"),
+        ("bvs://h?dialect=handbook&dialect=thesis", "names two dialects"),
         ("http://h", "unknown scheme 'http'; known are bvs://, bvs+udp://"),
         ("://h", "unknown scheme ''; known are"),
         ("bvs://", "has no host"),

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.machine import Machine
+from smartcam.protocols.base import POLICIES, Policy, Role, Transport
+from smartcam.protocols.machine import Machine, State
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from contextlib import AbstractContextManager
 
     from smartcam.emulator.quirks import Quirks
@@ -52,6 +53,13 @@ ACCEPT_PAUSE = 1.0
 
 WRITE_LIMIT = 1 << 20
 """Bytes kept for a client that does not read; more end its connection."""
+
+
+BAD_FRAME: Mapping[str, Policy] = {
+    "skip": POLICIES[Role.CAMERA, Transport.TCP],
+    "close": Policy(fatal=(FrameError,), exact_length=True),
+}
+"""What the quirk ``bad_frame`` means on TCP; a broken body or an unknown id never matters."""
 
 
 class Station(Protocol):
@@ -95,9 +103,13 @@ class Link(ABC):
         self.peer = peer
         self.closed = False
         self._station = station
-        self._broken = False
         self._machine = Machine(
-            station.spoken, Role.CAMERA, transport, max_length=MAX_INPUT, trace=self._trace
+            station.spoken,
+            Role.CAMERA,
+            transport,
+            max_length=MAX_INPUT,
+            policy=BAD_FRAME[station.quirks.bad_frame] if transport is Transport.TCP else None,
+            trace=self._trace,
         )
 
     def say(self, message: m.Message) -> None:
@@ -115,7 +127,7 @@ class Link(ABC):
     def close(self, reason: str) -> None:
         """End the link; nothing is read or written any more."""
 
-    def _take(self, data: memoryview | bytes) -> None:
+    def _take(self, data: bytes) -> None:
         """Feed the machine and pass its messages on."""
         self._machine.receive_data(data)
         for event in self._machine.events():
@@ -123,7 +135,6 @@ class Link(ABC):
                 self._station.received(self, event)
 
     def _trace(self, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        self._broken = self._broken or isinstance(what, FrameError)
         self._station.traced(self, sender, what)
 
 
@@ -142,8 +153,6 @@ class _TcpLink(Link, asyncio.Protocol):
     def __init__(self, listener: TcpListener, station: Station) -> None:
         super().__init__(station, Transport.TCP, "?")
         self._listener = listener
-        self._tail = b""  # the last bytes received, a header's size of them
-        self._payload = 0  # bytes that the header in hand announces
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
@@ -161,16 +170,10 @@ class _TcpLink(Link, asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         with self._station.step():
-            rest = memoryview(data)
-            while rest and not self.closed:
-                size = self._missing()
-                piece, rest = rest[:size], rest[size:]
-                self._tail = (self._tail + piece)[-self._header_size :]
-                self._take(piece)
-                if self._broken and self._station.quirks.bad_frame == "close":
-                    self.flush()
-                    self.close("a broken frame came")
+            self._take(data)
             self.flush()  # also what was said before a Disconnect in the same bytes
+            if self._machine.state is State.FAILED:
+                self.close("a broken frame came")
 
     def connection_lost(self, exc: Exception | None) -> None:
         self.closed = True
@@ -194,25 +197,6 @@ class _TcpLink(Link, asyncio.Protocol):
             self._transport.abort()
             self._listener.links.discard(self)
             self._station.lost(self)
-
-    @property
-    def _header_size(self) -> int:
-        return self._station.spoken.header.size
-
-    def _missing(self) -> int:
-        """Return the bytes to the end of the header or frame that is being received.
-
-        The machine gets no more than one frame at a time: the answer to a message must be on its
-        way before the next one is looked at, for that one may be right only after the answer.
-        """
-        kept = self._machine.buffered
-        header = self._station.spoken.header
-        if kept < header.size:
-            return header.size - kept
-        # pieces end with the header, so these were the last bytes when its last one came
-        if kept == header.size:
-            self._payload = header.unpack(self._tail, 0)[1]
-        return header.size + self._payload - kept
 
 
 class Listener(ABC):

@@ -11,7 +11,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.exceptions import LocalProtocolError, MessageError, hex_excerpt
+from smartcam.exceptions import FrameError, LocalProtocolError, MessageError, hex_excerpt
 from smartcam.models import Status
 from smartcam.protocols.framing import Frame, HeaderLayout
 from smartcam.protocols.messages import (
@@ -26,6 +26,8 @@ from smartcam.protocols.messages import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from smartcam.exceptions import RemoteProtocolError
 
 __all__ = ["POLICIES", "Dialect", "MessageRow", "Policy", "Protocol", "Role", "Transport"]
 
@@ -59,22 +61,23 @@ class Policy:
     """What one role does with broken input.
 
     Attributes:
-        fail: a broken frame, a short body or a message at the wrong time ends the link; otherwise
-            it is dropped and counted.
+        fatal: which errors end the link: :exc:`~smartcam.exceptions.FrameError` for bytes that
+            make no frame, :exc:`~smartcam.exceptions.MessageError` for a short body or a message
+            at the wrong time. Others are dropped and counted.
         exact_length: a known message must have exactly its documented length; otherwise a longer
             body is accepted and counted.
     """
 
-    fail: bool
+    fatal: tuple[type[RemoteProtocolError], ...]
     exact_length: bool
 
 
 POLICIES: Mapping[tuple[Role, Transport], Policy] = {
-    (Role.CLIENT, Transport.TCP): Policy(fail=True, exact_length=False),
-    (Role.CLIENT, Transport.UDP): Policy(fail=False, exact_length=False),
+    (Role.CLIENT, Transport.TCP): Policy(fatal=(FrameError, MessageError), exact_length=False),
+    (Role.CLIENT, Transport.UDP): Policy(fatal=(), exact_length=False),
     # the camera ignores invalid messages silently (SC manual p. 28: published)
-    (Role.CAMERA, Transport.TCP): Policy(fail=False, exact_length=True),
-    (Role.CAMERA, Transport.UDP): Policy(fail=False, exact_length=True),
+    (Role.CAMERA, Transport.TCP): Policy(fatal=(), exact_length=True),
+    (Role.CAMERA, Transport.UDP): Policy(fatal=(), exact_length=True),
 }
 
 
@@ -208,7 +211,7 @@ class Dialect:
             raise LocalProtocolError(f"dialect {self.name} has no message {type(message).__name__}")
         try:
             return Frame(codec.message_id, codec.encode(message))
-        except struct.error as exc:
+        except (struct.error, TypeError) as exc:
             raise LocalProtocolError(f"{message} does not fit its fields: {exc}") from exc
 
     def encode(self, message: Message) -> bytes:

@@ -86,9 +86,13 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
         (State.DISCONNECTED, client, m.Disconnect): State.DISCONNECTED,
         (State.DISCONNECTED, client, m.Connect): connecting,
         (State.DISCONNECTED, camera, m.ConnectAnswer): State.DISCONNECTED,
-        (connected, client, m.UnknownMessage): connected,
+        # the answer to a second Connect that came in the same bytes as the first
+        (connected, camera, m.ConnectAnswer): connected,
     }
-    table |= {(connected, client, request): connected for request in _SESSION_REQUESTS}
+    for request in (*_SESSION_REQUESTS, m.UnknownMessage):
+        table[connected, client, request] = connected
+        # right behind a Connect, before its answer is out: it is answered after that
+        table[connecting, client, request] = connecting
     for report in (*_SESSION_REPORTS, m.UnknownMessage):
         table[connected, camera, report] = connected
         table[State.DISCONNECTED, camera, report] = State.DISCONNECTED
@@ -288,7 +292,10 @@ class Machine:
         surplus = self.dialect.surplus(sender, frame)
         try:
             if surplus > 0 and self._policy.exact_length:
-                raise MessageError(f"message {frame.message_id:#04x} is {surplus} bytes too long")
+                raise MessageError(
+                    f"message {frame.message_id:#04x} is {surplus} bytes too long",
+                    data=frame.payload,
+                )
             message = self.dialect.decode(sender, frame)
             following = TRANSITIONS.get((self.state, sender, type(message)))
             if following is None:
@@ -309,6 +316,7 @@ class Machine:
     def _wanted(self, message: Message, message_id: int) -> bool:
         """Whether the client shall see it: an answer that nothing asked for is counted only."""
         if isinstance(message, (m.ResultContainer, m.StatusReport)):
+            self._open.discard(message_id)  # asked for, in a dialect or by a raw request
             return True
         unknown = isinstance(message, m.UnknownMessage)
         self.counters.unknown_ids += unknown
@@ -322,7 +330,7 @@ class Machine:
         """Fail the link (True) or drop and count, as the policy says."""
         if self._trace is not None:
             self._trace(self.role.receives, error)
-        if not self._policy.fail:
+        if not isinstance(error, self._policy.fatal):
             self.counters.ignored_frames += 1
             return False
         self.state = State.FAILED

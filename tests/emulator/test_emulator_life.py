@@ -15,6 +15,7 @@ from camera_wire import TcpClient, UdpClient, until
 
 from smartcam.emulator import Application, EmulatedCamera, ManualClock, Quirks, RealClock, Scenario
 from smartcam.exceptions import ConfigurationError, LocalProtocolError, ResponseTimeoutError
+from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 HELLO = (wire.CONNECTED, wire.NO_BIT)
@@ -410,14 +411,16 @@ async def test_log_has_both_directions_and_what_was_ignored() -> None:
     assert {entry.peer for entry in log} == {peer}
     assert {entry.time for entry in log} == {2.5}
     frames = [(e.direction, e.message_id, e.message, e.hex) for e in log if e.error is None]
-    assert frames == [
+    assert [frame for frame in frames if frame[0] == "in"] == [
         ("in", 0x30, m.Query(), ""),
         ("in", 0x01, m.Connect(), ""),
-        ("out", 0x01, m.ConnectAnswer(version=1), "01 00 00 00"),
-        ("out", 0x12, log[4].message, "00 00 00 00 00 00 00 00"),
         ("in", 0x77, None, "ff"),
         ("in", 0x30, None, "ff"),
         ("in", 0x30, m.Query(), ""),
+    ]
+    assert [frame for frame in frames if frame[0] == "out"] == [
+        ("out", 0x01, m.ConnectAnswer(version=1), "01 00 00 00"),
+        ("out", 0x12, m.StatusReport(status=Status(0)), "00 00 00 00 00 00 00 00"),
         ("out", 0x30, m.QueryAnswer(application=1), "01 00 00 00"),
     ]
     errors = [entry.error or "" for entry in log if entry.error is not None]

@@ -181,8 +181,7 @@ async def test_tcp_quirk_close_ends_the_connection_at_a_broken_frame() -> None:
         await client.expect(*HELLO, wire.ACTIVE_1)
         client.send(bytes.fromhex(INVALID["query with a body"]))
         await client.expect_nothing_but(wire.QUERY, wire.ACTIVE_1)
-        client.send(wire.QUERY + b"garbage" + wire.QUERY)
-        await client.expect(wire.ACTIVE_1)
+        client.send(b"garbage" + wire.QUERY)
         await client.expect_end()
         assert not emulator.has_session
         other.send(wire.CONNECT)

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 from machines import DIALECTS, EXAMPLES, SIXTEEN
 
-from smartcam.exceptions import LocalProtocolError, MessageError
+from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Dialect, Policy, Role, Transport
@@ -37,10 +37,10 @@ def test_role_sends_as_itself_and_receives_from_the_other() -> None:
 
 def test_policies_only_a_client_on_tcp_fails_and_only_a_camera_wants_exact_lengths() -> None:
     assert dict(POLICIES) == {
-        (Role.CLIENT, Transport.TCP): Policy(fail=True, exact_length=False),
-        (Role.CLIENT, Transport.UDP): Policy(fail=False, exact_length=False),
-        (Role.CAMERA, Transport.TCP): Policy(fail=False, exact_length=True),
-        (Role.CAMERA, Transport.UDP): Policy(fail=False, exact_length=True),
+        (Role.CLIENT, Transport.TCP): Policy(fatal=(FrameError, MessageError), exact_length=False),
+        (Role.CLIENT, Transport.UDP): Policy(fatal=(), exact_length=False),
+        (Role.CAMERA, Transport.TCP): Policy(fatal=(), exact_length=True),
+        (Role.CAMERA, Transport.UDP): Policy(fatal=(), exact_length=True),
     }
 
 

@@ -185,7 +185,6 @@ def test_receive_eof_between_frames_leaves_nothing_pending() -> None:
         (header(0xFFFFFFFF), FrameError, "announces 4294967295 bytes", 4),
         (header(DEFAULT_MAX_LENGTH + 1), FrameError, "announces 1048577 bytes", 4),
         (header(7, 0x12) + bytes(7), MessageError, "StatusReport (0x12) came with 7 bytes", 12),
-        (HANDBOOK.encode(m.ConnectAnswer(version=1)), MessageError, "came in state connected", 0),
     ],
 )
 def test_client_on_tcp_fails_the_link_and_keeps_the_error(
@@ -233,7 +232,7 @@ def test_udp_datagram_of_two_frames_is_dropped_whole(role: Role) -> None:
 
 
 def test_udp_client_that_shall_fail_tells_what_the_datagram_was() -> None:
-    strict = Policy(fail=True, exact_length=True)
+    strict = Policy(fatal=(FrameError, MessageError), exact_length=True)
     made = client(transport=UDP, policy=strict)
     error = failure(feed(made, STATUS + b"\xaa\xbb"))
     assert str(error) == "a datagram is not one whole frame: aa bb"
@@ -254,7 +253,23 @@ def test_client_longer_body_at_the_wrong_time_is_not_counted_as_one() -> None:
     assert (made.counters.long_bodies, made.counters.ignored_frames) == (0, 1)
 
 
+def test_client_second_connect_answer_is_counted_only() -> None:
+    made = client()
+    assert feed(made, HANDBOOK.encode(m.ConnectAnswer(version=1)) + STATUS) == [STATUS_MESSAGE]
+    assert made.counters.unexpected_messages == 1
+
+
 # ---------------------------------------------------------------------- the camera's policy
+
+
+def test_camera_requests_behind_a_connect_in_the_same_bytes_are_heard_in_order() -> None:
+    made = Machine(HANDBOOK, Role.CAMERA, Transport.TCP)
+    requests = [m.Connect(), m.Query(), m.Connect(), m.Trigger()]
+    assert feed(made, b"".join(HANDBOOK.encode(one) for one in requests)) == requests
+    made.send(m.ConnectAnswer(version=1))
+    made.send(m.QueryAnswer(application=7))
+    made.send(m.ConnectAnswer(version=1))
+    assert [data[8] for data in made.data_to_send()] == [0x01, 0x30, 0x01]
 
 
 @pytest.mark.parametrize(
@@ -306,7 +321,7 @@ def test_camera_before_connect_ignores_requests_and_takes_connect() -> None:
 
 
 def test_camera_with_a_failing_policy_ends_the_link() -> None:
-    made = camera(policy=Policy(fail=True, exact_length=True))
+    made = camera(policy=Policy(fatal=(FrameError, MessageError), exact_length=True))
     error = failure(feed(made, header(1, 0x40) + b"x"))
     assert str(error) == "message 0x40 is 1 bytes too long"
     assert made.state is State.FAILED

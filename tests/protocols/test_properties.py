@@ -116,7 +116,7 @@ def test_any_cutting_of_messages_gives_the_same_events(
 def test_any_cutting_of_any_bytes_gives_the_same_events(
     role: Role, dialect: Dialect, data: st.DataObject
 ) -> None:
-    drops = Policy(fail=False, exact_length=role is Role.CAMERA)
+    drops = Policy(fatal=(), exact_length=role is Role.CAMERA)
     stream = data.draw(streams(dialect, role.receives))
     chunks = split(stream, data.draw(chunkings(len(stream))))
     whole = outcome(session(role, dialect, policy=drops), [stream])
@@ -173,7 +173,9 @@ def check_order(made: Machine, events: list[Event]) -> None:
 @each_role
 @given(data=st.data())
 def test_after_the_link_failed_nothing_comes(role: Role, data: st.DataObject) -> None:
-    made = session(role, HANDBOOK, policy=Policy(fail=True, exact_length=True))
+    made = session(
+        role, HANDBOOK, policy=Policy(fatal=(FrameError, MessageError), exact_length=True)
+    )
     (event,) = feed(made, b"broken")
     assert isinstance(event, LinkFailed)
     counted = made.counters.bytes_received

@@ -71,8 +71,9 @@ def test_vectors_of_a_dialect_hold_every_message_of_its_table(dialect: str) -> N
         row.type for row in BVS.dialects[dialect].table
     }
     assert len({one.name for one in vectors}) == len(vectors)
-    assert {one.grade for one in vectors} == {"published", "derived"}
-    assert sum(one.grade == "published" for one in vectors) == 1
+    published = [one.name for one in vectors if one.grade == "published"]
+    assert published == (["set clock"] if dialect == "handbook" else [])
+    assert {one.grade for one in vectors} <= {"published", "derived"}
 
 
 @each_vector
