@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -50,6 +51,7 @@ for slow links."""
 
 
 OPENING = "opening the link"
+CONNECTING = "waiting for the answer to Connect"
 
 
 class Session(NamedTuple):
@@ -80,6 +82,16 @@ class Try:
     step: str = OPENING
     outcome: str = ""
     received: int = 0
+
+    def end(self, error: Exception, waited: float) -> None:
+        """Note what it ended with; ``UnicodeError`` stands for what is no host name."""
+        if isinstance(error, TimeoutError) and not isinstance(error, SmartCamError):
+            what = f"{self.received} bytes, then silence" if self.received else "silence"
+            self.outcome = f"{what} for {waited:.1f} s"
+        elif isinstance(error, OSError) and error.errno is not None and error.errno > 0:
+            self.outcome = os.strerror(error.errno)  # asyncio's own text is "Connect call failed"
+        else:
+            self.outcome = str(error)
 
     def __str__(self) -> str:
         """One line for an error text."""
@@ -161,7 +173,7 @@ async def attempt(
     collector = _Collector(link)
     try:
         link.send(Disconnect(), Connect())
-        progress.step = "waiting for the answer to Connect"
+        progress.step = CONNECTING
         while collector.version is None:
             await collector.take()
         progress.step = "waiting for the first status"
@@ -196,38 +208,37 @@ async def establish(
     protocol = load_protocol(address.protocol)
     transport = protocol.schemes[address.scheme]
     names = [address.dialect] if address.dialect else list(protocol.dialects)
-    rounds = [name for _ in range(settings.connect_attempts) for name in names]
     loop = asyncio.get_running_loop()
     deadline = loop.time() + settings.connect_timeout
     tries: list[Try] = []
     cause: BaseException | None = None
-    unreachable = False
-    for number, name in enumerate(rounds):
-        if unreachable and number % len(names):
-            continue  # no link, so another dialect would fare no better in this round
-        share = (deadline - loop.time()) / (len(rounds) - number)
-        if len(names) > 1 and number < len(names):
-            share = min(share, DETECTION_SHARE)
-        progress = Try(name, transport.value)
-        tries.append(progress)
-        try:
-            async with asyncio.timeout(share):
-                return await attempt(
-                    address,
-                    protocol.dialects[name],
-                    transport,
-                    progress=progress,
-                    name=settings.name,
-                    max_length=settings.max_length,
-                    trace=trace,
-                )
-        except TimeoutError as exc:
-            what = f"{progress.received} bytes, then silence" if progress.received else "silence"
-            progress.outcome, cause = f"{what} for {share:.1f} s", exc
-        except (OSError, UnicodeError, SmartCamError) as exc:  # UnicodeError: no host name
-            progress.outcome, cause = str(exc), exc
-        unreachable = progress.step == OPENING
-        logger.debug("%s ! attempt %d: %s", settings.name, number + 1, progress)
+    for left in range(settings.connect_attempts, 0, -1):
+        for position, name in enumerate(names):
+            share = (deadline - loop.time()) / (left * len(names) - position)
+            if len(names) > 1 and left == settings.connect_attempts:
+                share = min(share, DETECTION_SHARE)
+            progress = Try(name, transport.value)
+            tries.append(progress)
+            try:
+                async with asyncio.timeout(share):
+                    return await attempt(
+                        address,
+                        protocol.dialects[name],
+                        transport,
+                        progress=progress,
+                        name=settings.name,
+                        max_length=settings.max_length,
+                        trace=trace,
+                    )
+            except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
+                progress.end(exc, share)
+                cause = exc
+            logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
+            if progress.step == OPENING:
+                break  # no link, so another dialect would fare no better in this round
+            if progress.step != CONNECTING:
+                names = [name]  # it answered the Connect: that is its dialect
+                break
     texts = tuple(f"attempt {n}: {one}" for n, one in enumerate(tries, 1))
     raise ConnectFailedError(
         f"{settings.name}: no session with {address.url}: " + "; ".join(texts),

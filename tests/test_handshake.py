@@ -327,6 +327,17 @@ async def test_establish_unpinned_silence_takes_turns_through_the_dialects() -> 
     assert dialects == ["handbook", "thesis", "handbook", "thesis"]
 
 
+async def test_establish_unpinned_dialect_that_answered_is_the_only_one_tried_again() -> None:
+    async def talk(peer: Peer, number: int) -> None:
+        if await peer.read(24) == THESIS_OPENING:
+            peer.write(THESIS_CONNECT_ANSWER)
+        await end(peer)
+
+    error = await failure_with(talk, query="", connect_timeout=0.4, connect_attempts=3)
+    dialects = [one.split()[2] for one in error.attempts]
+    assert dialects == ["handbook", "thesis", "thesis", "thesis"]
+
+
 @pytest.mark.parametrize(
     ("reply", "outcome"),
     [

@@ -91,11 +91,8 @@ async def _try(
                 max_length=DEFAULT_MAX_LENGTH,
                 trace=note,
             )
-    except TimeoutError:
-        what = f"{progress.received} bytes, then silence" if progress.received else "silence"
-        progress.outcome = f"{what} for {share:.1f} s"
-    except (OSError, SmartCamError) as exc:
-        progress.outcome = str(exc)
+    except (OSError, UnicodeError, SmartCamError) as exc:
+        progress.end(exc, share)
     else:
         progress.outcome = "session"
         return session
