@@ -32,14 +32,14 @@ from smartcam.interpretation import Interpretation
 from smartcam.models import CameraEvent, Connected, Disconnected, Result, Statistics, Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.framing import Frame
-from smartcam.settings import CameraSettings
+from smartcam.settings import CameraOptions, CameraSettings
 from smartcam.streams import Subscription
 from smartcam.turns import Turns
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
     from types import TracebackType
-    from typing import Literal, Self
+    from typing import Literal, Self, Unpack
 
     from smartcam.connection import Link, TraceEntry
     from smartcam.protocols.base import Dialect
@@ -60,7 +60,7 @@ def connect(
     *,
     model: str | None = None,
     trace: Callable[[TraceEntry], None] | None = None,
-    **options: Any,
+    **options: Unpack[CameraOptions],
 ) -> SmartCamera:
     """Return a camera to be opened with ``async with`` (or ``await``).
 

@@ -9,7 +9,9 @@ Where no dialect is pinned, attempts take turns through the protocol's dialects.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
+import operator
 import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
@@ -239,10 +241,20 @@ async def establish(
             if progress.step != CONNECTING:
                 names = [name]  # it answered the Connect: that is its dialect
                 break
-    texts = tuple(f"attempt {n}: {one}" for n, one in enumerate(tries, 1))
     raise ConnectFailedError(
-        f"{settings.name}: no session with {address.url}: " + "; ".join(texts),
+        f"{settings.name}: no session with {address.url}: {_folded(tries)}",
         host=address.host,
         port=address.port,
-        attempts=texts,
+        attempts=tuple(f"attempt {number}: {one}" for number, one in enumerate(tries, 1)),
     ) from cause
+
+
+def _folded(tries: list[Try]) -> str:
+    """Return what came of all attempts, those with the same outcome in a row as one."""
+    parts: list[str] = []
+    numbered = enumerate(map(str, tries), 1)
+    for text, group in itertools.groupby(numbered, key=operator.itemgetter(1)):
+        first, *more = [number for number, _ in group]
+        which = f"attempts {first} to {more[-1]}" if more else f"attempt {first}"
+        parts.append(f"{which}: {text}")
+    return "; ".join(parts)

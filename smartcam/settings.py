@@ -5,7 +5,7 @@ A wrong option is a :exc:`~smartcam.exceptions.ConfigurationError` that names it
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, cast
 from urllib.parse import parse_qsl, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -14,11 +14,12 @@ from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
+    from smartcam.interpreters.base import Spec
     from smartcam.protocols.base import Protocol
 
-__all__ = ["Address", "CameraSettings", "parse_address", "validation_text"]
+__all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address", "validation_text"]
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
 
@@ -128,6 +129,22 @@ def _protocols() -> Iterator[Protocol]:
             yield protocol
 
 
+class CameraOptions(TypedDict, total=False):
+    """The options that ``connect()`` takes; :class:`CameraSettings` has defaults and meanings."""
+
+    name: str
+    application: int | None
+    interpret_as: Spec | Mapping[int, Spec]
+    y_down: bool
+    lenient: bool
+    connect_timeout: float
+    connect_attempts: int
+    switch_timeout: float
+    request_timeout: float
+    close_timeout: float
+    max_length: int
+
+
 class CameraSettings(BaseModel):
     """Options of one client. Times are seconds, each bounds one step."""
 
@@ -155,7 +172,9 @@ class CameraSettings(BaseModel):
     )
 
     @classmethod
-    def make(cls, url: str, model: str | None, options: dict[str, Any]) -> CameraSettings:
+    def make(
+        cls, url: str, model: str | None, options: CameraOptions | dict[str, Any]
+    ) -> CameraSettings:
         """Validate what ``connect()`` was given.
 
         Raises:
@@ -163,7 +182,7 @@ class CameraSettings(BaseModel):
         """
         address = parse_address(url, model=model)
         try:
-            settings = cls(address=address, **options)
+            settings = cls(address=address, **cast("dict[str, Any]", options))
         except ValidationError as exc:
             raise ConfigurationError(f"connect: {validation_text(exc)}") from exc
         except TypeError as exc:

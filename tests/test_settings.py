@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 
 from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.registry import PROTOCOLS
-from smartcam.settings import Address, CameraSettings, parse_address, validation_text
+from smartcam.settings import Address, CameraOptions, CameraSettings, parse_address, validation_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -273,3 +273,7 @@ def test_validation_text_cuts_long_input_and_names_the_whole_value() -> None:
     with pytest.raises(ValidationError) as caught:
         Outer.model_validate(3)
     assert validation_text(caught.value).startswith("value: ")
+
+
+def test_options_are_those_of_the_settings() -> None:
+    assert {*CameraOptions.__annotations__} == {*CameraSettings.model_fields} - {"address"}
