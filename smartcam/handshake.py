@@ -2,7 +2,8 @@
 
 Each attempt sends Disconnect (harmless without a session; old sessions confuse the camera, thesis
 3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
-Query. Anything unexpected, silence included, ends the attempt: close, fresh link, next attempt.
+Query. Anything unexpected, silence included, ends the attempt: close, fresh link, next attempt. To
+a camera that hangs up without a byte, the next attempt is made without the Disconnect.
 Where no dialect is pinned, attempts take turns through the protocol's dialects.
 """
 
@@ -77,16 +78,28 @@ class Session(NamedTuple):
 
 @dataclass(slots=True)
 class Try:
-    """One attempt: what was tried and how far it came."""
+    """One attempt: what was tried and how far it came.
+
+    Attributes:
+        dialect: that was spoken.
+        transport: ``tcp`` or ``udp``.
+        step: what was waited for at last.
+        outcome: what came of it.
+        received: bytes that came.
+        hung_up: the other side ended the link without a byte.
+    """
 
     dialect: str
     transport: str
     step: str = OPENING
     outcome: str = ""
     received: int = 0
+    hung_up: bool = False
 
     def end(self, error: Exception, waited: float) -> None:
         """Note what it ended with; ``UnicodeError`` stands for what is no host name."""
+        timeout = isinstance(error, TimeoutError)
+        self.hung_up = self.step == CONNECTING and not timeout and not self.received
         if isinstance(error, TimeoutError) and not isinstance(error, SmartCamError):
             what = f"{self.received} bytes, then silence" if self.received else "silence"
             self.outcome = f"{what} for {waited:.1f} s"
@@ -156,6 +169,7 @@ async def attempt(
     name: str,
     max_length: int,
     trace: Callable[[TraceEntry], None] | None = None,
+    disconnect_first: bool = True,
 ) -> Session:
     """Make a session over one fresh link; bounded by the caller's deadline.
 
@@ -174,7 +188,7 @@ async def attempt(
     )
     collector = _Collector(link)
     try:
-        link.send(Disconnect(), Connect())
+        link.send(*([Disconnect()] if disconnect_first else []), Connect())
         progress.step = CONNECTING
         while collector.version is None:
             await collector.take()
@@ -214,6 +228,7 @@ async def establish(
     deadline = loop.time() + settings.connect_timeout
     tries: list[Try] = []
     cause: BaseException | None = None
+    disconnect_first = True
     for left in range(settings.connect_attempts, 0, -1):
         for position, name in enumerate(names):
             share = (deadline - loop.time()) / (left * len(names) - position)
@@ -231,10 +246,14 @@ async def establish(
                         name=settings.name,
                         max_length=settings.max_length,
                         trace=trace,
+                        disconnect_first=disconnect_first,
                     )
             except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
                 progress.end(exc, share)
                 cause = exc
+            if progress.hung_up:
+                # perhaps at the Disconnect: then the next link does without, and so by turns
+                disconnect_first = not disconnect_first
             logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
             if progress.step == OPENING:
                 break  # no link, so another dialect would fare no better in this round

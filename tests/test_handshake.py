@@ -297,6 +297,20 @@ async def test_establish_peer_that_closes_or_resets_leads_to_a_fresh_link() -> N
         assert events(session) == ANSWERS
 
 
+async def test_establish_camera_that_hangs_up_at_disconnect_gets_none_the_next_time() -> None:
+    async def talk(peer: Peer, number: int) -> None:
+        if await peer.read(12) == DISCONNECT:
+            peer.close()
+            return
+        peer.write(CONNECT_ANSWER + STATUS)
+        assert await peer.read(12) == QUERY
+        peer.write(QUERY_ANSWER)
+        await end(peer)
+
+    async with session_with(talk) as session:
+        assert session.version == 1
+
+
 async def test_establish_answers_only_at_the_third_attempt() -> None:
     seen, talk = then_good(end, bad_ones=2)
     async with session_with(talk, connect_timeout=0.4, connect_attempts=3) as session:
