@@ -21,7 +21,7 @@ from smartcam.cli.texts import result_text, table_text
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import NotRunningError, TriggerTimeoutError
 from smartcam.handshake import load_protocol
-from smartcam.models import Status, jsonable
+from smartcam.models import Status
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ async def _trigger(url: str, input_hex: str | None, options: Options) -> None:
                         f"{exc}. To start it: smartcam start {camera.url}, or trigger with "
                         f"--application {camera.active_application}"
                     ) from exc
-                options.show(result, lambda: result_text(result))  # noqa: B023 - called at once
+                options.show(result, result_text)
                 done += 1
 
 
@@ -123,7 +123,7 @@ async def _watch(url: str, options: Options) -> None:
                                 f"{camera.name}: no result within {each:g} s; "
                                 f"status: {camera.status}"
                             ) from exc
-                        options.show(result, lambda: result_text(result))  # noqa: B023
+                        options.show(result, result_text)
                         done += 1
             except TriggerTimeoutError:
                 raise
@@ -201,7 +201,7 @@ def protocols(**shared: Any) -> None:
                 f"{info.name} ({info.origin}): {', '.join(f'{s}://' for s in protocol.schemes)}, "
                 f"port {protocol.default_port}, models {', '.join(protocol.models)}\n"
             )
-            options.show(value, lambda: head + table_text(("dialect", ""), rows))  # noqa: B023
+            options.show(value, head + table_text(("dialect", ""), rows))
 
     run(main(), program="smartcam", debug=options.debug)
 
@@ -214,7 +214,7 @@ def interpreters(**shared: Any) -> None:
 
     async def main() -> None:
         for info in INTERPRETERS.available():
-            options.show(info, lambda: f"{info.name}  ({info.origin}: {info.target})")  # noqa: B023
+            options.show(info, f"{info.name}  ({info.origin}: {info.target})")
 
     run(main(), program="smartcam", debug=options.debug)
 
@@ -254,9 +254,7 @@ def _show_camera(camera: smartcam.SmartCamera, options: Options) -> None:
     }
     running = "running" if Status.RUNNING in camera.status else "stopped"
     options.show(
-        jsonable(value),
-        lambda: (
-            f"{camera.url}\n  application {camera.active_application}, {running}\n"
-            f"  status: {camera.status}\n  protocol version {camera.protocol_version}"
-        ),
+        value,
+        f"{camera.url}\n  application {camera.active_application}, {running}\n"
+        f"  status: {camera.status}\n  protocol version {camera.protocol_version}",
     )

@@ -52,7 +52,7 @@ def decode(data: str, options: Options, *, big_endian: bool) -> None:
             "--interpret-as must say what the container holds"
         )
     value = _interpret(payload, interpreter, byte_order)
-    options.show({"value": value}, lambda: value_text(value))
+    options.show({"value": value}, value_text(value))
 
 
 def _load(data: str) -> bytes:
@@ -133,7 +133,7 @@ def _show_frame(
         if name == ResultContainer.__name__ and interpreter is not None:
             shown["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
             lines.append(value_text(shown["value"]))
-        options.show(shown, lambda: "\n".join(lines))  # noqa: B023 - called at once
+        options.show(shown, "\n".join(lines))
 
 
 def _senders(dialect: Dialect, frame: Frame) -> list[Sender]:

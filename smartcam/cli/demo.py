@@ -30,10 +30,10 @@ class _Steps:
     def step(self, text: str, **values: Any) -> None:
         self._number += 1
         number = self._number
-        self._options.show({"step": number, "text": text, **values}, lambda: f"\n{number}. {text}")
+        self._options.show({"step": number, "text": text, **values}, f"\n{number}. {text}")
 
     def detail(self, text: str, **values: Any) -> None:
-        self._options.show({"text": text, **values}, lambda: text)
+        self._options.show({"text": text, **values}, text)
 
 
 async def demo(options: Options) -> None:

@@ -91,4 +91,4 @@ def _announce(emulator: EmulatedCamera, options: Options) -> None:
         "dialect": emulator.dialect,
         "applications": sorted(emulator.device.applications),
     }
-    options.show(value, lambda: emulator.url)
+    options.show(value, emulator.url)

@@ -168,6 +168,9 @@ class Options:
         if failed:
             raise ConfigurationError(f"--trace {self.trace}: {failed[0].strerror}") from failed[0]
 
-    def show(self, value: object, text: Callable[[], str]) -> None:
-        """Print ``value`` as a line of JSON, or ``text()`` for people; flushed."""
-        click.echo(json.dumps(jsonable(value)) if self.as_json else text())
+    def show(self, value: object, text: str | Callable[[Any], str]) -> None:
+        """Print ``value`` as a line of JSON, or for people ``text`` (of it); flushed."""
+        if self.as_json:
+            click.echo(json.dumps(jsonable(value)))
+        else:
+            click.echo(text if isinstance(text, str) else text(value))

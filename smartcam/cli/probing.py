@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from smartcam.cli.options import camera_url
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.handshake import Session, Try, attempt, load_protocol
-from smartcam.models import Status, jsonable
+from smartcam.models import Status
 from smartcam.protocols.framing import DEFAULT_MAX_LENGTH
 from smartcam.protocols.messages import StatusReport
 from smartcam.settings import parse_address
@@ -113,7 +113,7 @@ def _show_try(progress: Try, frames: list[TraceEntry], options: Options) -> None
     for entry in frames:
         fields = ", ".join(f"{name}={value}" for name, value in (entry.fields or {}).items())
         lines.append(f"  {entry.direction} {entry.message}({fields})  {entry.hex[:128]}")
-    options.show(value, lambda: "\n".join(lines))
+    options.show(value, "\n".join(lines))
 
 
 def _show_session(session: Session, options: Options) -> None:
@@ -128,6 +128,6 @@ def _show_session(session: Session, options: Options) -> None:
         "protocol_version": session.version,
     }
     options.show(
-        jsonable(value),
-        lambda: f"status: {status}\nuse: {session.address.url}",
+        value,
+        f"status: {status}\nuse: {session.address.url}",
     )
