@@ -230,7 +230,7 @@ class Inbox:
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         previous, status = self.status, report.status
         self.status, self.endian = status, report.endian
-        risen = status & ~(previous or Status(0))
+        risen = Status(status.value & ~(previous.value if previous is not None else 0))
         if Status.OVERTRIGGERED in risen:
             self.overtriggers += 1
         self._fail_trigger(risen)

@@ -63,6 +63,19 @@ class Status(enum.IntFlag):
     WAITING_FOR_TRIGGER = 0x200
     """The camera would take a trigger now."""
 
+    @classmethod
+    def _missing_(cls, value: object) -> Any:
+        """Make the member for a word with unnamed bits, without keeping it.
+
+        ``enum`` keeps every word it has seen: up to four thousand million of them, as the peer
+        likes.
+        """
+        if not isinstance(value, int) or value < 0 or not value & ~_NAMED_BITS:
+            return super()._missing_(value)
+        member = int.__new__(cls, value)
+        member._name_, member._value_ = None, value
+        return member
+
     @property
     def names(self) -> list[str]:
         """Names of the set bits, lowest first; a bit without a name as ``0x40``."""
@@ -78,6 +91,9 @@ class Status(enum.IntFlag):
     def __str__(self) -> str:
         """Return the set bits as text, ``"no bit set"`` for none."""
         return " + ".join(self.names) or "no bit set"
+
+
+_NAMED_BITS = sum(member.value for member in Status)
 
 
 class Position(NamedTuple):

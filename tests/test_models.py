@@ -6,6 +6,7 @@ import dataclasses
 import enum
 import json
 import math
+import pickle
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
@@ -320,3 +321,15 @@ def test_models_public_values_are_all_exported() -> None:
         if isinstance(one, type) and one.__module__ == models.__name__
     }
     assert defined <= set(models.__all__)
+
+
+def test_status_words_with_unknown_bits_are_kept_as_they_are_but_not_in_memory() -> None:
+    before = len(Status._value2member_map_)
+    words = [Status(0x8000_0080 | number << 11) for number in range(1000)]
+    assert len(Status._value2member_map_) == before
+    assert [int(word) for word in words] == [0x8000_0080 | n << 11 for n in range(1000)]
+    assert all(Status.RUNNING in word and Status.BUSY not in word for word in words)
+    assert words[0] == Status(0x8000_0080)
+    assert repr(words[0]) == "<Status: 2147483776>"
+    assert words[0] & Status.RUNNING == Status.RUNNING
+    assert pickle.loads(pickle.dumps(words[0])) == words[0]  # noqa: S301
