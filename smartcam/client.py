@@ -31,6 +31,7 @@ from smartcam.inbox import Inbox
 from smartcam.interpretation import Interpretation
 from smartcam.models import CameraEvent, Connected, Disconnected, Result, Statistics, Status
 from smartcam.protocols import messages as m
+from smartcam.protocols.base import Transport
 from smartcam.protocols.framing import Frame
 from smartcam.settings import CameraOptions, CameraSettings
 from smartcam.streams import Subscription
@@ -139,16 +140,21 @@ class SmartCamera:
     async def close(self) -> None:
         """Send Disconnect, end the link, wait for the client's tasks. Idempotent, bounded.
 
-        The camera's run state is left as it is.
+        Going back after a temporary switch is finished first, within ``switch_timeout``. Otherwise
+        the camera's application and run state are left as they are.
         Cancellation: the link is dropped at once.
         """
-        self._inbox.fail(self._closed_error())
         supervisor, session = self._supervisor, self._session
         try:
+            await self._turns.settle()
+            self._inbox.fail(self._closed_error())
             if session is not None:
                 await session.link.close(self.settings.close_timeout)
         finally:
-            if supervisor is not None and session is None:
+            self._inbox.fail(self._closed_error())
+            if session is not None:
+                session.link.abort()
+            elif supervisor is not None:
                 supervisor.cancel()
             if supervisor is not None:
                 await asyncio.wait({supervisor})
@@ -519,6 +525,10 @@ class SmartCamera:
         sibling). It comes back with the last application, stopped.
         """
         await self._tell(m.Reboot())
+        link = self._talk.require_link()
+        if link.machine.transport is Transport.UDP:
+            # no end of the link will tell that the session is over
+            link.abort(ConnectionResetError("the camera restarts"))
 
     async def request(
         self,

@@ -64,6 +64,9 @@ def takes_trigger(status: Status) -> bool:
     return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
 
 
+_WHY_READY = "; it does not while it inspects, and an application that runs free never does"
+
+
 class Conversation:
     """What is said to the camera over one session, step by step.
 
@@ -310,11 +313,11 @@ class Conversation:
         if code != 0 or active != application:
             if was_running and Status.RUNNING not in self.status:
                 await self.start(deadline)
-            refusal = (
-                f"the camera refused to switch to application {application} (status {code})"
-                if application
-                else "no application may have the id 0"
-            )
+            refusal = f"the camera refused to switch to application {application} (status {code})"
+            if application == 0:
+                refusal = "no application may have the id 0"
+            elif code == 0:
+                refusal = f"the camera says it switched, but not to application {application}"
             raise CommandRejectedError(
                 f"{self.name}: {refusal}; application {active} is active",
                 message_id=self.require_link().machine.dialect.message_id(m.SwitchApplication),
@@ -403,7 +406,7 @@ class Conversation:
             try:
                 await self.inbox.wait_status(_is_decided, deadline)
             except TimeoutError as exc:
-                free = "; an application that runs free never does" if is_ready(status) else ""
+                free = _WHY_READY if is_ready(status) else ""
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
                     f"{self.name}: the camera did not wait for a trigger within "

@@ -134,6 +134,11 @@ class Turns:
             await asyncio.wait({job})
             self._raise_failed()
 
+    async def settle(self) -> None:
+        """Wait until every job that goes back is done; each is bounded by the switch timeout."""
+        while self._leaving:
+            await asyncio.wait(self._leaving)
+
     async def _go_back(self, before: Before) -> None:
         """Restore application and run state; never raises."""
         talk = self._talk
@@ -158,8 +163,7 @@ class Turns:
         Who had the turn before may have left such a job behind while this command was in line.
         """
         while True:
-            while self._leaving:
-                await asyncio.wait(self._leaving)
+            await self.settle()
             await self._lock.acquire()
             if not self._leaving:
                 return

@@ -114,7 +114,7 @@ def _show_frame(
     """Print one frame field by field, as each message that it can be."""
     raw = dialect.encode_frame(frame)
     for sender in _senders(dialect, frame):
-        name = dialect.message_type(sender, frame.message_id).__name__
+        name = type(dialect.decode(sender, frame)).__name__  # says plainly if it is too short
         fields = view_fields(dialect, sender, raw)
         shown: dict[str, Any] = {
             "offset": offset,

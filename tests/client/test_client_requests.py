@@ -150,6 +150,14 @@ async def test_reboot_loses_the_link_and_the_camera_comes_back_stopped() -> None
         assert (emulator.device.running, emulator.device.active_application) == (False, 3)
 
 
+async def test_reboot_over_udp_ends_the_link_for_nothing_else_will() -> None:
+    async with emulated(box={"transport": "udp"}) as (_, _, camera):
+        await camera.reboot()
+        await until(lambda: not camera.connected)
+        with pytest.raises(ConnectionLostError, match="the camera restarts"):
+            await camera.query_application()
+
+
 async def test_reboot_is_one_frame() -> None:
     async with by_hand() as (box, camera):
         await camera.reboot()

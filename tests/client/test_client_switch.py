@@ -23,6 +23,7 @@ from camera_by_hand import (
 )
 from clientkit import SHORT, balance, by_hand, cancelled, emulated, gone, steps, until
 
+import smartcam
 from smartcam import (
     CommandRejectedError,
     ConfigurationError,
@@ -33,9 +34,18 @@ from smartcam import (
     TriggerTimeoutError,
     WrongApplicationError,
 )
+from smartcam.emulator import EmulatedCamera, ManualClock
+from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
+
+    from smartcam import SmartCamera
+
+QUICK = [
+    {"id": 3, "layout": "n: uint8", "constant": {"n": 3}, "load_time": 0.0, "processing_time": 0.0},
+    {"id": 21, "layout": "n: uint8", "constant": {"n": 1}, "load_time": 0.0},
+]
 
 # ---------------------------------------------------------------------- for good
 
@@ -569,3 +579,44 @@ async def test_application_used_by_two_tasks_does_not_mix_them_up() -> None:
                 return (await camera.trigger()).application
 
         assert await asyncio.gather(*(shot() for _ in range(5))) == [7] * 5
+
+
+# ---------------------------------------------------------------------- closing on the way back
+
+
+async def left_by_error(camera: SmartCamera) -> None:
+    async with camera.application(21):
+        raise ValueError("the user's own")
+
+
+async def left_by_timeout(camera: SmartCamera) -> None:
+    await camera.trigger(21, timeout=0.0)
+
+
+async def left_by_interpretation(camera: SmartCamera) -> None:
+    await camera.trigger(21, interpret_as="n: int32")
+
+
+@pytest.mark.parametrize("leave", [left_by_error, left_by_timeout, left_by_interpretation])
+async def test_close_waits_for_the_way_back(
+    leave: Callable[[SmartCamera], Awaitable[None]],
+) -> None:
+    async with EmulatedCamera(applications=QUICK) as emulator:
+        with pytest.raises((ValueError, TriggerTimeoutError)):
+            async with smartcam.connect(emulator.url, application=3) as camera:
+                await leave(camera)
+        assert emulator.device.active_application == 3
+        assert emulator.device.running
+
+
+async def test_close_cancelled_on_the_way_back_drops_the_link() -> None:
+    async with EmulatedCamera(applications=QUICK, clock=ManualClock()) as emulator:
+        camera = await smartcam.connect(emulator.url)
+        visit = asyncio.create_task(camera.trigger(21))
+        await emulator.wait_received(m.SwitchApplication)
+        await cancelled(visit)
+        closing = asyncio.create_task(camera.close())
+        await steps(3)
+        assert not closing.done()
+        await cancelled(closing)
+        assert not camera.connected
