@@ -164,7 +164,9 @@ def test_decode_garbage_behind_a_frame_exits_3() -> None:
 
 
 def test_decode_short_body_exits_3_in_one_line() -> None:
-    run("decode", "50535642 04000000 12000000 05000000").failed(3, "StatusReport (0x12) came with 4 bytes")
+    run("decode", "50535642 04000000 12000000 05000000").failed(
+        3, "StatusReport (0x12) came with 4 bytes"
+    )
 
 
 def test_decode_short_container_exits_6() -> None:
