@@ -146,7 +146,9 @@ class SmartCamera:
         """
         supervisor, session = self._supervisor, self._session
         try:
-            await self._turns.settle()
+            with contextlib.suppress(TimeoutError):  # another task's command may be in between
+                async with asyncio.timeout(self.settings.switch_timeout):
+                    await self._turns.settle()
             self._inbox.fail(self._closed_error())
             if session is not None:
                 await session.link.close(self.settings.close_timeout)

@@ -135,7 +135,11 @@ class Turns:
             self._raise_failed()
 
     async def settle(self) -> None:
-        """Wait until every job that goes back is done; each is bounded by the switch timeout."""
+        """Wait until every job that goes back is done.
+
+        Each is bounded by the switch timeout once it has the turn; who had it before may take
+        longer, so the caller has a deadline of its own.
+        """
         while self._leaving:
             await asyncio.wait(self._leaving)
 

@@ -27,6 +27,7 @@ import smartcam
 from smartcam import (
     CommandRejectedError,
     ConfigurationError,
+    ConnectionClosedError,
     ConnectionLostError,
     InterpretationError,
     ResponseTimeoutError,
@@ -620,3 +621,17 @@ async def test_close_cancelled_on_the_way_back_drops_the_link() -> None:
         assert not closing.done()
         await cancelled(closing)
         assert not camera.connected
+
+
+async def test_close_does_not_wait_for_a_way_back_behind_somebodys_long_trigger() -> None:
+    slow = [QUICK[0], {**QUICK[1], "processing_time": 60.0}]
+    async with EmulatedCamera(applications=slow) as emulator:
+        camera = await smartcam.connect(emulator.url, application=3, switch_timeout=0.3)
+        with contextlib.suppress(ZeroDivisionError):
+            async with camera.application(21):
+                long = asyncio.create_task(camera.trigger(timeout=60))
+                await emulator.wait_received(m.Trigger)
+                raise ZeroDivisionError
+        async with asyncio.timeout(5):
+            await camera.close()
+        assert isinstance(await gone(long), ConnectionClosedError)
