@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from smartcam import emulator, exceptions, interpreters, layout, models, protocols
+    from smartcam.backoff import Backoff
     from smartcam.client import SmartCamera, connect
     from smartcam.exceptions import (
         CameraBusyError,
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
         Connected,
         Disconnected,
         Header,
+        Histogram,
         Localization,
         Pose,
         Position,
@@ -60,11 +62,13 @@ if TYPE_CHECKING:
         Status,
         StatusChanged,
     )
+    from smartcam.observers import Observer
 
 __version__ = "0.1.0"
 
 __all__ = [
     "ApplicationChanged",
+    "Backoff",
     "CameraBusyError",
     "CameraEvent",
     "CameraFaultError",
@@ -78,6 +82,7 @@ __all__ = [
     "Disconnected",
     "FrameError",
     "Header",
+    "Histogram",
     "InputContainerError",
     "InterpretationError",
     "Layout",
@@ -88,6 +93,7 @@ __all__ = [
     "MessageError",
     "MissingExtraError",
     "NotRunningError",
+    "Observer",
     "OvertriggeredError",
     "PluginError",
     "Pose",
@@ -119,7 +125,13 @@ __all__ = [
 ]
 
 _ROOMS = frozenset({"emulator", "exceptions", "interpreters", "layout", "models", "protocols"})
-_HOMES = {"connect": "client", "SmartCamera": "client", "Layout": "layout"}
+_HOMES = {
+    "Backoff": "backoff",
+    "Layout": "layout",
+    "Observer": "observers",
+    "SmartCamera": "client",
+    "connect": "client",
+}
 
 
 def __getattr__(name: str) -> Any:

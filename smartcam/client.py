@@ -1,24 +1,21 @@
 """The camera as the user sees it.
 
-``open()`` starts one supervisor task, the client's only bare ``create_task``. It makes the session
-and then reads the link: every chunk goes to the :class:`~smartcam.inbox.Inbox`, which knows who
-waits for what. Commands stand here; each is a few messages out and a wait with a deadline.
+``open()`` starts the :class:`~smartcam.supervisor.Supervisor`, which makes sessions and reads their
+links: every chunk goes to the :class:`~smartcam.inbox.Inbox`, which knows who waits for what.
+Commands stand here; each is a few messages out and a wait with a deadline.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
-import logging
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
-from smartcam.conversation import Conversation, is_ready
+from smartcam.conversation import Conversation, TriggerRequest, is_ready
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectionClosedError,
-    ConnectionLostError,
     InterpretationError,
     LocalProtocolError,
     RemoteProtocolError,
@@ -26,28 +23,26 @@ from smartcam.exceptions import (
     SmartCamError,
     TriggerTimeoutError,
 )
-from smartcam.handshake import Session, establish
 from smartcam.inbox import Inbox
 from smartcam.interpretation import Interpretation
-from smartcam.models import CameraEvent, Connected, Disconnected, Result, Statistics, Status
+from smartcam.models import CameraEvent, Result, Statistics, Status
+from smartcam.observers import Observer, Observers
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
 from smartcam.protocols.framing import Frame
 from smartcam.settings import CameraOptions, CameraSettings
 from smartcam.streams import Subscription
+from smartcam.supervisor import Supervisor
 from smartcam.turns import Turns
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
+    from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterable
     from types import TracebackType
     from typing import Literal, Self, Unpack
 
-    from smartcam.connection import Link, TraceEntry
     from smartcam.protocols.base import Dialect
 
 __all__ = ["SmartCamera", "connect"]
-
-logger: logging.Logger = logging.getLogger("smartcam.client")
 
 DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
@@ -55,12 +50,16 @@ DEFAULT_MAX_QUEUE = 1024
 DEFAULT_TRIGGER_TIMEOUT = 5.0
 """Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
 
+DEFAULT_RECONNECT_TIMEOUT = 60.0
+"""Seconds for a session to be there again: a reboot takes about 30 (mvBlueGEMINI manual p. 31,
+published for the sibling)."""
+
 
 def connect(
     url: str,
     *,
     model: str | None = None,
-    trace: Callable[[TraceEntry], None] | None = None,
+    observers: Iterable[Observer] = (),
     **options: Unpack[CameraOptions],
 ) -> SmartCamera:
     """Return a camera to be opened with ``async with`` (or ``await``).
@@ -69,42 +68,44 @@ def connect(
         url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
             pins the dialect; or a bare host together with ``model``.
         model: camera model, such as ``"BVS002C"``.
-        trace: called with every frame, see :class:`~smartcam.connection.TraceEntry`.
+        observers: see frames, events, results and errors:
+            :class:`~smartcam.observers.Observer`.
         **options: ``name``, ``application``, ``interpret_as``, ``y_down``, ``lenient``,
             ``connect_timeout``, ``connect_attempts``, ``switch_timeout``, ``request_timeout``,
-            ``close_timeout``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
+            ``close_timeout``, ``liveness_timeout``, ``reconnect``, ``restore``, ``max_length``: see
+            :class:`~smartcam.settings.CameraSettings`.
 
     Raises:
         ConfigurationError: an address or option cannot work; nothing was tried.
     """
-    return SmartCamera(CameraSettings.make(url, model, options), trace=trace)
+    return SmartCamera(CameraSettings.make(url, model, options), observers=observers)
 
 
 class SmartCamera:
     """A smart camera; made by :func:`connect`.
 
-    Used once: after :meth:`close`, or when the link is lost, make a new one. Every method that
-    talks to the camera raises :exc:`~smartcam.exceptions.ConnectionLostError` (with the first cause
-    chained) once the link is gone and :exc:`~smartcam.exceptions.ConnectionClosedError` before
-    ``open()`` and after ``close()``.
+    It outlives its links: one that is lost is made again as ``reconnect`` says. Until then every
+    method that talks to the camera raises :exc:`~smartcam.exceptions.ConnectionLostError` at once,
+    with the first cause chained; nothing is sent again by itself. Before ``open()`` and after
+    ``close()`` it is :exc:`~smartcam.exceptions.ConnectionClosedError`, and
+    :exc:`~smartcam.exceptions.ConnectionTakenError` once another client has taken the camera,
+    which ends this one. Then make a new one.
 
     Args:
         settings: validated options.
-        trace: called with every frame.
+        observers: see what happens.
     """
 
-    def __init__(
-        self, settings: CameraSettings, *, trace: Callable[[TraceEntry], None] | None = None
-    ) -> None:
+    def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
         self.settings = settings
-        self._trace = trace
-        self._inbox = Inbox(settings.name, self._interpretation(settings.interpret_as))
+        self._observers = Observers(observers)
+        self._inbox = Inbox(
+            settings.name, self._interpretation(settings.interpret_as), self._observers
+        )
         self._inbox.expected = settings.application
         self._talk = Conversation(self._inbox, settings.request_timeout)
-        self._supervisor: asyncio.Task[None] | None = None
-        self._opened: asyncio.Future[SmartCamError | None] | None = None
-        self._session: Session | None = None
         self._turns = Turns(self._talk, settings.switch_timeout)
+        self._supervisor = Supervisor(settings, self._talk, self._turns, self._observers)
 
     # ------------------------------------------------------------------ life
 
@@ -118,17 +119,10 @@ class SmartCamera:
 
         Cancellation: the link is dropped.
         """
-        if self._supervisor is not None or self._inbox.end is not None:
+        if self._supervisor.started or self._inbox.end is not None:
             raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
-        self._opened = asyncio.get_running_loop().create_future()
-        self._supervisor = asyncio.create_task(
-            self._supervise(), name=f"smartcam[{self.settings.address.host}].supervisor"
-        )
         try:
-            await asyncio.wait({self._opened})
-            error = self._opened.result()
-            if error is not None:
-                raise error
+            await self._supervisor.open()
             if self.settings.application is not None:
                 async with self._turns.hold(self.settings.switch_timeout) as deadline:
                     await self._talk.ensure(self.settings.application, deadline)
@@ -144,23 +138,23 @@ class SmartCamera:
         the camera's application and run state are left as they are.
         Cancellation: the link is dropped at once.
         """
-        supervisor, session = self._supervisor, self._session
-        try:
-            with contextlib.suppress(TimeoutError):  # another task's command may be in between
-                async with asyncio.timeout(self.settings.switch_timeout):
-                    await self._turns.settle()
-            self._inbox.fail(self._closed_error())
-            if session is not None:
-                await session.link.close(self.settings.close_timeout)
-        finally:
-            self._inbox.fail(self._closed_error())
-            if session is not None:
-                session.link.abort()
-            elif supervisor is not None:
-                supervisor.cancel()
-            if supervisor is not None:
-                await asyncio.wait({supervisor})
-            self._inbox.finish()
+        await self._supervisor.close()
+
+    async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
+        """Wait until there is a session, and what ``restore`` asks for is done.
+
+        Args:
+            timeout: seconds.
+
+        Raises:
+            ResponseTimeoutError: there was none in time; the last loss is told.
+            ConnectionLostError: ``reconnect`` is None, or it gave up.
+            ConnectionTakenError: another client has the camera.
+            ConnectionClosedError: not opened, or closed.
+
+        Cancellation: safe.
+        """
+        await self._supervisor.wait_connected(self._talk.deadline(timeout), timeout)
 
     async def __aenter__(self) -> Self:
         return await self.open()
@@ -186,23 +180,22 @@ class SmartCamera:
     @property
     def url(self) -> str:
         """Its address, with the dialect pinned once it was found out."""
-        address = self._session.address if self._session else self.settings.address
-        return address.url
+        return self._supervisor.address.url
 
     @property
     def connected(self) -> bool:
         """Whether there is a session."""
-        return self._session is not None and self._inbox.end is None
+        return self._supervisor.connected
 
     @property
     def status(self) -> Status:
-        """The last status the camera sent.
+        """The last status the camera sent; after a loss it is the one of before.
 
         Raises:
             ConnectionClosedError: there was no session yet.
         """
         if self._inbox.status is None:
-            raise self._closed_error()
+            raise self._supervisor.closed_error()
         return self._inbox.status
 
     @property
@@ -213,23 +206,13 @@ class SmartCamera:
     @property
     def protocol_version(self) -> int | None:
         """Version from the answer to Connect; None before ``open()``."""
-        return self._session.version if self._session else None
+        session = self._supervisor.session
+        return session.version if session is not None else None
 
     def statistics(self) -> Statistics:
-        """Return everything counted so far. The accounts balance at any time."""
-        inbox, session = self._inbox, self._session
-        counters = dataclasses.asdict(session.link.machine.counters) if session is not None else {}
-        return dataclasses.replace(
-            Statistics(),
-            received=inbox.received,
-            **inbox.fates,
-            **counters,
-            empty_slots=inbox.empty_slots,
-            overtriggers=inbox.overtriggers,
-            sessions=int(session is not None),
-            last_error=str(inbox.end) if isinstance(inbox.end, ConnectionLostError) else None,
-            subscribers=[s.statistics() for s in inbox.streams() if not s.ended],
-        )
+        """Return everything counted so far, over all sessions. The accounts balance at any time."""
+        streams = self._inbox.streams()
+        return self._inbox.account.statistics(s.statistics() for s in streams if not s.ended)
 
     # ------------------------------------------------------------------ streams and waits
 
@@ -241,6 +224,8 @@ class SmartCamera:
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[Result]:
         """Subscribe to everything the camera sends, triggered or not; subscribed when called.
+
+        The stream goes on over a reconnect; what the camera sent in between nobody got.
 
         A container that does not fit its layout is raised from the iterator as
         :exc:`~smartcam.exceptions.InterpretationError`; the iterator stays usable. Results of
@@ -275,7 +260,7 @@ class SmartCamera:
     ) -> Subscription[CameraEvent]:
         """Subscribe to what happens to the camera, in order.
 
-        The events are ``Connected``, ``Disconnected``, ``StatusChanged`` and
+        The events are ``Connected``, ``Disconnected``, ``Reconnected``, ``StatusChanged`` and
         ``ApplicationChanged``. Subscribe before :meth:`open` to see the first ones.
         """
         stream: Subscription[CameraEvent] = self._stream("events", 0.0, max_queue, overflow)
@@ -316,6 +301,8 @@ class SmartCamera:
     ) -> Coroutine[Any, Any, Result]:
         """Wait for the next result, whoever triggers it; registered when called, not when awaited.
 
+        One that is known to be of a trigger that was given up is not taken for it.
+
         ``waiting = camera.next_result(); start_conveyor(); result = await waiting``
 
         Args:
@@ -334,6 +321,7 @@ class SmartCamera:
 
     # ------------------------------------------------------------------ commands
 
+    @overload
     async def trigger(
         self,
         application: int | None = None,
@@ -342,11 +330,41 @@ class SmartCamera:
         input: bytes | None = None,
         timeout: float = DEFAULT_TRIGGER_TIMEOUT,
         when_busy: Literal["wait", "refuse"] = "wait",
-    ) -> Result:
+        results_per_trigger: None = None,
+    ) -> Result: ...
+
+    @overload
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: object = None,
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: int,
+    ) -> list[Result]: ...
+
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: object = None,
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: int | None = None,
+    ) -> Result | list[Result]:
         """Trigger one inspection and return its result.
 
         Waits until the camera waits for a trigger, then sends. One trigger at a time: a second
-        caller waits its turn, within its own ``timeout``.
+        caller waits its turn, within its own ``timeout``. A trigger is never sent twice.
+
+        Where the layout has an ``@sequence`` field, the run's number is set right before the
+        trigger, and only the container that carries it is the result. Otherwise, over TCP, an
+        earlier trigger that was given up is settled first: its result is awaited a moment, or made
+        impossible (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP without
+        ``@sequence`` a late result can pass for the next one's: nothing on the wire tells.
 
         Args:
             application: have this application running for this trigger, and go back to the present
@@ -356,9 +374,13 @@ class SmartCamera:
             input: input data for this inspection, sent right before the trigger.
             timeout: seconds, for the turn, the readiness and the result together.
             when_busy: ``refuse`` raises CameraBusyError instead of waiting for readiness.
+            results_per_trigger: how many results the application sends for a trigger (one for each
+                "send results" tool); they come as a list then. By default it is one, and more are
+                counted as ``extra_results``.
 
         Raises:
-            NotRunningError: the application is stopped (neither BUSY nor Running).
+            NotRunningError: the application is stopped (neither BUSY nor Running), or somebody
+                else stopped it during the inspection.
             TriggerTimeoutError: no result in time; it says what the status was. An application
                 that runs free never waits for a trigger and ends here, and so does a switch to
                 ``application`` that takes too long.
@@ -369,11 +391,13 @@ class SmartCamera:
                 of an earlier trigger without a result may still be queued in the camera; loading
                 an application (:meth:`switch_application`) empties its queue (inferred).
             InterpretationError: the result does not fit its layout.
-            WrongApplicationError: the result is another application's.
+            WrongApplicationError: the result is another application's, or another application is
+                active than the one that was named.
             CommandRejectedError: with ``application``: the camera does not have it.
+            ConnectionLostError: the link was lost; whether the camera got the trigger is unknown.
 
-        Cancellation: safe. A result still under way is made impossible (Stop, Query, Start) before
-        the next trigger, and counted as late if it comes.
+        Cancellation: safe. A result still under way is never taken for the next trigger's, and
+        counted as late if it comes.
         """
         interpretation = (
             self._inbox.interpretation
@@ -382,11 +406,25 @@ class SmartCamera:
         )
         if when_busy not in {"wait", "refuse"}:
             raise ConfigurationError(f"trigger: when_busy is 'wait' or 'refuse', not {when_busy!r}")
-        wait = when_busy == "wait"
+        wanted = 1 if results_per_trigger is None else results_per_trigger
+        if wanted < 1:
+            raise ConfigurationError(f"trigger: results_per_trigger is 1 or more, not {wanted}")
         data = None if input is None else bytes(input)
+        request = TriggerRequest(interpretation, data, wanted, when_busy == "wait")
+        called_at = datetime.now(UTC)
+        try:
+            results = await self._trigger(application, request, timeout)
+        except SmartCamError as error:
+            self._observers.error(self.name, error, called_at)
+            raise
+        return results[0] if results_per_trigger is None else results
+
+    async def _trigger(
+        self, application: int | None, request: TriggerRequest, timeout: float
+    ) -> list[Result]:
         try:
             async with self._turns.hold_in(application, timeout) as deadline:
-                return await self._talk.trigger(interpretation, data, deadline, wait=wait)
+                return await self._talk.trigger(request, deadline)
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
 
@@ -515,22 +553,31 @@ class SmartCamera:
     async def set_sequence_number(self, number: int) -> None:
         """Set the number of the next run (0 to 4294967295); nothing confirms it.
 
+        :meth:`trigger` takes it for the next run's where the layout has an ``@sequence`` field;
+        otherwise it picks numbers of its own there.
+
         Raises:
             LocalProtocolError: the number does not fit.
         """
         await self._tell(m.SetSequenceNumber(number=number))
+        self._inbox.attribution.give_number(number)
 
     async def reboot(self) -> None:
-        """Restart the camera; returns when the command is written.
+        """Restart the camera; returns when the session is over.
 
-        The link is lost then, and the camera is away for about 30 seconds (published for a
-        sibling). It comes back with the last application, stopped.
+        The camera is away for about 30 seconds then (published for a sibling) and comes back with
+        the last application, stopped. :meth:`wait_connected` waits for it.
+
+        Cancellation: the command may have been sent.
         """
-        await self._tell(m.Reboot())
         link = self._talk.require_link()
-        if link.machine.transport is Transport.UDP:
-            # no end of the link will tell that the session is over
-            link.abort(ConnectionResetError("the camera restarts"))
+        self._supervisor.restarts(link)
+        await self._tell(m.Reboot())
+        if link.machine.transport is Transport.TCP:
+            await link.wait_closed(self.settings.close_timeout)
+        # over UDP nothing tells that the session is over, and over TCP perhaps nothing in time
+        link.abort(ConnectionResetError("the camera restarts"))
+        self._inbox.fail(link.lost_error())
 
     async def request(
         self,
@@ -578,61 +625,6 @@ class SmartCamera:
             await self._talk.tell(message, deadline, answered=False)
         return None
 
-    # ------------------------------------------------------------------ the supervisor
-
-    async def _supervise(self) -> None:
-        """Make the session, read the link to its end, tell everybody."""
-        error: SmartCamError = self._closed_error()
-        try:
-            session = await establish(self.settings, self._trace)
-            self._adopt(session)
-            async with asyncio.TaskGroup() as self._turns.jobs:
-                self._tell_opener(None)
-                error = await self._read(session.link)
-                self._inbox.fail(error)  # ends the jobs' waits too
-        except SmartCamError as exc:
-            error = exc
-        except Exception as exc:  # nobody must wait for a dead supervisor
-            logger.exception("%s ! the supervisor failed", self.name)
-            cause = exc.exceptions[0] if isinstance(exc, ExceptionGroup) else exc
-            error = ConnectionLostError(f"{self.name}: {cause!r} in the client")
-            error.__cause__ = cause
-        finally:
-            self._turns.jobs = None
-            self._inbox.fail(error)
-            self._inbox.finish()
-            if self._session is not None:
-                self._session.link.abort()
-            self._tell_opener(error)
-
-    def _tell_opener(self, error: SmartCamError | None) -> None:
-        if self._opened is not None and not self._opened.done():
-            self._opened.set_result(error)
-
-    def _adopt(self, session: Session) -> None:
-        self._session, self._talk.link = session, session.link
-        logger.info("%s = connected to %s", self.name, session.address.url)
-        self._inbox.publish(
-            Connected(camera=self.name, at=datetime.now(UTC), url=session.address.url)
-        )
-        for chunk in session.early:
-            self._inbox.dispatch(chunk)
-
-    async def _read(self, link: Link) -> SmartCamError:
-        """Dispatch chunks until the link ends; return why it did."""
-        try:
-            while True:
-                self._inbox.dispatch(await link.receive())
-        except ConnectionLostError as error:
-            ours = isinstance(self._inbox.end, ConnectionClosedError)
-            reason = "closed by this side" if ours else str(error.__cause__)
-            if not ours:
-                logger.warning("! %s", error)
-            self._inbox.publish(
-                Disconnected(camera=self.name, at=datetime.now(UTC), reason=reason, expected=ours)
-            )
-            return error
-
     # ------------------------------------------------------------------ small helpers
 
     async def _tell(self, message: m.Message) -> None:
@@ -665,13 +657,6 @@ class SmartCamera:
             ) from exc
         finally:
             self._inbox.next_results.discard(future)
-
-    def _closed_error(self) -> ConnectionClosedError:
-        address = self.settings.address
-        state = "closed" if self._supervisor is not None else "not opened yet"
-        return ConnectionClosedError(
-            f"{self.name}: the connection is {state}", host=address.host, port=address.port
-        )
 
 
 def _as_named(dialect: Dialect, frame: Frame) -> m.Message:

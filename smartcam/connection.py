@@ -71,6 +71,11 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         name: the camera's name, for logs and errors.
         host: address of the camera.
         port: its port.
+        liveness_timeout: seconds after which the system, too, gives up a peer that acknowledges
+            nothing (TCP keep-alive and user timeout, where it has them); None for its own default.
+
+    Attributes:
+        heard_at: loop time of the last byte received.
     """
 
     def __init__(
@@ -80,12 +85,15 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         name: str,
         host: str,
         port: int,
+        liveness_timeout: float | None = None,
     ) -> None:
         self.machine = machine
         self.name = name
         self.host = host
         self.port = port
+        self._liveness_timeout = liveness_timeout
         self._loop = asyncio.get_running_loop()
+        self.heard_at: float = self._loop.time()
         self._transport: Any = None
         self._chunks: collections.deque[Chunk] = collections.deque()
         self._wakeup: asyncio.Future[None] | None = None
@@ -110,7 +118,7 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
             ConnectionLostError: the link is gone.
         """
         if self._closed.done() or self._loss is not None:
-            raise self._lost_error()
+            raise self.lost_error()
         try:
             for message in messages:
                 self.machine.send(message, answered=answered)
@@ -131,7 +139,7 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         """
         while not self._chunks:
             if self._loss is not None:
-                raise self._lost_error()
+                raise self.lost_error()
             self._wakeup = self._loop.create_future()
             try:
                 await self._wakeup
@@ -176,6 +184,21 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
             self._say_goodbye()
         self.abort(reason)
 
+    def lost_error(self) -> ConnectionLostError:
+        """Return what readers and writers are told when the link is gone."""
+        where = "" if self.name == self.peer else f" to {self.peer}"
+        error = ConnectionLostError(
+            f"{self.name}: the link{where} is gone: {self._loss}",
+            host=self.host,
+            port=self.port,
+        )
+        error.__cause__ = self._loss
+        return error
+
+    async def wait_closed(self, timeout: float) -> None:
+        """Wait until the link is over, ``timeout`` seconds at most."""
+        await asyncio.wait({self._closed}, timeout=timeout)
+
     @property
     def peer(self) -> str:
         """``host:port`` of the camera."""
@@ -190,14 +213,18 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         if sock is not None and self.machine.transport is Transport.TCP:
             # the camera sets it and advises it (SC manual p. 40: published)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if self._liveness_timeout is not None:
+                _keep_alive(sock, self._liveness_timeout)
 
     def data_received(self, data: bytes) -> None:
         """asyncio: bytes of a TCP link."""
+        self.heard_at = self._loop.time()
         self.machine.receive_data(data)
         self._enqueue()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""
+        self.heard_at = self._loop.time()
         if len(self._chunks) >= MAX_CHUNKS:
             self.machine.counters.ignored_frames += 1
             return
@@ -249,7 +276,7 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         events = self.machine.events()
         if not events or self._closing:
             return
-        self._chunks.append(Chunk(self._loop.time(), events))
+        self._chunks.append(Chunk(self.heard_at, events))
         last = events[-1]
         if isinstance(last, LinkFailed):
             self._lose(last.error)
@@ -278,16 +305,6 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         if self._wakeup is not None and not self._wakeup.done():
             self._wakeup.set_result(None)
 
-    def _lost_error(self) -> ConnectionLostError:
-        where = "" if self.name == self.peer else f" to {self.peer}"
-        error = ConnectionLostError(
-            f"{self.name}: the link{where} is gone: {self._loss}",
-            host=self.host,
-            port=self.port,
-        )
-        error.__cause__ = self._loss
-        return error
-
 
 async def open_link(
     dialect: Dialect,
@@ -298,6 +315,7 @@ async def open_link(
     name: str,
     max_length: int,
     trace: Callable[[TraceEntry], None] | None = None,
+    liveness_timeout: float | None = None,
 ) -> Link:
     """Open a link; bounded by the caller's deadline.
 
@@ -307,12 +325,28 @@ async def open_link(
     loop = asyncio.get_running_loop()
     tracer = _tracer(name, dialect, trace)
     machine = Machine(dialect, Role.CLIENT, transport, max_length=max_length, trace=tracer)
-    link = Link(machine, name=name, host=host, port=port)
+    link = Link(machine, name=name, host=host, port=port, liveness_timeout=liveness_timeout)
     if transport is Transport.TCP:
         await loop.create_connection(lambda: link, host, port)
     else:
         await loop.create_datagram_endpoint(lambda: link, remote_addr=(host, port))
     return link
+
+
+def _keep_alive(sock: socket.socket, timeout: float) -> None:
+    """Have the system end a link whose peer acknowledges nothing for ``timeout`` seconds."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    probe = max(1, round(timeout / 3))  # whole seconds, after that long and that often
+    options = {
+        "TCP_KEEPIDLE": probe,
+        "TCP_KEEPALIVE": probe,  # the same, where it is called so
+        "TCP_KEEPINTVL": probe,
+        "TCP_KEEPCNT": 2,
+        "TCP_USER_TIMEOUT": max(1, round(timeout * 1000)),  # milliseconds
+    }
+    for name, value in options.items():
+        if hasattr(socket, name):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 def _tracer(

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import contextlib
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
+from smartcam.attribution import PendingTrigger
 from smartcam.exceptions import (
     CameraBusyError,
     CameraFaultError,
@@ -26,19 +28,21 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
+    WrongApplicationError,
 )
-from smartcam.inbox import Inbox, PendingTrigger
 from smartcam.models import Status
 from smartcam.protocols import messages as m
+from smartcam.protocols.base import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.connection import Link
+    from smartcam.inbox import Inbox
     from smartcam.interpretation import Interpretation
     from smartcam.models import Result
 
-__all__ = ["Conversation"]
+__all__ = ["Conversation", "TriggerRequest"]
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -47,6 +51,26 @@ TIMER_RESOLUTION = 0.02
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
 """The id is a UINT32 on the wire (SC manual p. 34, published)."""
+
+LATE_GRACE = 0.25
+"""Seconds that a late result is waited for before it is made impossible: most are only a little
+late, and stopping and starting an application costs more."""
+
+
+class TriggerRequest(NamedTuple):
+    """What a trigger is to do.
+
+    Attributes:
+        interpretation: how to read its results.
+        input_data: sent right before it, None for none.
+        results: how many results it is to have.
+        wait: wait until the camera takes a trigger; else refuse where it does not.
+    """
+
+    interpretation: Interpretation
+    input_data: bytes | None
+    results: int
+    wait: bool
 
 
 def is_ready(status: Status) -> bool:
@@ -68,7 +92,7 @@ _WHY_READY = "; it does not while it inspects, and an application that runs free
 
 
 class Conversation:
-    """What is said to the camera over one session, step by step.
+    """What is said to the camera, step by step, over one link after the other.
 
     Args:
         inbox: the receiving half.
@@ -80,11 +104,17 @@ class Conversation:
         self._patience = patience
         self.name: str = inbox.name
         self.link: Link | None = None
-        self.wants_running: bool = False
+        self.wants_running: bool | None = None  # None: neither was asked for
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
         self._halted = False  # stopped by a trigger's fence that has not started it again yet
         self._unconfirmed = False  # a Start or Stop was sent, its status has not come
+
+    def begin(self, link: Link) -> None:
+        """A new session: nothing is owed on it, its status is heard."""
+        self.link = link
+        self._due.clear()
+        self._unconfirmed = False
 
     def require_link(self) -> Link:
         """Return the link.
@@ -232,12 +262,19 @@ class Conversation:
     async def start(self, deadline: float) -> None:
         """Enter run mode and wait until the camera reports it."""
         self.wants_running = True
-        await self._confirm(m.Start(), is_ready, deadline, "Running and not BUSY after Start")
-        self._halted = False
+        await self._enter_run_mode(deadline)
 
     async def stop(self, deadline: float) -> None:
         """Leave run mode and wait until the camera reports it."""
-        self.wants_running = self._halted = False
+        self.wants_running = False
+        await self._leave_run_mode(deadline)
+
+    async def _enter_run_mode(self, deadline: float) -> None:
+        await self._confirm(m.Start(), is_ready, deadline, "Running and not BUSY after Start")
+        self._halted = False
+
+    async def _leave_run_mode(self, deadline: float) -> None:
+        self._halted = False
         await self._halt(deadline)
 
     async def _halt(self, deadline: float) -> None:
@@ -268,6 +305,13 @@ class Conversation:
         due = max(deadline, asyncio.get_running_loop().time() + self._patience)
         await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline, due=due)
+
+    def ask_for_life(self, due: float) -> None:
+        """Send a Query unless one is open; its answer is owed until ``due`` (loop time)."""
+        if m.QueryAnswer not in self.inbox.answers:
+            self.require_link().send(m.Query())
+            self._due[m.QueryAnswer] = due
+            self.inbox.next_answer(m.QueryAnswer)
 
     async def query(self, deadline: float) -> int:
         """Return the active application.
@@ -305,14 +349,13 @@ class Conversation:
             code, active = 1, await self.query(deadline)
         else:
             if was_running:
-                await self.stop(deadline)
+                await self._leave_run_mode(deadline)
             request = m.SwitchApplication(application=application)
             answer = await self.ask(request, m.SwitchAnswer, deadline)
-            self.inbox.debt = None  # stopped, and the answer came behind whatever was under way
             code, active = answer.code, answer.application
         if code != 0 or active != application:
             if was_running and Status.RUNNING not in self.status:
-                await self.start(deadline)
+                await self._enter_run_mode(deadline)
             refusal = f"the camera refused to switch to application {application} (status {code})"
             if application == 0:
                 refusal = "no application may have the id 0"
@@ -330,61 +373,94 @@ class Conversation:
 
     # ------------------------------------------------------------------ trigger
 
-    async def trigger(
-        self,
-        interpretation: Interpretation,
-        input_data: bytes | None,
-        deadline: float,
-        *,
-        wait: bool,
-    ) -> Result:
-        """Wait until the camera takes a trigger, send it, return the result.
+    async def trigger(self, request: TriggerRequest, deadline: float) -> list[Result]:
+        """Wait until the camera takes a trigger, send it, return its results.
 
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
-        inbox, loop = self.inbox, asyncio.get_running_loop()
+        attribution = self.inbox.attribution
         self._raise_fault()
-        if input_data is not None and inbox.input_in_doubt:
+        if request.input_data is not None and self.inbox.input_in_doubt:
             raise InputContainerError(
                 f"{self.name}: input data of an earlier trigger, which had no result, may still be "
                 "queued in the camera and would be taken for this one's; switch_application() "
                 "empties the queue"
             )
-        if inbox.debt is not None:
+        await self._check_application(deadline)
+        numbering = request.interpretation.numbering(self.inbox.active)
+        # an older result shows by its number where each container has one
+        decided = numbering is not None and numbering.always
+        if attribution.debt is not None and not decided:
             await self._settle_debt(deadline)
-        await self._wait_for_trigger(deadline, wait=wait)
-        link = self.require_link()
-        outcome: asyncio.Future[Result] = loop.create_future()
-        sent_at = loop.time()
-        pending = inbox.pending = PendingTrigger(
-            outcome, interpretation, input_data is not None, sent_at, datetime.now(UTC)
+        await self._wait_for_trigger(deadline, wait=request.wait)
+        while attribution.unsettled and not decided and self._ordered:
+            await self._settle_others(deadline)
+            await self._wait_for_trigger(deadline, wait=request.wait)
+        pending = PendingTrigger(
+            asyncio.get_running_loop().create_future(),
+            request.interpretation,
+            request.input_data is not None,
+            asyncio.get_running_loop().time(),
+            datetime.now(UTC),
+            wanted=request.results,
+            number=attribution.take_number(numbering.highest) if numbering is not None else None,
+            # where each application has its own interpreter none is read with another's layout
+            application=None if request.interpretation.by_application else self.inbox.active,
         )
+        return await self._await_results(pending, request.input_data, deadline)
+
+    async def _await_results(
+        self, pending: PendingTrigger, input_data: bytes | None, deadline: float
+    ) -> list[Result]:
+        inbox, outcome, link = self.inbox, pending.outcome, self.require_link()
+        words: list[m.Message] = []
+        if pending.number is not None:
+            words.append(m.SetSequenceNumber(number=pending.number))
+        if input_data is not None:
+            inbox.input_in_doubt = True  # until its result is there
+            words.append(m.SetInput(data=input_data))
+        inbox.attribution.send(pending)
         try:
-            if input_data is not None:
-                inbox.input_in_doubt = True  # until its result is there
-                link.send(m.SetInput(data=input_data), m.Trigger())
-            else:
-                link.send(m.Trigger())
+            link.send(*words, m.Trigger())
             async with asyncio.timeout_at(deadline):
                 await link.drain()
                 return await outcome
         except TimeoutError as exc:
             if outcome.done() and not outcome.cancelled():
                 return outcome.result()
-            inbox.give_up(pending)
-            waited = deadline - sent_at
+            inbox.attribution.give_up(pending)
+            waited = deadline - pending.sent_at
+            came = f"{len(pending.results)} of {pending.wanted} results"
             raise TriggerTimeoutError(
-                f"{self.name}: no result within {round(waited, 2):g} s of the trigger; "
-                f"status: {self.status}",
+                f"{self.name}: {came if pending.results else 'no result'} within "
+                f"{round(waited, 2):g} s of the trigger; status: {self.status}",
                 waited=waited,
             ) from exc
         except asyncio.CancelledError:
             if not outcome.done() or outcome.cancelled():
-                inbox.give_up(pending)
+                inbox.attribution.give_up(pending)
             raise
         finally:
-            inbox.pending = None
+            inbox.attribution.pending = None
+
+    async def _check_application(self, deadline: float) -> None:
+        """See to it that the application that was named is the active one.
+
+        Raises:
+            WrongApplicationError: somebody else has switched; nothing was sent but a Query.
+        """
+        inbox = self.inbox
+        if inbox.expected is None or inbox.active == inbox.expected:
+            return
+        await self._fence(deadline)  # what is known may be old
+        if inbox.active != inbox.expected:
+            raise WrongApplicationError(
+                f"{self.name}: application {inbox.active} is active, somebody else has switched; "
+                f"{inbox.expected} was expected",
+                expected=inbox.expected,
+                got=inbox.active,
+            )
 
     async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
         """Wait until the camera takes a trigger, or say why it never will."""
@@ -418,18 +494,40 @@ class Conversation:
         if Status.SYSTEM_ERROR in self.status:
             raise CameraFaultError(f"{self.name}: the camera reports System Error")
 
-    async def _settle_debt(self, deadline: float) -> None:
-        """Make a result that may still come impossible: Stop voids it, a Query is the fence.
+    @property
+    def _ordered(self) -> bool:
+        return self.require_link().machine.transport is Transport.TCP
 
-        Source: that Stop voids the inspection under way is inferred. What comes before the
-        Query's answer came from before.
+    async def _settle_debt(self, deadline: float) -> None:
+        """Await the result of an earlier trigger, or make it impossible.
+
+        Stop voids the inspection under way, a Query is the fence: what comes before its answer
+        came from before.
+        Source: that Stop voids the inspection is inferred.
         """
+        attribution, now = self.inbox.attribution, asyncio.get_running_loop().time()
+        if not self._halted and Status.RUNNING in self.status:
+            grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
+            with contextlib.suppress(TimeoutError):
+                await self.inbox.wait_status(_is_decided, grace)
+            if attribution.debt is None:
+                return
         if self.runs:
             self._halted = True  # interrupted here, the next trigger does all of it again
             await self._halt(deadline)
             await self._fence(deadline)
-            await self.start(deadline)
-        self.inbox.debt = None
+            await self._enter_run_mode(deadline)
+        attribution.settled()
+
+    async def _settle_others(self, deadline: float) -> None:
+        """Have heard the result of an inspection that somebody else triggered."""
+        attribution = self.inbox.attribution
+        attribution.unsettled = False  # the next one may begin meanwhile
+        try:
+            await self._fence(deadline)
+        except BaseException:
+            attribution.unsettled = True
+            raise
 
     # ------------------------------------------------------------------ answers
 

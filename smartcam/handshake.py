@@ -170,6 +170,7 @@ async def attempt(
     max_length: int,
     trace: Callable[[TraceEntry], None] | None = None,
     disconnect_first: bool = True,
+    liveness_timeout: float | None = None,
 ) -> Session:
     """Make a session over one fresh link; bounded by the caller's deadline.
 
@@ -185,6 +186,7 @@ async def attempt(
         name=name,
         max_length=max_length,
         trace=trace,
+        liveness_timeout=liveness_timeout,
     )
     collector = _Collector(link)
     try:
@@ -247,6 +249,7 @@ async def establish(
                         max_length=settings.max_length,
                         trace=trace,
                         disconnect_first=disconnect_first,
+                        liveness_timeout=settings.liveness_timeout,
                     )
             except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
                 progress.end(exc, share)

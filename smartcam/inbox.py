@@ -8,18 +8,20 @@ to its trigger and to the streams. What the camera is known to be stands here to
 from __future__ import annotations
 
 import asyncio
-import collections
 import logging
 import weakref
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from smartcam.account import Account
+from smartcam.attribution import Attribution, PendingTrigger
 from smartcam.exceptions import (
     CameraFaultError,
     ConnectionClosedError,
     InputContainerError,
     InterpretationError,
+    NotRunningError,
     OvertriggeredError,
     SmartCamError,
     WrongApplicationError,
@@ -38,34 +40,14 @@ if TYPE_CHECKING:
 
     from smartcam.connection import Chunk
     from smartcam.interpretation import Interpretation
+    from smartcam.observers import Observers
     from smartcam.streams import Subscription
 
-__all__ = ["Inbox", "PendingTrigger"]
+__all__ = ["Inbox"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 Answer = m.Message | SmartCamError
-
-
-@dataclass(slots=True)
-class PendingTrigger:
-    """The trigger under way.
-
-    Attributes:
-        outcome: gets the result or the error.
-        interpretation: how to read its result.
-        has_input: input data was sent with it.
-        sent_at: loop time.
-        triggered_at: wall clock, UTC.
-        came: its result came when nobody waited any more.
-    """
-
-    outcome: asyncio.Future[Result]
-    interpretation: Interpretation
-    has_input: bool
-    sent_at: float
-    triggered_at: datetime
-    came: bool = False
 
 
 @dataclass(slots=True)
@@ -75,40 +57,46 @@ class _StatusWaiter:
 
 
 class Inbox:
-    """The receiving half of a client.
+    """The receiving half of a client, over all its sessions.
 
     Args:
         name: the camera's name.
         interpretation: how to read results that no trigger reads otherwise.
+        observers: who else wants to know.
     """
 
-    def __init__(self, name: str, interpretation: Interpretation) -> None:
+    def __init__(self, name: str, interpretation: Interpretation, observers: Observers) -> None:
         self.name = name
         self.interpretation = interpretation
-        self.end: SmartCamError | None = None
+        self.end: SmartCamError | None = None  # why there is no session
         # what the camera is known to be
         self.status: Status | None = None
         self.endian: int = 0
         self.active: int | None = None
         self.expected: int | None = None  # the application that was named, if any
         # who waits for what
-        self.pending: PendingTrigger | None = None
-        self.debt: Literal["late", "streamed"] | None = None  # fate of the result still to come
+        self.attribution: Attribution = Attribution()
         # the input data of a trigger without a result may still be queued in the camera
         self.input_in_doubt: bool = False
         # by the answer's type; by id for a message that the dialect does not know
         self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
         # weak: a waiter that was made and never awaited must not count as a listener
         self.next_results: weakref.WeakSet[asyncio.Future[Result]] = weakref.WeakSet()
-        self._status_waiters: list[_StatusWaiter] = []
         self.result_streams: weakref.WeakSet[Subscription[Result]] = weakref.WeakSet()
         self.status_streams: weakref.WeakSet[Subscription[Status]] = weakref.WeakSet()
         self.event_streams: weakref.WeakSet[Subscription[CameraEvent]] = weakref.WeakSet()
-        # the account
-        self.fates: collections.Counter[str] = collections.Counter()
-        self.received: int = 0
-        self.empty_slots: int = 0
-        self.overtriggers: int = 0
+        self.account: Account = Account()
+        self._observers = observers
+        self._status_waiters: list[_StatusWaiter] = []
+        self._asked_at: dict[object, float] = {}
+        self._heard_status = False  # in this session
+        self._warned_extra = False
+
+    def begin(self, *, ordered: bool) -> None:
+        """A new session; ``ordered`` where messages come in order and none is lost (TCP)."""
+        self.end = None
+        self._heard_status = self._warned_extra = False
+        self.attribution.begin_session(ordered=ordered)
 
     # ------------------------------------------------------------------ from the receive task
 
@@ -119,30 +107,27 @@ class Inbox:
             match event:
                 case m.ResultContainer():
                     self._on_result(event, chunk.received_at, at)
-                    self._on_answer(m.ResultContainer, event)
                 case m.StatusReport():
                     self._on_status(event, chunk.received_at, at)
-                    self._on_answer(m.StatusReport, event)
-                case m.UnknownMessage():
-                    self._on_answer(event.message_id, event)
                 case m.QueryAnswer():
                     self.set_active(event.application, at)
-                    self._on_answer(type(event), event)
                 case m.SwitchAnswer():
                     if event.code == 0:
                         self.expected = event.application
                         self.input_in_doubt = False
+                        self.attribution.settled()
                     self.set_active(event.application, at)
-                    self._on_answer(type(event), event)
                 case m.Message():
-                    self._on_answer(type(event), event)
+                    pass
                 case _:
-                    pass  # LinkFailed and LinkEnded: the link tells its reader when it is drained
+                    continue  # LinkFailed and LinkEnded: the link tells its reader when drained
+            self._on_answer(event, chunk.received_at)
 
     def fail(self, error: SmartCamError) -> None:
-        """The session is over: tell everybody who waits, and everybody who comes later.
+        """The session is over: tell everybody who waits, and who comes before the next one.
 
-        The first reason stays. Streams go on until :meth:`finish`.
+        The first reason stays. Streams go on until :meth:`finish`. What the trigger under way
+        would have given may come in the next session: it is owed.
         """
         if self.end is not None:
             return
@@ -150,10 +135,13 @@ class Inbox:
         for answer in self.answers.values():
             answer.set_result(error)
         self.answers.clear()
-        waiting: list[asyncio.Future[Result] | asyncio.Future[Status]] = [*self.next_results]
+        self._asked_at.clear()
+        waiting: list[asyncio.Future[Any]] = [*self.next_results]
         waiting += [waiter.outcome for waiter in self._status_waiters]
-        if self.pending is not None:
-            waiting.append(self.pending.outcome)
+        pending = self.attribution.pending
+        if pending is not None and not pending.outcome.done():
+            self.attribution.give_up(pending)
+            waiting.append(pending.outcome)
         for future in waiting:
             if not future.done():
                 future.set_exception(error)
@@ -173,8 +161,11 @@ class Inbox:
 
     def next_answer(self, key: type[m.Message] | int) -> asyncio.Future[Answer]:
         """Register for the next answer of this kind; errors come as a result, never raised."""
-        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[Answer] = loop.create_future()
         self.answers[key] = future
+        if key is not m.SwitchAnswer:  # it takes its time, which is no round trip
+            self._asked_at[key] = loop.time()
         return future
 
     async def wait_status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
@@ -199,11 +190,6 @@ class Inbox:
             if waiter in self._status_waiters:
                 self._status_waiters.remove(waiter)
 
-    def give_up(self, pending: PendingTrigger) -> None:
-        """Its caller waits no more; a result that still comes is late."""
-        if not pending.came:
-            self.debt = "late"
-
     def set_active(self, application: int, at: datetime) -> None:
         """Note which application is active."""
         previous, self.active = self.active, application
@@ -217,25 +203,30 @@ class Inbox:
     def publish(self, event: CameraEvent) -> None:
         """Hand an event to its subscribers."""
         logger.debug("%s = %s", self.name, event)
+        self._observers.state(event)
         for stream in tuple(self.event_streams):
             stream.offer(event, 0.0)
 
     # ------------------------------------------------------------------ inside
 
-    def _on_answer(self, key: type[m.Message] | int, message: m.Message) -> None:
+    def _on_answer(self, message: m.Message, now: float) -> None:
+        key = message.message_id if isinstance(message, m.UnknownMessage) else type(message)
         future = self.answers.pop(key, None)
         if future is not None:
+            asked_at = self._asked_at.pop(key, None)
+            if asked_at is not None:
+                self.account.round_trip.add(now - asked_at)
             future.set_result(message)
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
-        previous, status = self.status, report.status
-        self.status, self.endian = status, report.endian
-        risen = Status(status.value & ~(previous.value if previous is not None else 0))
-        if Status.OVERTRIGGERED in risen:
-            self.overtriggers += 1
-        self._fail_trigger(risen)
-        if status != previous:
-            self.publish(StatusChanged(camera=self.name, at=at, status=status, previous=previous))
+        before, status = self.status, report.status
+        previous = before if self._heard_status else None
+        self.status, self.endian, self._heard_status = status, report.endian, True
+        self._note_changes(Status(0) if previous is None else previous, status)
+        self._fail_trigger(Status(0) if previous is None else previous, status)
+        self.attribution.on_status(previous, status)
+        if status != before:
+            self.publish(StatusChanged(camera=self.name, at=at, status=status, previous=before))
         for stream in tuple(self.status_streams):
             stream.offer(status, now)
         for waiter in tuple(self._status_waiters):
@@ -247,11 +238,23 @@ class Inbox:
             except Exception as exc:  # noqa: BLE001 - the user's predicate: its caller gets it
                 waiter.outcome.set_exception(exc)
 
-    def _fail_trigger(self, risen: Status) -> None:
-        """End the trigger under way where a status bit says that its result cannot be trusted."""
-        pending = self.pending
+    def _note_changes(self, previous: Status, status: Status) -> None:
+        risen, fallen = status & ~previous, previous & ~status
+        if Status.OVERTRIGGERED in risen:
+            self.account.overtriggers += 1
+        if Status.OVERHEAT in risen:
+            logger.warning("%s ! the camera is too hot: inspections may get worse", self.name)
+        if Status.OVERHEAT in fallen:
+            logger.info("%s = the camera is no longer too hot", self.name)
+        if Status.SYSTEM_ERROR in risen:
+            logger.error("%s ! the camera reports System Error", self.name)
+
+    def _fail_trigger(self, previous: Status, status: Status) -> None:
+        """End the trigger under way where the status says that its result cannot be trusted."""
+        pending = self.attribution.pending
         if pending is None or pending.outcome.done():
             return
+        risen, fallen = status & ~previous, previous & ~status
         error: SmartCamError | None = None
         if Status.SYSTEM_ERROR in risen:
             error = CameraFaultError(f"{self.name}: the camera reports System Error")
@@ -265,39 +268,62 @@ class Inbox:
                 f"{self.name}: input data and inspections are out of step: "
                 "the result would not belong to this input"
             )
+        elif Status.RUNNING in fallen:
+            error = NotRunningError(
+                f"{self.name}: somebody else stopped application {self.active} during the "
+                f"inspection, which voids it; status: {status}"
+            )
         if error is not None:
-            self.debt = "streamed"  # a result may still come, and it is nobody's
+            self.attribution.give_up(pending, "streamed")  # what still comes is nobody's
             pending.outcome.set_exception(error)
 
     def _on_result(self, container: m.ResultContainer, now: float, at: datetime) -> None:
-        self.received += 1
-        pending = self.pending if self.pending and not self.pending.outcome.done() else None
-        if self.expected is not None and container.application != self.expected:
-            self.fates["wrong_application"] += 1
+        account, attribution = self.account, self.attribution
+        account.received += 1
+        pending = attribution.pending
+        if pending is not None and pending.outcome.done():
+            pending = None
+        expected = self.expected
+        if expected is None and pending is not None:
+            expected = pending.application
+        self.set_active(container.application, at)
+        if expected is not None and container.application != expected:
+            account.fates["wrong_application"] += 1
             if pending is not None:
-                self.debt = "late"  # ours may still come
-                pending.outcome.set_exception(self._wrong_application(container))
+                attribution.give_up(pending)  # ours may still come
+                pending.outcome.set_exception(self._wrong_application(container, expected))
             return
-        if self.expected is None:
-            self.set_active(container.application, at)
-        fate = "triggered"
-        if pending is None:
-            if self.pending is not None and self.pending.outcome.cancelled():
-                self.debt, self.pending.came = "late", True  # its caller was not woken yet
-            listening = self._listening()
-            fate = self.debt or ("streamed" if listening else "unclaimed")
-            self.debt = None
-            if not listening:
-                self.fates[fate] += 1
-                return
+        numbering = attribution.numbering
+        number = numbering.number(container, self.endian) if numbering is not None else None
+        verdict = attribution.judge(number)
+        if verdict.extra:
+            self._note_extra()
+        owner = pending if verdict.fate == "triggered" else None
+        listening = self._listening()
+        fate: str = verdict.fate
+        if fate == "nobody":
+            fate = "streamed" if listening else "unclaimed"
+        if owner is None and not listening:
+            account.fates[fate] += 1
+            return
         try:
-            result = self._interpret(container, pending, now, at)
+            result = self._interpret(container, owner, now, at)
         except InterpretationError as error:
-            self.fates["late" if fate == "late" else "uninterpretable"] += 1
-            self._deliver(error, pending, now)
+            account.fates["late" if fate == "late" else "uninterpretable"] += 1
+            self._deliver_error(error, owner, now)
         else:
-            self.fates[fate] += 1
-            self._deliver(result, pending, now)
+            account.fates[fate] += 1
+            self._deliver(result, owner, now, current=verdict.fate in {"triggered", "nobody"})
+
+    def _note_extra(self) -> None:
+        self.account.extra_results += 1
+        if not self._warned_extra:
+            self._warned_extra = True
+            logger.warning(
+                "%s ! the application sends more than one result for a trigger; "
+                "results_per_trigger= takes them all",
+                self.name,
+            )
 
     def _listening(self) -> bool:
         return any(not stream.ended for stream in self.result_streams) or any(
@@ -305,44 +331,74 @@ class Inbox:
         )
 
     def _interpret(
-        self, container: m.ResultContainer, pending: PendingTrigger | None, now: float, at: datetime
+        self, container: m.ResultContainer, owner: PendingTrigger | None, now: float, at: datetime
     ) -> Result:
-        interpretation = pending.interpretation if pending is not None else self.interpretation
-        done = interpretation(container, self.endian, camera=self.name, number=self.received, at=at)
-        self.empty_slots += done.empty_slots
+        interpretation = owner.interpretation if owner is not None else self.interpretation
+        number = self.account.received
+        done = interpretation(container, self.endian, camera=self.name, number=number, at=at)
+        self.account.empty_slots += done.empty_slots
         return Result(
             camera=self.name,
             application=container.application,
             sequence=done.sequence,
-            number=self.received,
-            triggered_at=pending.triggered_at if pending is not None else None,
+            number=number,
+            triggered_at=owner.triggered_at if owner is not None else None,
             received_at=at,
-            latency=now - pending.sent_at if pending is not None else None,
+            latency=now - owner.sent_at if owner is not None else None,
             raw=container.data,
             value=done.value,
         )
 
     def _deliver(
-        self, result: Result | InterpretationError, pending: PendingTrigger | None, now: float
+        self, result: Result, owner: PendingTrigger | None, now: float, *, current: bool
     ) -> None:
-        if pending is not None and pending.has_input:
-            self.input_in_doubt = False
+        """Hand a result on; ``current`` where it is not known to be an older trigger's."""
+        self._observers.result(result)
         for stream in tuple(self.result_streams):
             stream.offer(result, now)
-        waiting = tuple(self.next_results)
-        self.next_results.clear()
-        for future in (*waiting, pending.outcome) if pending is not None else waiting:
-            if future.done():
-                continue
-            if isinstance(result, InterpretationError):
-                future.set_exception(result)
-            else:
+        if current:
+            for future in self._take_next_results():
                 future.set_result(result)
+        if owner is not None:
+            owner.results.append(result)
+            if len(owner.results) == owner.wanted:
+                self._end_input_doubt(owner)
+                self.account.processing.add(now - owner.sent_at)
+                self.attribution.done(owner)
+                owner.outcome.set_result(owner.results)
 
-    def _wrong_application(self, container: m.ResultContainer) -> WrongApplicationError:
+    def _deliver_error(
+        self, error: InterpretationError, owner: PendingTrigger | None, now: float
+    ) -> None:
+        for stream in tuple(self.result_streams):
+            stream.offer(error, now)
+        for future in self._take_next_results():
+            future.set_exception(error)
+        if owner is None:
+            self._observers.error(self.name, error)
+            return
+        self._end_input_doubt(owner)
+        if owner.number is not None or owner.wanted > 1:
+            self.attribution.give_up(owner)  # its own may still come
+        else:
+            self.attribution.done(owner)
+        owner.outcome.set_exception(error)
+
+    def _end_input_doubt(self, owner: PendingTrigger) -> None:
+        if owner.has_input:
+            self.input_in_doubt = False
+
+    def _take_next_results(self) -> list[asyncio.Future[Result]]:
+        waiting = [future for future in self.next_results if not future.done()]
+        self.next_results.clear()
+        return waiting
+
+    def _wrong_application(
+        self, container: m.ResultContainer, expected: int
+    ) -> WrongApplicationError:
         return WrongApplicationError(
             f"{self.name}: a result of application {container.application} came, "
-            f"application {self.expected} was expected",
-            expected=self.expected,
+            f"application {expected} was expected",
+            expected=expected,
             got=container.application,
         )

@@ -39,12 +39,28 @@ def byte_order(endian: int) -> ByteOrder:
     )
 
 
+MAX_NUMBER = (1 << 31) - 1
+"""Largest sequence number of ours: an int32 in the container holds it."""
+
+
 class Interpreted(NamedTuple):
     """What came of a container: value, sequence number if the layout has one, empty slots."""
 
     value: Any
     sequence: int | None
     empty_slots: int
+
+
+class Numbering(NamedTuple):
+    """How a layout carries the sequence number.
+
+    Attributes:
+        highest: the largest number that its field holds, at most 2^31 - 1.
+        always: whether each container has it; not where it stands in a record that may be missing.
+    """
+
+    highest: int
+    always: bool
 
 
 class Interpretation:
@@ -75,6 +91,36 @@ class Interpretation:
         else:
             self._one = resolve(spec, lenient=lenient)
 
+    @property
+    def by_application(self) -> bool:
+        """Whether each application has its own interpreter."""
+        return self._one is None
+
+    def numbering(self, application: int | None) -> Numbering | None:
+        """Return how this application's containers carry the sequence number, None if not."""
+        interpreter = self._interpreter(application)
+        layout = interpreter.layout if interpreter is not None else None
+        field = layout.sequence_field if layout is not None else None
+        if layout is None or field is None or field.wire.high is None:
+            return None
+        always = field in layout.head or layout.repeat is None
+        return Numbering(min(field.wire.high, MAX_NUMBER), always)
+
+    def number(self, container: ResultContainer, endian: int) -> int | None:
+        """Return a container's sequence number, None where it has none or does not fit."""
+        interpreter = self._interpreter(container.application)
+        if interpreter is None or interpreter.layout is None:
+            return None
+        try:
+            return interpreter.layout.sequence(container.data, byte_order(endian))
+        except InterpretationError:
+            return None
+
+    def _interpreter(self, application: int | None) -> Interpreter | None:
+        if self._one is not None or application is None:
+            return self._one
+        return self._by_application.get(application)
+
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
     ) -> Interpreted:
@@ -84,7 +130,7 @@ class Interpretation:
             InterpretationError: it does not fit.
             WrongApplicationError: the mapping does not know its application.
         """
-        interpreter = self._one or self._by_application.get(container.application)
+        interpreter = self._interpreter(container.application)
         if interpreter is None:
             known = sorted(self._by_application)
             raise WrongApplicationError(

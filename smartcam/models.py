@@ -25,6 +25,7 @@ __all__ = [
     "Connected",
     "Disconnected",
     "Header",
+    "Histogram",
     "Localization",
     "Pose",
     "Position",
@@ -212,14 +213,14 @@ class Connected(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reconnected(CameraEvent):
-    """A later session is there."""
+    """A later session is there, and which application is active was asked again."""
 
     url: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disconnected(CameraEvent):
-    """The session ended; ``reason`` says why, ``expected`` whether we closed it."""
+    """The session ended; ``reason`` says why, ``expected`` whether this side wanted it so."""
 
     reason: str
     expected: bool
@@ -262,9 +263,43 @@ class SubscriberStatistics:
     queued: int
 
 
+@dataclass(frozen=True, slots=True)
+class Histogram:
+    """How often a time fell into each of a row of bins.
+
+    Attributes:
+        bounds: upper bounds of the bins, seconds, each included; a last bin has none.
+        counts: how many there were in each bin; one more than bounds.
+        total: sum of all times, seconds.
+        shortest: the shortest one, seconds; None before the first.
+        longest: the longest one, seconds; None before the first.
+    """
+
+    bounds: tuple[float, ...]
+    counts: tuple[int, ...]
+    total: float = 0.0
+    shortest: float | None = None
+    longest: float | None = None
+
+    @property
+    def count(self) -> int:
+        """How many there were in all."""
+        return sum(self.counts)
+
+
+HISTOGRAM_BOUNDS = tuple(
+    round(step * 10.0**decade, 9) for decade in range(-4, 2) for step in (1, 2, 5)
+)
+"""Upper bounds of the bins, seconds: 0.1 ms to 50 s, three in a decade."""
+
+
+def _empty_histogram() -> Histogram:
+    return Histogram(HISTOGRAM_BOUNDS, (0,) * (len(HISTOGRAM_BOUNDS) + 1))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statistics:
-    """Everything counted since the client was made.
+    """Everything counted since the client was made, over all its sessions.
 
     Each result container that arrives has exactly one fate, so ``received == triggered +
     streamed + late + wrong_application + uninterpretable + unclaimed``.
@@ -278,17 +313,23 @@ class Statistics:
         uninterpretable: does not fit its layout.
         unclaimed: nobody had triggered it and nobody was listening.
         empty_slots: all-zero records skipped by interpreters.
+        extra_results: containers that came for a trigger which had its results already; they are
+            counted as streamed or unclaimed too.
         overtriggers: times the Overtriggered bit rose.
         sessions: sessions made.
+        reconnects: sessions made after the first.
         frames_received: whole frames from the camera.
         frames_sent: frames to the camera.
         bytes_received: bytes from the camera.
         bytes_sent: bytes to the camera.
-        ignored_frames: frames or datagrams that were dropped as broken.
+        ignored_datagrams: datagrams that were dropped as broken, or because they came faster than
+            the client could read; on TCP a broken frame ends the link.
         unknown_ids: messages with an id that the dialect does not know.
         unexpected_messages: answers nobody waited for any more.
         long_bodies: known messages whose body was longer than documented.
-        last_error: text of the last error of the link, or None.
+        last_error: text of the last error of a link, or None.
+        round_trip: seconds from a request to its answer; a switch, which takes its time, left out.
+        processing: seconds from a trigger to its result.
         subscribers: accounts of the living subscribers.
     """
 
@@ -300,17 +341,21 @@ class Statistics:
     uninterpretable: int = 0
     unclaimed: int = 0
     empty_slots: int = 0
+    extra_results: int = 0
     overtriggers: int = 0
     sessions: int = 0
+    reconnects: int = 0
     frames_received: int = 0
     frames_sent: int = 0
     bytes_received: int = 0
     bytes_sent: int = 0
-    ignored_frames: int = 0
+    ignored_datagrams: int = 0
     unknown_ids: int = 0
     unexpected_messages: int = 0
     long_bodies: int = 0
     last_error: str | None = None
+    round_trip: Histogram = field(default_factory=_empty_histogram)
+    processing: Histogram = field(default_factory=_empty_histogram)
     subscribers: list[SubscriberStatistics] = field(default_factory=list[SubscriberStatistics])
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, cast
 from urllib.parse import parse_qsl, urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError
 
+from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.registry import PROTOCOLS
 
@@ -142,6 +143,9 @@ class CameraOptions(TypedDict, total=False):
     switch_timeout: float
     request_timeout: float
     close_timeout: float
+    liveness_timeout: float | None
+    reconnect: Backoff | None
+    restore: bool
     max_length: int
 
 
@@ -167,6 +171,17 @@ class CameraSettings(BaseModel):
     switch_timeout: Seconds = Field(10.0, description="for a switch until the camera is ready")
     request_timeout: Seconds = Field(5.0, description="for the answer to a request")
     close_timeout: Seconds = Field(1.0, description="for an orderly end of the link")
+    liveness_timeout: Seconds | None = Field(
+        5.0, description="until a camera that gives no sign of life counts as gone; None: never"
+    )
+    reconnect: InstanceOf[Backoff] | None = Field(
+        Backoff(), description="when a lost camera is tried again; None: never"
+    )
+    restore: bool = Field(
+        False,
+        description="after a reconnect have the named application and the run state back that "
+        "were wanted; else they are left as the camera has them",
+    )
     max_length: int = Field(
         1 << 20, ge=16, le=1 << 30, description="largest payload accepted, bytes"
     )

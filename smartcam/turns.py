@@ -1,7 +1,8 @@
 """Whose turn it is: one command at a time, and going back after a temporary switch.
 
-Going back to the application before is a job of the supervisor's task group: it is finished even
-when the caller was cancelled, it is bounded, and every later command waits for it.
+Going back to the application before is a job of the session's task group: it is finished even
+when the caller was cancelled, it is bounded, and every later command waits for it. One that a lost
+link prevented is done first thing in the next session; so is restoring what was wanted.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam.exceptions import ResponseTimeoutError, SmartCamError
+from smartcam.exceptions import LinkError, ResponseTimeoutError, SmartCamError
 from smartcam.models import Status
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
+    from collections.abc import AsyncGenerator, Coroutine
+    from typing import Any
 
     from smartcam.conversation import Conversation
 
@@ -33,11 +35,13 @@ class Before:
         application: id of the application that was active.
         running: whether it ran.
         expected: the application that was named, if any.
+        wants_running: the run state that was asked for, if any.
     """
 
     application: int
     running: bool
     expected: int | None
+    wants_running: bool | None
 
 
 class Turns:
@@ -49,12 +53,41 @@ class Turns:
     """
 
     def __init__(self, talk: Conversation, switch_timeout: float) -> None:
-        self.jobs: asyncio.TaskGroup | None = None
+        self._jobs: asyncio.TaskGroup | None = None  # of the session, None between two
+        self._owed: Before | None = None  # to go back to in the next session
         self._talk = talk
         self._switch_timeout = switch_timeout
         self._lock = asyncio.Lock()
         self._leaving: set[asyncio.Task[None]] = set()
         self._failed: SmartCamError | None = None
+
+    # ------------------------------------------------------------------ for the supervisor
+
+    @contextlib.asynccontextmanager
+    async def session(self, *, restore: bool) -> AsyncGenerator[None]:
+        """A session is there as long as the body runs; ends when its jobs have.
+
+        Args:
+            restore: have the application and the run state again that were wanted.
+        """
+        async with asyncio.TaskGroup() as self._jobs:
+            try:
+                owed, self._owed = self._owed, None
+                if owed is not None:
+                    self.leave(owed)
+                elif restore:
+                    self._start_job("restoring", self._restore())
+                yield
+            finally:
+                self._jobs = None
+
+    async def vacated(self) -> None:
+        """Wait until every command of the session that is over has noticed; bounded."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._switch_timeout), self._lock:
+                pass
+
+    # ------------------------------------------------------------------ for commands
 
     @contextlib.asynccontextmanager
     async def hold(self, timeout: float) -> AsyncGenerator[float]:
@@ -75,6 +108,7 @@ class Turns:
                 waited=timeout,
             ) from exc
         try:
+            self._talk.require_link()  # it may have been lost meanwhile
             self._raise_failed()
             await self._talk.catch_up(deadline)
             yield deadline
@@ -106,7 +140,8 @@ class Turns:
         """Have ``application`` running; the turn is held. Goes back where that fails."""
         running = self._talk.runs
         active = await self._talk.query(deadline)
-        before = Before(active, running, self._talk.inbox.expected)
+        talk = self._talk
+        before = Before(active, running, talk.inbox.expected, talk.wants_running)
         try:
             await self._talk.ensure(application, deadline)
         except BaseException:
@@ -115,14 +150,23 @@ class Turns:
         return before
 
     def leave(self, before: Before) -> asyncio.Task[None] | None:
-        """Let the supervisor go back as soon as the turn is free; None if the session is over."""
-        if self.jobs is None or self._talk.inbox.end is not None:
+        """Go back as soon as the turn is free; in the next session, and None, where there is none.
+
+        Whoever left first is done last: of several that are owed the outermost counts.
+        """
+        if self._jobs is None or self._talk.inbox.end is not None:
+            self._owe(before)
             return None
-        name = f"smartcam[{self._talk.name}].going_back"
-        job = self.jobs.create_task(self._go_back(before), name=name)
-        self._leaving.add(job)
-        job.add_done_callback(self._leaving.discard)
-        return job
+        return self._start_job("going_back", self._go_back(before))
+
+    def _start_job(self, what: str, job: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
+        if self._jobs is None:
+            job.close()
+            return None
+        task = self._jobs.create_task(job, name=f"smartcam[{self._talk.name}].{what}")
+        self._leaving.add(task)
+        task.add_done_callback(self._leaving.discard)
+        return task
 
     async def leave_and_wait(self, before: Before) -> None:
         """Go back, and raise what stood in the way.
@@ -143,23 +187,56 @@ class Turns:
         while self._leaving:
             await asyncio.wait(self._leaving)
 
+    def _owe(self, before: Before) -> None:
+        """Keep what the next session is to go back to."""
+        self._owed = before
+        self._talk.inbox.expected = before.expected
+        self._talk.wants_running = before.wants_running
+
     async def _go_back(self, before: Before) -> None:
         """Restore application and run state; never raises."""
         talk = self._talk
         async with self._lock:
-            deadline = talk.deadline(self._switch_timeout)
             try:
-                if await talk.query(deadline) != before.application:
-                    await talk.switch(before.application, deadline, start=before.running)
-                elif before.running and Status.RUNNING not in talk.status:
-                    await talk.start(deadline)
-                elif not before.running and Status.RUNNING in talk.status:
-                    await talk.stop(deadline)
+                await self._have(before.application, before.running)
             except SmartCamError as error:
                 logger.warning("%s ! going back failed: %s", talk.name, error)
-                self._failed = error
+                if isinstance(error, LinkError):
+                    self._owe(before)
+                else:
+                    self._failed = error
             finally:
                 talk.inbox.expected = before.expected
+                talk.wants_running = before.wants_running
+
+    async def _restore(self) -> None:
+        """Have the application that was named, and the run state that was asked for; never raises.
+
+        Where the link is lost again the next session does it.
+        """
+        talk = self._talk
+        wanted = talk.inbox.expected, talk.wants_running
+        async with self._lock:
+            try:
+                await self._have(*wanted)
+            except SmartCamError as error:
+                logger.warning("%s ! restoring failed: %s", talk.name, error)
+                if not isinstance(error, LinkError):
+                    self._failed = error
+            finally:
+                talk.inbox.expected, talk.wants_running = wanted
+
+    async def _have(self, application: int | None, running: bool | None) -> None:
+        """Have an application and a run state, by the least that is needed; None: as it is."""
+        talk = self._talk
+        deadline = talk.deadline(self._switch_timeout)
+        active = await talk.query(deadline)
+        if application is not None and active != application:
+            await talk.switch(application, deadline, start=running is True)
+        elif running and Status.RUNNING not in talk.status:
+            await talk.start(deadline)
+        elif running is False and Status.RUNNING in talk.status:
+            await talk.stop(deadline)
 
     async def _acquire(self) -> None:
         """Take the lock, but behind every job that goes back.

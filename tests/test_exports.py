@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     import types
 
 PUBLIC = [
-    "ApplicationChanged", "CameraBusyError", "CameraEvent", "CameraFaultError",
+    "ApplicationChanged", "Backoff", "CameraBusyError", "CameraEvent", "CameraFaultError",
     "CommandRejectedError", "ConfigurationError", "ConnectFailedError", "Connected",
     "ConnectionClosedError", "ConnectionLostError", "ConnectionTakenError", "Disconnected",
-    "FrameError", "Header", "InputContainerError", "InterpretationError", "Layout", "LayoutError",
-    "LinkError", "LocalProtocolError", "Localization", "MessageError", "MissingExtraError",
-    "NotRunningError", "OvertriggeredError", "PluginError", "Pose", "Position", "ProtocolError",
-    "Quaternion", "Reconnected", "RemoteProtocolError", "ResponseTimeoutError", "Result",
-    "SmartCamError", "SmartCamera", "Statistics", "Status", "StatusChanged",
-    "SubscriberOverflowError", "TriggerError", "TriggerTimeoutError", "UnsupportedError",
-    "WrongApplicationError", "__version__", "connect", "emulator", "exceptions", "interpreters",
-    "layout", "models", "protocols",
+    "FrameError", "Header", "Histogram", "InputContainerError", "InterpretationError", "Layout",
+    "LayoutError", "LinkError", "LocalProtocolError", "Localization", "MessageError",
+    "MissingExtraError", "NotRunningError", "Observer", "OvertriggeredError", "PluginError",
+    "Pose", "Position", "ProtocolError", "Quaternion", "Reconnected", "RemoteProtocolError",
+    "ResponseTimeoutError", "Result", "SmartCamError", "SmartCamera", "Statistics", "Status",
+    "StatusChanged", "SubscriberOverflowError", "TriggerError", "TriggerTimeoutError",
+    "UnsupportedError", "WrongApplicationError", "__version__", "connect", "emulator",
+    "exceptions", "interpreters", "layout", "models", "protocols",
 ]  # fmt: skip
 
 MODULES = sorted(

@@ -14,6 +14,7 @@ import click
 from smartcam.client import SmartCamera, connect
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import jsonable
+from smartcam.observers import Observer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -106,6 +107,16 @@ def camera_url(text: str) -> str:
     return text if "://" in text else f"bvs://{text}"
 
 
+class _Frames(Observer):
+    """Gives every frame to a function."""
+
+    def __init__(self, write: Callable[[TraceEntry], None]) -> None:
+        self._write = write
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        self._write(entry)
+
+
 @dataclass(slots=True)
 class Options:
     """The shared options as a command uses them."""
@@ -130,7 +141,8 @@ class Options:
         with self.tracing() as trace:
             yield connect(
                 camera_url(url),
-                trace=trace,
+                observers=[_Frames(trace)] if trace is not None else [],
+                reconnect=None,
                 application=self.application,
                 interpret_as=self.interpret_as,
                 y_down=self.y_down,

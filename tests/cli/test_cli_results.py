@@ -26,6 +26,7 @@ from commandline import (
 )
 
 from smartcam import Result
+from smartcam.attribution import NUMBER_STEP
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
@@ -141,7 +142,8 @@ def test_trigger_count_prints_as_many_results(url: str) -> None:
     results = outcome.done().lines
     assert [result["number"] for result in results] == [1, 2, 3, 4, 5]
     first = results[0]["sequence"]
-    assert [result["sequence"] for result in results] == [first + i for i in range(5)]
+    steps = [result["sequence"] - first for result in results]
+    assert steps == [i * NUMBER_STEP for i in range(5)]
 
 
 def test_trigger_seconds_ends_after_them(url: str) -> None:

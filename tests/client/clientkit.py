@@ -25,7 +25,8 @@ SHORT = 0.05
 async def by_hand(
     *, box: dict[str, Any] | None = None, **options: Any
 ) -> AsyncIterator[tuple[HandmadeCamera, SmartCamera]]:
-    """A handmade camera and a client in a session with it."""
+    """A handmade camera and a client in a session with it, which does not reconnect by default."""
+    options.setdefault("reconnect", None)
     async with (
         _nothing_unheard(),
         HandmadeCamera(**(box or {})) as made,
@@ -38,7 +39,11 @@ async def by_hand(
 async def emulated(
     *, box: dict[str, Any] | None = None, **options: Any
 ) -> AsyncIterator[tuple[EmulatedCamera, ManualClock, SmartCamera]]:
-    """An emulated camera on a clock that stands still, and a client in a session with it."""
+    """An emulated camera on a clock that stands still, and a client in a session with it.
+
+    It does not reconnect by default.
+    """
+    options.setdefault("reconnect", None)
     clock = ManualClock()
     async with (
         _nothing_unheard(),

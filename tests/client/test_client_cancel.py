@@ -191,7 +191,7 @@ async def test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_res
 async def test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_result() -> None:
     async with emulator() as box, connect(box) as camera:
         for count in range(MOST_STEPS):
-            camera._inbox.debt = "late"  # as after a trigger that was given up
+            camera._inbox.attribution.debt = "late"  # as after a trigger that was given up
             over = await cancel_after(count, camera.trigger())
             result = await camera.trigger()
             assert result.sequence == box.device.next_number - 1

@@ -468,7 +468,7 @@ async def test_statistics_count_what_went_over_the_wire() -> None:
     assert after.frames_sent - before.frames_sent == 2
     assert after.frames_received - before.frames_received == 5
     assert after.bytes_sent - before.bytes_sent == 2 * 12
-    assert (after.sessions, after.long_bodies, after.ignored_frames) == (1, 1, 0)
+    assert (after.sessions, after.long_bodies, after.ignored_datagrams) == (1, 1, 0)
     assert after.last_error is None
 
 

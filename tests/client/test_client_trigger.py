@@ -737,6 +737,7 @@ async def test_interpret_as_something_wrong_is_refused_before_a_trigger_is_sent(
 async def test_result_carries_the_value_of_its_sequence_field() -> None:
     async with by_hand(interpret_as="n: int32 @sequence, x: int32") as (box, camera):
         box.container = struct.pack("<ii", 41, 5)
+        await camera.set_sequence_number(41)
         result = await camera.trigger()
         assert (result.sequence, result.value.x, result.number) == (41, 5, 1)
 
@@ -746,6 +747,7 @@ async def test_endian_field_of_the_status_turns_the_result_around() -> None:
         box.container = struct.pack(">i", 41)
         box.send(box.status_frame(READY, 1))
         assert (await camera.trigger(interpret_as="raw")).value == struct.pack(">i", 41)
+        await camera.set_sequence_number(41)
         result = await camera.trigger()
         assert (result.value.n, result.sequence) == (41, 41)
 
@@ -776,14 +778,23 @@ async def test_interpreter_with_a_slip_is_an_outcome_like_any_other() -> None:
 # ---------------------------------------------------------------------- traces of it all
 
 
+class _Frames(smartcam.Observer):
+    def __init__(self) -> None:
+        self.entries: list[Any] = []
+
+    def on_frame(self, entry: object) -> None:
+        self.entries.append(entry)
+
+
 async def test_trigger_is_traced(caplog: pytest.LogCaptureFixture) -> None:
-    entries: list[Any] = []
+    frames = _Frames()
     with caplog.at_level(logging.DEBUG, "smartcam"):
         async with (
             HandmadeCamera() as box,
-            smartcam.connect(box.url, trace=entries.append) as camera,
+            smartcam.connect(box.url, observers=[frames]) as camera,
         ):
             await camera.trigger()
+    entries = frames.entries
     names = [(entry.direction, entry.message) for entry in entries]
     at = names.index((">", "Trigger"))
     assert names[at : at + 4] == [

@@ -111,7 +111,7 @@ async def test_garbage_over_udp_is_ignored_and_counted(data: bytes) -> None:
         box.send_datagram(data)
         assert (await camera.trigger()).raw == b"found"
         await camera.get_clock()
-        assert camera.statistics().ignored_frames == 1
+        assert camera.statistics().ignored_datagrams == 1
         assert camera.status == Status(READY)
 
 
@@ -120,7 +120,7 @@ async def test_answer_to_connect_over_udp_that_comes_twice_is_counted_only() -> 
         box.send(box.frame(CONNECT, words(1)))
         assert (await camera.trigger()).raw == b"found"
         statistics = camera.statistics()
-        assert statistics.ignored_frames + statistics.unexpected_messages == 1
+        assert statistics.ignored_datagrams + statistics.unexpected_messages == 1
 
 
 async def test_answer_over_udp_that_comes_twice_is_used_once() -> None:

@@ -1,0 +1,77 @@
+"""When a lost camera is tried again, as a value."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import ConfigurationError, LinkError, PluginError, SmartCamError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["Backoff", "is_transient"]
+
+
+def is_transient(error: BaseException) -> bool:
+    """Return whether trying again may help.
+
+    What happens to links does pass: nothing listens, no way to the host, a name that does not
+    resolve while the name server is away, silence, a peer that breaks the protocol. An error in
+    what the user gave or in a plug-in does not.
+    """
+    if isinstance(error, (ConfigurationError, PluginError)):
+        return False
+    return isinstance(error, (LinkError, SmartCamError, OSError))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Backoff:
+    """Delays between tries to reach a camera again: each is longer than the one before.
+
+    Attributes:
+        initial: the first delay, seconds. A link that was cut is often back at once.
+        factor: how much longer each delay is than the one before.
+        maximum: the longest delay, seconds. A rebooting camera is away for about 30 s.
+        jitter: share of each delay that is left to chance, so that many clients do not come all at
+            the same instant: 0 (none) to 1.
+        attempts: tries until it is given up; None for never.
+        transient: says of an error whether trying again may help; where not, it is given up.
+
+    Raises:
+        ConfigurationError: a value cannot work.
+    """
+
+    initial: float = 0.1
+    factor: float = 2.0
+    maximum: float = 10.0
+    jitter: float = 0.3
+    attempts: int | None = None
+    transient: Callable[[BaseException], bool] = is_transient
+
+    def __post_init__(self) -> None:
+        checks = {
+            "initial: 0 or more seconds": 0 <= self.initial < math.inf,
+            "factor: 1 or more": 1 <= self.factor < math.inf,
+            "maximum: seconds, not below initial": self.initial <= self.maximum < math.inf,
+            "jitter: 0 to 1": 0 <= self.jitter <= 1,
+            "attempts: 1 or more, or None": self.attempts is None or self.attempts >= 1,
+        }
+        wrong = [what for what, fits in checks.items() if not fits]
+        if wrong:
+            raise ConfigurationError(f"Backoff: expected {'; '.join(wrong)}; got {self}")
+
+    def delays(self, chance: random.Random | None = None) -> Iterator[float]:
+        """Give the delay before each try, seconds; ends after ``attempts``.
+
+        Args:
+            chance: where the jitter comes from; seed it for the same delays again.
+        """
+        chance = chance or random.Random()  # noqa: S311 - spreads load, keeps no secret
+        delay, tried = self.initial, 0
+        while self.attempts is None or tried < self.attempts:
+            yield delay * (1.0 - self.jitter * chance.random())
+            delay = min(delay * self.factor, self.maximum)
+            tried += 1
