@@ -63,14 +63,20 @@ class Backoff:
         if wrong:
             raise ConfigurationError(f"Backoff: expected {'; '.join(wrong)}; got {self}")
 
-    def delays(self, chance: random.Random | None = None) -> Iterator[float]:
+    def delays(
+        self, *, short_lived: int = 0, chance: random.Random | None = None
+    ) -> Iterator[float]:
         """Give the delay before each try, seconds; ends after ``attempts``.
 
         Args:
+            short_lived: sessions in a row that were lost soon: the delays begin so many steps
+                later, or a link that breaks as soon as it is made would be made without a pause.
             chance: where the jitter comes from; seed it for the same delays again.
         """
         chance = chance or random.Random()  # noqa: S311 - spreads load, keeps no secret
         delay, tried = self.initial, 0
+        for _ in range(short_lived):
+            delay = min(delay * self.factor, self.maximum)
         while self.attempts is None or tried < self.attempts:
             yield delay * (1.0 - self.jitter * chance.random())
             delay = min(delay * self.factor, self.maximum)

@@ -69,6 +69,7 @@ class Supervisor:
         self._closing = False
         self._ended_by: SmartCamError | None = None  # why there is no more session, if not by us
         self._reading = False  # a link, whose end it notices by itself
+        self._short_lived = 0  # sessions in a row that were lost soon
         self._excused = False  # an early loss of this session is no other client's doing
         self._restarting: Link | None = None  # the camera was told to restart over this link
 
@@ -204,9 +205,10 @@ class Supervisor:
             restarting, self._restarting = self._restarting is session.link, None
             if self._closing or self._settings.reconnect is None:
                 return error
-            lasted = asyncio.get_running_loop().time() - made_at
-            if again and lasted < TAKEN_WITHIN and not self._excused and _may_be_taken(error):
+            short = asyncio.get_running_loop().time() - made_at < TAKEN_WITHIN
+            if again and short and not self._excused and _may_be_taken(error):
                 return self._taken(error)
+            self._short_lived = self._short_lived + 1 if again and short else 0
             self._excused = restarting
             await self._turns.vacated()
             session = await self._reconnect(error)
@@ -276,7 +278,7 @@ class Supervisor:
         settings = self._settings.model_copy(update={"address": self.address})
         failed: SmartCamError = loss
         if policy is not None:
-            for tried, delay in enumerate(policy.delays(), 1):
+            for tried, delay in enumerate(policy.delays(short_lived=self._short_lived), 1):
                 await asyncio.sleep(delay)
                 try:
                     return await establish(settings, self._observers.trace)
