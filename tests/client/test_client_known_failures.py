@@ -1,0 +1,201 @@
+"""Failures that clients of such devices are known for. Each has one test here that says it plainly.
+
+The camera is written by hand; where it matters how the bytes arrive, a proxy stands between.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from camera_by_hand import (
+    MAGIC,
+    QUERY,
+    READY,
+    RUNNING,
+    TRIGGER,
+    HandmadeCamera,
+)
+from clientkit import SHORT, balance, by_hand, steps, until
+
+import smartcam
+from smartcam import ResponseTimeoutError
+from smartcam.connection import Link
+from smartcam.testing import LinkProxy
+from smartcam.testing.rules import Rule, Split
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from smartcam import Result, SmartCamera
+
+HEADER = 12
+"""Bytes of a frame's header."""
+IN_FRONT = HEADER + 4
+"""Bytes of a result's frame in front of the container: header and application id."""
+SEGMENT = 1460
+"""Bytes of payload that Ethernet carries in one TCP segment."""
+
+
+@contextlib.asynccontextmanager
+async def through_proxy(
+    **options: Any,
+) -> AsyncIterator[tuple[HandmadeCamera, LinkProxy, SmartCamera]]:
+    """A handmade camera, a proxy, and a client in a session through it."""
+    async with (
+        HandmadeCamera() as box,
+        LinkProxy("127.0.0.1", box.port) as proxy,
+        smartcam.connect(proxy.url(box.url), reconnect=None, **options) as camera,
+    ):
+        yield box, proxy, camera
+
+
+class Work:
+    """What comes from the client's socket, and the CPU time the client spends on it.
+
+    Attributes:
+        sizes: bytes of each delivery.
+        seconds: CPU time for all of them.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.seconds = 0.0
+        self.sizes: list[int] = []
+        receive = Link.data_received
+
+        def measured(link: Link, data: bytes) -> None:
+            begin = time.thread_time()
+            receive(link, data)
+            self.seconds += time.thread_time() - begin
+            self.sizes.append(len(data))
+
+        monkeypatch.setattr(Link, "data_received", measured)
+
+
+async def next_of(results: Any) -> Result:
+    """Return the next result of a stream, which is to come at once."""
+    async with asyncio.timeout(10):
+        result: Result = await anext(results)
+        return result
+
+
+def has_received(camera: SmartCamera, count: int) -> bool:
+    return camera.statistics().received == count
+
+
+async def test_results_that_arrive_while_a_command_waits_are_kept() -> None:
+    """A client that reads until its answer comes throws away what comes before it: results."""
+    async with by_hand() as (box, camera):
+        results = camera.results()
+        box.script[QUERY] = lambda _: b""
+        asking = asyncio.create_task(camera.query_application())
+        await box.wait_for(QUERY, count=box.ids.count(QUERY) + 1)
+        for number in range(3):
+            box.send(box.result_frame(b"%d" % number))
+            await until(functools.partial(has_received, camera, number + 1))
+        assert not asking.done()
+        box.send(box.frame(QUERY, bytes([7, 0, 0, 0])))
+        assert await asking == 7
+        assert [(await next_of(results)).raw for _ in range(3)] == [b"0", b"1", b"2"]
+        assert camera.statistics().streamed == 3
+        balance(camera.statistics())
+
+
+async def test_body_with_the_magic_number_at_a_segments_edge_is_delivered() -> None:
+    """A client that takes a segment that begins with the magic number for a new frame loses both.
+
+    The magic number begins a segment, ends one, and lies across the edge.
+    """
+    magic = MAGIC["handbook"]
+    body = b"before" + magic + b"behind" + magic
+    place = IN_FRONT + len(b"before")
+    async with through_proxy() as (box, proxy, camera):
+        results = camera.results()
+        for edge in range(place, place + len(magic) + 1):
+            proxy.from_now(Split(at=edge))
+            box.send(box.result_frame(body) + box.result_frame(b"next"))
+            assert [(await next_of(results)).raw for _ in range(2)] == [body, b"next"]
+        assert proxy.counts["split"] == len(magic) + 1
+
+
+async def test_header_split_after_five_bytes_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that wants a whole header from one read fails where it comes as 5 and 7 bytes."""
+    work = Work(monkeypatch)
+    async with through_proxy() as (box, proxy, camera):
+        results = camera.results()
+        proxy.from_now(Split(at=5, pause=SHORT), Split(at=HEADER, pause=SHORT))
+        box.send(box.result_frame(b"found"))
+        assert (await next_of(results)).raw == b"found"
+        assert work.sizes[-3:] == [5, 7, 9]
+
+
+async def test_one_split_packet_does_not_spoil_later_ones() -> None:
+    """A client that loses its place in the stream once reads garbage from then on."""
+    async with through_proxy() as (box, proxy, camera):
+        results = camera.results()
+        size = len(box.result_frame(b"00"))
+        for at in range(1, size):
+            proxy.from_now(Split(at=at))
+            bodies = [b"%02d" % at, b"a", b"b" * 50]
+            box.send(b"".join(map(box.result_frame, bodies)))
+            assert [(await next_of(results)).raw for _ in bodies] == bodies
+        assert proxy.counts["split"] == size - 1
+        assert await camera.query_application() == 7
+
+
+async def test_silent_peer_ends_at_the_deadline() -> None:
+    """A client without a deadline waits for ever where the peer is gone and its socket is not."""
+    async with through_proxy(close_timeout=SHORT) as (_, proxy, camera):
+        proxy.stall()
+        begin = asyncio.get_running_loop().time()
+        with pytest.raises(ResponseTimeoutError):
+            async with asyncio.timeout(5):
+                await camera.query_application(timeout=SHORT)
+        assert asyncio.get_running_loop().time() - begin >= SHORT * 0.8
+        assert proxy.open_connections == 1
+
+
+async def test_body_of_5_mb_in_segments_costs_linear_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that copies or parses what it has with each segment needs minutes for an image."""
+    work = Work(monkeypatch)
+    costs: dict[int, float] = {}
+    async with through_proxy(max_length=8 << 20) as (box, proxy, camera):
+        results = camera.results()
+        for size in (1_250_000, 2_500_000, 5_000_000) * 2:
+            body = bytes(range(250)) * (size // 250)
+            edges: list[Rule] = [Split(at=at) for at in range(SEGMENT, size, SEGMENT)]
+            proxy.from_now(*edges)
+            work.seconds, work.sizes = 0.0, []
+            box.send(box.result_frame(body))
+            assert (await next_of(results)).raw == body
+            assert len(work.sizes) > 0.5 * len(edges)  # some come together on a busy machine
+            costs[size] = min(work.seconds, costs.get(size, work.seconds))
+    small, _, large = costs.values()
+    # linear is 4, large memory makes it 6; with work that grows with the square it is 16 and more
+    assert large / small < 10, costs
+
+
+async def test_image_sized_answer_pays_no_idle_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that takes silence for the end of an answer pays that silence with every one.
+
+    From the last byte on the loop's time stands still here, so no timer can lie between.
+    """
+    work = Work(monkeypatch)
+    async with by_hand() as (box, camera):
+        image = bytes(1_000_000)
+        sent = box.status_frame(RUNNING) + box.result_frame(image) + box.status_frame(READY)
+        box.script[TRIGGER] = lambda _: sent
+        before = sum(work.sizes)
+        triggering = asyncio.create_task(camera.trigger(timeout=60))
+        await until(lambda: sum(work.sizes) == before + len(sent))
+        loop = asyncio.get_running_loop()
+        now = loop.time()
+        with monkeypatch.context() as standing:
+            standing.setattr(loop, "time", lambda: now)
+            await steps(10)
+        assert triggering.done()
+        assert len((await triggering).raw) == len(image)
