@@ -65,14 +65,14 @@ class Account:
 
     def __init__(self) -> None:
         self.fates: collections.Counter[str] = collections.Counter()
-        self.received = 0
-        self.empty_slots = 0
-        self.extra_results = 0
-        self.overtriggers = 0
-        self.sessions = 0
+        self.received: int = 0
+        self.empty_slots: int = 0
+        self.extra_results: int = 0
+        self.overtriggers: int = 0
+        self.sessions: int = 0
         self.last_error: str | None = None
-        self.round_trip = Times()
-        self.processing = Times()
+        self.round_trip: Times = Times()
+        self.processing: Times = Times()
         self._wire = Counters()  # of the links that are over
         self._open: Counters | None = None
 

@@ -99,7 +99,7 @@ class Attribution:
     def __init__(self) -> None:
         self.pending: PendingTrigger | None = None
         self.debt: Debt | None = None
-        self.unsettled = False
+        self.unsettled: bool = False
         self.numbering: Interpretation | None = None
         self._ordered = False
         self._drops_waiting = False  # the camera is known to show a trigger in its status

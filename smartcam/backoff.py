@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ConfigurationError, LinkError, PluginError, SmartCamError
@@ -49,7 +49,7 @@ class Backoff:
     maximum: float = 10.0
     jitter: float = 0.3
     attempts: int | None = None
-    transient: Callable[[BaseException], bool] = is_transient
+    transient: Callable[[BaseException], bool] = field(default=is_transient, repr=False)
 
     def __post_init__(self) -> None:
         checks = {

@@ -637,9 +637,9 @@ class SmartCamera:
         stream: Subscription[Any] = Subscription(
             name, max_queue=max_queue, overflow=overflow, min_interval=min_interval
         )
-        if self._inbox.end is not None:
-            ours = isinstance(self._inbox.end, ConnectionClosedError)
-            stream.end(None if ours else self._inbox.end)
+        end = self._inbox.end
+        if end is not None and self._supervisor.over:  # between two sessions it waits for the next
+            stream.end(None if isinstance(end, ConnectionClosedError) else end)
         return stream
 
     async def _await_next(

@@ -200,6 +200,11 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         await asyncio.wait({self._closed}, timeout=timeout)
 
     @property
+    def lost(self) -> bool:
+        """Whether it is gone; chunks that came before may still wait to be taken."""
+        return self._loss is not None
+
+    @property
     def peer(self) -> str:
         """``host:port`` of the camera."""
         return f"{self.host}:{self.port}"
@@ -235,6 +240,7 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         """asyncio: the camera will send no more."""
         self.machine.receive_eof()
         self._enqueue()
+        self._lose(ConnectionResetError("the camera closed the connection"))
 
     def error_received(self, exc: Exception) -> None:
         """asyncio: the system refused a datagram: nothing listens there."""

@@ -391,7 +391,7 @@ class Conversation:
         numbering = request.interpretation.numbering(self.inbox.active)
         # an older result shows by its number where each container has one
         decided = numbering is not None and numbering.always
-        if attribution.debt is not None and not decided:
+        if self._halted or (attribution.debt is not None and not decided):
             await self._settle_debt(deadline)
         await self._wait_for_trigger(deadline, wait=request.wait)
         while attribution.unsettled and not decided and self._ordered:

@@ -299,6 +299,7 @@ class Inbox:
         if verdict.extra:
             self._note_extra()
         owner = pending if verdict.fate == "triggered" else None
+        current = verdict.fate in {"triggered", "nobody"}
         listening = self._listening()
         fate: str = verdict.fate
         if fate == "nobody":
@@ -310,10 +311,10 @@ class Inbox:
             result = self._interpret(container, owner, now, at)
         except InterpretationError as error:
             account.fates["late" if fate == "late" else "uninterpretable"] += 1
-            self._deliver_error(error, owner, now)
+            self._deliver_error(error, owner, now, current=current)
         else:
             account.fates[fate] += 1
-            self._deliver(result, owner, now, current=verdict.fate in {"triggered", "nobody"})
+            self._deliver(result, owner, now, current=current)
 
     def _note_extra(self) -> None:
         self.account.extra_results += 1
@@ -368,12 +369,13 @@ class Inbox:
                 owner.outcome.set_result(owner.results)
 
     def _deliver_error(
-        self, error: InterpretationError, owner: PendingTrigger | None, now: float
+        self, error: InterpretationError, owner: PendingTrigger | None, now: float, *, current: bool
     ) -> None:
         for stream in tuple(self.result_streams):
             stream.offer(error, now)
-        for future in self._take_next_results():
-            future.set_exception(error)
+        if current:
+            for future in self._take_next_results():
+                future.set_exception(error)
         if owner is None:
             self._observers.error(self.name, error)
             return

@@ -81,6 +81,11 @@ class Supervisor:
         return self._task is not None
 
     @property
+    def over(self) -> bool:
+        """Whether there will be no session any more."""
+        return self._closing or self._ended_by is not None
+
+    @property
     def address(self) -> Address:
         """The camera's address, with the dialect pinned once it was found out."""
         return self._settings.address if self.session is None else self.session.address
@@ -88,7 +93,8 @@ class Supervisor:
     @property
     def connected(self) -> bool:
         """Whether there is a session."""
-        return self.session is not None and self._inbox.end is None
+        session = self.session
+        return session is not None and not session.link.lost and self._inbox.end is None
 
     async def open(self) -> None:
         """Start, and wait for the first session.
@@ -142,7 +148,7 @@ class Supervisor:
         try:
             async with asyncio.timeout_at(deadline):
                 while True:
-                    if self._task is None or self._task.done() or self._closing:
+                    if not self.started or self.over:
                         self._talk.require_link()
                     changed = self._changed
                     if self.connected:
@@ -205,7 +211,8 @@ class Supervisor:
             restarting, self._restarting = self._restarting is session.link, None
             if self._closing or self._settings.reconnect is None:
                 return error
-            short = asyncio.get_running_loop().time() - made_at < TAKEN_WITHIN
+            silence = _silence(error, self._settings.liveness_timeout)
+            short = asyncio.get_running_loop().time() - silence - made_at < TAKEN_WITHIN
             if again and short and not self._excused and _may_be_taken(error):
                 return self._taken(error)
             self._short_lived = self._short_lived + 1 if again and short else 0
@@ -314,6 +321,11 @@ class Supervisor:
         """Wake who waits for a change of the connection."""
         self._changed.set()
         self._changed = asyncio.Event()
+
+
+def _silence(error: ConnectionLostError, liveness_timeout: float | None) -> float:
+    """Return how many seconds before it was noticed a link was lost: over UDP only silence tells."""
+    return liveness_timeout or 0.0 if isinstance(error.__cause__, TimeoutError) else 0.0
 
 
 def _may_be_taken(error: ConnectionLostError) -> bool:

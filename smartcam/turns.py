@@ -74,7 +74,7 @@ class Turns:
             try:
                 owed, self._owed = self._owed, None
                 if owed is not None:
-                    self.leave(owed)
+                    self._start_job("going_back", self._go_back(owed))
                 elif restore:
                     self._start_job("restoring", self._restore())
                 yield
