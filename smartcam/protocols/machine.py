@@ -81,7 +81,8 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
         (connecting, client, m.Disconnect): State.DISCONNECTED,
         (connecting, client, m.Connect): connecting,
         (connecting, camera, m.ConnectAnswer): connected,
-        (connected, client, m.Connect): connecting,
+        # what was asked before it in the same bytes is still answered
+        (connected, client, m.Connect): connected,
         (connected, client, m.Disconnect): State.DISCONNECTED,
         (State.DISCONNECTED, client, m.Disconnect): State.DISCONNECTED,
         (State.DISCONNECTED, client, m.Connect): connecting,
