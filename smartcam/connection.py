@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import contextlib
 import logging
 import socket
 from datetime import UTC, datetime
@@ -167,7 +168,8 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
                 self._transport.close()
             elif not self._transport.is_closing():
                 self._resume()
-                self._transport.write_eof()
+                with contextlib.suppress(OSError):  # it was reset just now
+                    self._transport.write_eof()
             await asyncio.wait({self._closed}, timeout=timeout)
         finally:
             self.abort()

@@ -306,12 +306,20 @@ class Conversation:
         await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline, due=due)
 
-    def ask_for_life(self, due: float) -> None:
+    def ask_for_life(self, due: float) -> bool:
         """Send a Query unless one is open; its answer is owed until ``due`` (loop time)."""
-        if m.QueryAnswer not in self.inbox.answers:
-            self.require_link().send(m.Query())
-            self._due[m.QueryAnswer] = due
-            self.inbox.next_answer(m.QueryAnswer)
+        if m.QueryAnswer in self.inbox.answers:
+            return False
+        self.require_link().send(m.Query())
+        self._due[m.QueryAnswer] = due
+        self.inbox.next_answer(m.QueryAnswer)
+        return True
+
+    def ask_what_is_active(self) -> None:
+        """Send a Query after somebody else's switch, as soon as none is open from before it."""
+        with contextlib.suppress(SmartCamError):  # the link is over: its reader knows
+            if self.ask_for_life(asyncio.get_running_loop().time() + self._patience):
+                self.inbox.active_in_doubt = False
 
     async def query(self, deadline: float) -> int:
         """Return the active application.
@@ -321,9 +329,15 @@ class Conversation:
         await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
         return (await self.ask(m.Query(), m.QueryAnswer, deadline)).application
 
+    async def query_loaded(self, deadline: float) -> int:
+        """Return the active application; while one is being loaded a Query tells the old one."""
+        await self.until(_is_not_loading, deadline, "the application to be loaded")
+        return await self.query(deadline)
+
     async def ensure(self, application: int, deadline: float) -> None:
         """Have an application running and ready, by the least that is needed."""
-        if await self.query(deadline) != application:
+        await self.until(lambda status: Status.BUSY not in status, deadline, "not BUSY")
+        if await self.query_loaded(deadline) != application:
             await self.switch(application, deadline, start=True)
             return
         self.inbox.expected = application
@@ -539,15 +553,13 @@ class Conversation:
         Raises:
             ResponseTimeoutError: it did not come; the link is given up if its own time is over too.
         """
-        owed = self.inbox.answers.get(key)
-        if owed is None:
-            return
-        try:
-            await self._take_answer(owed, deadline)
-        except TimeoutError as exc:
-            error = self._unsent(message)
-            self._give_up_overdue(key, error)
-            raise error from exc
+        while (owed := self.inbox.answers.get(key)) is not None:
+            try:
+                await self._take_answer(owed, deadline)
+            except TimeoutError as exc:
+                error = self._unsent(message)
+                self._give_up_overdue(key, error)
+                raise error from exc
 
     def _give_up_overdue(self, key: type[m.Message] | int, error: ResponseTimeoutError) -> None:
         """Give the link up if the answer that is owed should have come by now."""
@@ -578,6 +590,10 @@ class Conversation:
             f"status: {self.status}",
             message_id=message_id,
         )
+
+
+def _is_not_loading(status: Status) -> bool:
+    return not status.loading
 
 
 def _is_not_running(status: Status) -> bool:

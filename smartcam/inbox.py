@@ -89,13 +89,15 @@ class Inbox:
         self._observers = observers
         self._status_waiters: list[_StatusWaiter] = []
         self._asked_at: dict[object, float] = {}
+        self.active_in_doubt: bool = False  # somebody else loaded an application
         self._heard_status = False  # in this session
+        self._loaded_by_us = False
         self._warned_extra = False
 
     def begin(self, *, ordered: bool) -> None:
         """A new session; ``ordered`` where messages come in order and none is lost (TCP)."""
         self.end = None
-        self._heard_status = self._warned_extra = False
+        self._heard_status = self._warned_extra = self.active_in_doubt = False
         self.attribution.begin_session(ordered=ordered)
 
     # ------------------------------------------------------------------ from the receive task
@@ -115,6 +117,7 @@ class Inbox:
                     if event.code == 0:
                         self.expected = event.application
                         self.input_in_doubt = False
+                        self._loaded_by_us = True
                         self.attribution.settled()
                     self.set_active(event.application, at)
                 case m.Message():
@@ -225,6 +228,7 @@ class Inbox:
         self._note_changes(Status(0) if previous is None else previous, status)
         self._fail_trigger(Status(0) if previous is None else previous, status)
         self.attribution.on_status(previous, status)
+        self._note_loading(previous, status)
         if status != before:
             self.publish(StatusChanged(camera=self.name, at=at, status=status, previous=before))
         for stream in tuple(self.status_streams):
@@ -237,6 +241,14 @@ class Inbox:
                     waiter.outcome.set_result(status)
             except Exception as exc:  # noqa: BLE001 - the user's predicate: its caller gets it
                 waiter.outcome.set_exception(exc)
+
+    def _note_loading(self, previous: Status | None, status: Status) -> None:
+        """Doubt which application is active when somebody else's switch has ended."""
+        if status.loading:
+            self._loaded_by_us = False
+        elif previous is not None and previous.loading:
+            by_us = self._loaded_by_us or m.SwitchAnswer in self.answers
+            self.active_in_doubt = self.active_in_doubt or not by_us
 
     def _note_changes(self, previous: Status, status: Status) -> None:
         risen, fallen = status & ~previous, previous & ~status

@@ -12,7 +12,6 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import SmartCamError
-from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ class _Watch:
     def look(self) -> None:
         """Ask, give up, or wait; then look again when there is something to do next."""
         now, heard_at = self._loop.time(), self._link.heard_at
-        if self._asked_at is not None and self._asked_at < heard_at:
+        if self._asked_at is not None and self._asked_at <= heard_at:  # a clock may be coarse
             self._asked_at = None
         if self._asked_at is None:
             quiet = self._switch_timeout if self._loading else self._patience
@@ -88,6 +87,4 @@ class _Watch:
     @property
     def _loading(self) -> bool:
         """A switch is under way, ours or somebody else's."""
-        status = self._talk.status
-        by_us = m.SwitchAnswer in self._talk.inbox.answers
-        return by_us or (Status.BUSY in status and Status.RUNNING not in status)
+        return m.SwitchAnswer in self._talk.inbox.answers or self._talk.status.loading

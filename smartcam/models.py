@@ -78,6 +78,15 @@ class Status(enum.IntFlag):
         return member
 
     @property
+    def loading(self) -> bool:
+        """Whether an application is being loaded: BUSY, and not running.
+
+        Source: BUSY is set meanwhile, and the application is stopped for it (SC manual p. 33, 34,
+        published).
+        """
+        return Status.BUSY in self and Status.RUNNING not in self
+
+    @property
     def names(self) -> list[str]:
         """Names of the set bits, lowest first; a bit without a name as ``0x40``."""
         names: list[str] = []

@@ -191,7 +191,9 @@ class Supervisor:
             error.__cause__ = cause
         finally:
             self._inbox.fail(error)
-            if not self._closing:
+            if self._closing:
+                self._inbox.end = self.closed_error()  # whatever it was before
+            else:
                 self._inbox.end = self._ended_by = error
             if self.session is not None:
                 self.session.link.abort()
@@ -257,6 +259,8 @@ class Supervisor:
         try:
             while True:
                 self._inbox.dispatch(await link.receive())
+                if self._inbox.active_in_doubt:
+                    self._talk.ask_what_is_active()
         except ConnectionLostError as error:
             restarting = self._restarting is link
             expected = self._closing or restarting
@@ -324,7 +328,7 @@ class Supervisor:
 
 
 def _silence(error: ConnectionLostError, liveness_timeout: float | None) -> float:
-    """Return how many seconds before it was noticed a link was lost: over UDP only silence tells."""
+    """Return how many seconds ago a link was lost when it is noticed: only silence may tell."""
     return liveness_timeout or 0.0 if isinstance(error.__cause__, TimeoutError) else 0.0
 
 

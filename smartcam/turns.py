@@ -139,7 +139,7 @@ class Turns:
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""
         running = self._talk.runs
-        active = await self._talk.query(deadline)
+        active = await self._talk.query_loaded(deadline)
         talk = self._talk
         before = Before(active, running, talk.inbox.expected, talk.wants_running)
         try:
@@ -201,7 +201,7 @@ class Turns:
                 await self._have(before.application, before.running)
             except SmartCamError as error:
                 logger.warning("%s ! going back failed: %s", talk.name, error)
-                if isinstance(error, LinkError):
+                if self._is_loss(error):
                     self._owe(before)
                 else:
                     self._failed = error
@@ -221,16 +221,22 @@ class Turns:
                 await self._have(*wanted)
             except SmartCamError as error:
                 logger.warning("%s ! restoring failed: %s", talk.name, error)
-                if not isinstance(error, LinkError):
+                if not self._is_loss(error):
                     self._failed = error
             finally:
                 talk.inbox.expected, talk.wants_running = wanted
+
+    def _is_loss(self, error: SmartCamError) -> bool:
+        """Whether the link is lost, an answer that did not come included: it costs the link."""
+        link = self._talk.link
+        return isinstance(error, LinkError) or (link is not None and link.lost)
 
     async def _have(self, application: int | None, running: bool | None) -> None:
         """Have an application and a run state, by the least that is needed; None: as it is."""
         talk = self._talk
         deadline = talk.deadline(self._switch_timeout)
-        active = await talk.query(deadline)
+        await talk.until(lambda status: Status.BUSY not in status, deadline, "not BUSY")
+        active = await talk.query_loaded(deadline)
         if application is not None and active != application:
             await talk.switch(application, deadline, start=running is True)
         elif running and Status.RUNNING not in talk.status:
