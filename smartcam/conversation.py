@@ -336,7 +336,6 @@ class Conversation:
 
     async def ensure(self, application: int, deadline: float) -> None:
         """Have an application running and ready, by the least that is needed."""
-        await self.until(lambda status: Status.BUSY not in status, deadline, "not BUSY")
         if await self.query_loaded(deadline) != application:
             await self.switch(application, deadline, start=True)
             return

@@ -141,7 +141,7 @@ def test_trigger_switch_never_answered_exits_4() -> None:
     outcome.failed(4, "no answer to SwitchApplication (0x31)", within=0.6)
 
 
-def test_trigger_busy_for_ever_exits_4() -> None:
+def test_trigger_switch_while_busy_for_ever_exits_4() -> None:
     with Peer({**SESSION, CONNECT: CONNECTED + BUSY}) as peer:
         outcome = run("trigger", peer.url, "--application", "5", "--timeout", "0.3")
     outcome.failed(4, "for the application to be loaded; status: BUSY", within=0.6)
