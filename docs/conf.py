@@ -73,7 +73,11 @@ LIMITS = (
     "emulator.links.MAX_LINKS",
     "emulator.links.WRITE_LIMIT",
     "emulator.application.MAX_CONTAINER",
+    "emulator.links.FAREWELL",
     "emulator.traffic.MAX_ENTRIES",
+    "emulator.faults.MAX_FAULTS",
+    "emulator.faults.MAX_FIRED",
+    "emulator.faults.MAX_BYTES",
 )
 """Constants that bound something, below ``smartcam.``."""
 

@@ -7,6 +7,7 @@ an emulator of its own unless it starts one; what they show must be what is prin
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import os
 import re
 import shlex
@@ -18,11 +19,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
+from smartcam import exceptions
+from smartcam.client import SmartCamera
 from smartcam.emulator import Quirks
 from smartcam.models import Status
 from smartcam.protocols.bvs import MESSAGES
 from smartcam.protocols.machine import TRANSITIONS, State
 from smartcam.protocols.messages import wire_fields
+from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,6 +38,8 @@ CAMERA = "bvs://192.168.0.10"
 """The address of a real camera in examples; an emulator's takes its place here."""
 LOCAL = re.compile(r"127\.0\.0\.1:\d{4,5}")
 SECONDS = 20
+OPTIONAL = ("opentelemetry.sdk", "prometheus_client")
+"""What some examples import and the tests do not demand; the extra ``dev`` has it."""
 
 
 class Block(NamedTuple):
@@ -164,6 +170,9 @@ def missing_line(shown: list[str], printed: str) -> str | None:
 @pytest.mark.parametrize("block", blocks("python", PAGES))
 def test_python_block_runs(block: Block, shell: Shell) -> None:
     text = block.text
+    for name in OPTIONAL:
+        if f"from {name}" in text:
+            pytest.importorskip(name)
     if CAMERA in text:
         text = text.replace(CAMERA, shell.emulate(["smartcam-emulator"], 1).strip())
     # empty lines in front, so that a traceback names the page's own lines
@@ -230,6 +239,49 @@ def test_documents_build_without_warnings(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+# ---------------------------------------------------------------------- promises, troubleshooting
+
+
+def test_troubleshooting_has_every_error() -> None:
+    page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^#### `(\w+)`$", page, re.MULTILINE)
+    families = {"SmartCamError", "LinkError", "TriggerError", "ProtocolError"}
+    errors = [name for name in exceptions.__all__ if name.endswith("Error")]
+    assert sorted([*shown, *families]) == sorted(errors)
+
+
+def test_promises_name_tests_that_are_there() -> None:
+    page = (DOCS / "promises.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(tests/[\w/.]*)`", page))
+    assert len(named) > 20
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_promises_have_every_wait_with_its_default() -> None:
+    page = (DOCS / "promises.md").read_text(encoding="utf-8")
+    table = page.partition("\n(waits)=\n")[2].partition("\nWaiting for one's turn")[0]
+    waits = [row for row in rows(table[table.index("\n|") + 1 :]) if len(row) == 3]
+    named: set[str] = set()
+    for call, bound, default in waits:
+        name = call.partition("(")[0]
+        method = inspect.signature(getattr(SmartCamera, name))
+        options = re.findall(r"\b(\w*timeout)\b(?!=)", bound)
+        seconds = [
+            method.parameters[option].default
+            if option in method.parameters
+            else CameraSettings.model_fields[option].default
+            for option in options
+        ]
+        assert default == ", ".join(f"{one:g} s" for one in seconds), call
+        named.add(name)
+    waiting = {
+        name
+        for name, member in vars(SmartCamera).items()
+        if inspect.iscoroutinefunction(member) and not name.startswith("_")
+    }
+    assert named == waiting | {"application", "next_result"}  # these two are no coroutine functions
 
 
 # ---------------------------------------------------------------------- tables

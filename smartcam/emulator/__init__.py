@@ -6,9 +6,11 @@
         emulator.url    # bvs://127.0.0.1:PORT?dialect=handbook
 """
 
+from smartcam.emulator import faults
 from smartcam.emulator.application import Application
 from smartcam.emulator.clock import Clock, ManualClock, RealClock
 from smartcam.emulator.device import Device
+from smartcam.emulator.faults import FiredFault
 from smartcam.emulator.generators import Run, register_generator
 from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scenario import Scenario, load_scenario
@@ -21,6 +23,7 @@ __all__ = [
     "Clock",
     "Device",
     "EmulatedCamera",
+    "FiredFault",
     "LogEntry",
     "ManualClock",
     "Quirks",
@@ -28,6 +31,7 @@ __all__ = [
     "Run",
     "Scenario",
     "TableScene",
+    "faults",
     "load_scenario",
     "register_generator",
 ]

@@ -19,7 +19,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.emulator.clock import NANOSECONDS
-from smartcam.emulator.parts import LOST_CLOCK, CalendarClock, InputQueue
+from smartcam.emulator.parts import LOST_CLOCK, CalendarClock, InputQueue, RunChange
 from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scene import TableScene
 from smartcam.exceptions import ConfigurationError, InterpretationError
@@ -63,7 +63,8 @@ class _Event(enum.IntEnum):
     OVERTRIGGER_ENDS = 1
     LOADED = 2
     BOOTED = 3
-    FREE_RUN = 4
+    BUSY_ENDS = 4
+    FREE_RUN = 5
 
 
 class _Inspection(NamedTuple):
@@ -73,6 +74,7 @@ class _Inspection(NamedTuple):
     turn: int
     time: float
     input: Mapping[str, Any] | None
+    change: RunChange
 
 
 def _ns(seconds: float) -> int:
@@ -121,6 +123,7 @@ class Device:
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
         self._session = False
+        self._owes_switch = False  # the session's
         self._output: list[m.Message] = []
         self._reported: tuple[Status, int] | None = None
         self._conditions = Status(0)
@@ -128,6 +131,9 @@ class Device:
         self._next_number = 0
         self._runs = 0  # of the active application since it was loaded
         self._processing = False
+        self._held_busy = False
+        self._trigger_drops = 0  # triggers still to be dropped
+        self._change = RunChange()  # of the inspection under way, else of the next
         self._inputs = InputQueue(self.quirks.input_queue_depth)
         self._clock = CalendarClock(clock_time, self._now)
         if running:
@@ -203,13 +209,13 @@ class Device:
         camera with a System Error takes no trigger (inferred).
         """
         word = self._conditions
-        if self._mode is Mode.SWITCHING:
+        if self._mode is Mode.SWITCHING or self._held_busy:
             word |= Status.BUSY
         if self._mode is Mode.RUNNING:
             word |= Status.RUNNING
             if self._processing:
                 word |= Status.BUSY if self.quirks.busy_while_processing else Status(0)
-            elif self._active.triggered and not self._faulty:
+            elif self._active.triggered and self._takes_runs:
                 word |= Status.WAITING_FOR_TRIGGER
         return word
 
@@ -235,7 +241,7 @@ class Device:
 
         Source: SC manual p. 28, 29 (published).
         """
-        self._session = True
+        self._session, self._owes_switch = True, False
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
         self._reported = None
         self._report()
@@ -245,7 +251,7 @@ class Device:
 
         Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
         """
-        self._session = False
+        self._session = self._owes_switch = False  # an answer is for who asked
         self._output = []
 
     def take_output(self) -> list[m.Message]:
@@ -312,10 +318,14 @@ class Device:
             self._advance(self._now)
         return True
 
-    def reboot(self) -> None:
-        """Restart the camera, as by its power switch."""
+    def reboot(self, seconds: float | None = None) -> None:
+        """Restart the camera, as by its power switch.
+
+        Args:
+            seconds: until it is up again; None: what the quirk ``reboot_time`` says.
+        """
         with self.around():
-            self._reboot()
+            self._reboot(seconds)
 
     def set_condition(self, condition: Status, on: bool) -> None:
         """Set or clear Overheat or System Error.
@@ -344,6 +354,60 @@ class Device:
         with self.around():
             self._endian = endian
             self._report()
+
+    # ------------------------------------------------------------------ faults
+
+    def hold_busy(self, seconds: float | None = None) -> None:
+        """Set BUSY and keep it; no inspection begins meanwhile.
+
+        Args:
+            seconds: how long; None: until a reboot or :meth:`end_faults`.
+        """
+        with self.around():
+            if self._mode is Mode.REBOOTING:
+                return
+            self._held_busy = True
+            self._events.pop(_Event.BUSY_ENDS, None)
+            if seconds is not None:
+                self._after(seconds, _Event.BUSY_ENDS, self._end_busy)
+            self._report()
+            self._advance(self._now)
+
+    def drop_triggers(self, count: int) -> None:
+        """Drop so many triggers as if the last image were still analysed."""
+        self._trigger_drops += count
+
+    def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
+        """Change the inspection under way, else the next that begins.
+
+        Args:
+            late: seconds that it takes longer.
+            silent: it sends nothing.
+            extra: how often its container comes beside the first time.
+        """
+        with self.around():
+            self._change.late += _ns(late)
+            self._change.silent |= silent
+            self._change.extra += extra
+            if self._processing:
+                when, action = self._events[_Event.INSPECTED]
+                self._events[_Event.INSPECTED] = (when + _ns(late), action)
+
+    def end_faults(self) -> None:
+        """Undo what still lasts of them: BUSY falls, the next triggers are taken as ever."""
+        with self.around():
+            self._forget_faults()
+            self._report()
+
+    def _end_busy(self) -> None:
+        self._held_busy = False
+        self._report()
+
+    def _forget_faults(self) -> None:
+        self._held_busy = False
+        self._events.pop(_Event.BUSY_ENDS, None)
+        self._trigger_drops = 0
+        self._change = RunChange()
 
     # ------------------------------------------------------------------ requests
 
@@ -394,9 +458,10 @@ class Device:
         A stopped, switching or untriggered application ignores it (mvBlueGEMINI manual p. 31 and
         the newest SC manual p. 48, published).
         """
-        if self._mode is not Mode.RUNNING or not self._active.triggered or self._faulty:
+        if self._mode is not Mode.RUNNING or not self._active.triggered or not self._takes_runs:
             return False
-        if self._processing:
+        if self._processing or self._trigger_drops:
+            self._trigger_drops = max(0, self._trigger_drops - 1)
             self._conditions |= Status.OVERTRIGGERED
             self._after(
                 self.quirks.overtriggered_time, _Event.OVERTRIGGER_ENDS, self._end_overtrigger
@@ -421,11 +486,12 @@ class Device:
         self._void_run()
         self._events.pop(_Event.FREE_RUN, None)
         self._mode = Mode.SWITCHING
-        finish = partial(self._finish_load, target, answer=answer, running=running)
+        self._owes_switch = answer
+        finish = partial(self._finish_load, target, running=running)
         self._after(target.load_time, _Event.LOADED, finish)
         self._report()
 
-    def _reboot(self) -> None:
+    def _reboot(self, seconds: float | None = None) -> None:
         """Go down: the session is gone without a word.
 
         Source: mvBlueGEMINI manual p. 31 (published for the sibling).
@@ -436,7 +502,9 @@ class Device:
         self._mode = Mode.REBOOTING
         self._processing = False
         self._events = {}
-        self._after(self.quirks.reboot_time, _Event.BOOTED, self._finish_boot)
+        self._forget_faults()
+        duration = self.quirks.reboot_time if seconds is None else seconds
+        self._after(duration, _Event.BOOTED, self._finish_boot)
 
     # ------------------------------------------------------------------ time
 
@@ -458,12 +526,13 @@ class Device:
         self._conditions &= ~Status.OVERTRIGGERED
         self._report()
 
-    def _finish_load(self, target: Application, *, answer: bool, running: bool) -> None:
+    def _finish_load(self, target: Application, *, running: bool) -> None:
         self._active = target
         self._forget_inputs()
         self._runs = 0
         self._mode = Mode.STOPPED
         message = m.SwitchAnswer(code=0, application=target.id)
+        answer, self._owes_switch = self._owes_switch, False
         before = self.quirks.switch_answer == "before_status"
         if answer and before:
             self._say(message)
@@ -492,6 +561,10 @@ class Device:
         return bool(self._conditions & Status.SYSTEM_ERROR)
 
     @property
+    def _takes_runs(self) -> bool:
+        return not self._faulty and not self._held_busy
+
+    @property
     def _byte_order(self) -> ByteOrder:
         return "big" if self._endian == 1 else "little"
 
@@ -502,8 +575,10 @@ class Device:
 
     def _begin_free_run(self, origin: int, count: int) -> None:
         self._plan_free_run(origin, count + 1)
-        if not self._faulty:
-            self._begin_run()
+        if not self._takes_runs or self._processing:  # the last one is late
+            return
+        self._begin_run()
+        if not self._change.late:
             # a run never reaches into the next, however both were rounded
             (ends, action), (following, _) = (
                 self._events[_Event.INSPECTED],
@@ -513,22 +588,27 @@ class Device:
 
     def _begin_run(self) -> None:
         """Take the next number and the next input container."""
-        run = _Inspection(self._next_number, self._runs, self.time, self._next_input())
+        change = self._change
+        run = _Inspection(self._next_number, self._runs, self.time, self._next_input(), change)
         self._next_number = (self._next_number + 1) % _NUMBERS
         self._runs += 1
         self._processing = True
         finish = partial(self._finish_run, run)
         self._after(self._active.processing_time, _Event.INSPECTED, finish)
+        when, action = self._events[_Event.INSPECTED]
+        self._events[_Event.INSPECTED] = (when + change.late, action)
         self._report()
 
     def _finish_run(self, run: _Inspection) -> None:
         """Send the result, then Waiting for Trigger rises again (the order is a quirk)."""
         self._processing = False
+        self._change = RunChange()
         result = self._result(run)
         if self.quirks.waiting_before_result:
             self._report()
-        if result is not None:
-            self._say(result)
+        if result is not None and not run.change.silent:
+            for _ in range(1 + run.change.extra):
+                self._say(result)
         self._report()
 
     def _result(self, run: _Inspection) -> m.ResultContainer | None:
@@ -549,6 +629,8 @@ class Device:
 
     def _void_run(self) -> None:
         """Drop the inspection under way: no result comes from it (inferred)."""
+        if self._processing:
+            self._change = RunChange()
         self._processing = False
         self._events.pop(_Event.INSPECTED, None)
 

@@ -9,11 +9,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import socket
+import struct
 from abc import ABC, abstractmethod
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal, Protocol, cast
 
+from smartcam.emulator.passage import Passage, Watch
 from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Policy, Role, Transport
@@ -21,14 +24,14 @@ from smartcam.protocols.machine import Machine, State
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from contextlib import AbstractContextManager
 
+    from smartcam.emulator.parcels import Parcel
     from smartcam.emulator.quirks import Quirks
-    from smartcam.protocols.base import Dialect
     from smartcam.protocols.framing import Frame
 
 __all__ = [
     "ACCEPT_PAUSE",
+    "FAREWELL",
     "MAX_INPUT",
     "MAX_LINKS",
     "WRITE_LIMIT",
@@ -52,8 +55,16 @@ ACCEPT_PAUSE = 1.0
 """Seconds until the next try where the system has no socket left."""
 
 WRITE_LIMIT = 1 << 20
-"""Bytes kept for a client that does not read; more end its connection."""
+"""Bytes kept for a client that does not read, or held back by faults; more end its connection."""
 
+FAREWELL = 1.0
+"""Seconds of real time that a client has to close its side after a fault closed the camera's."""
+
+_NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
+
+
+REFUSED = "refuse"
+"""Kind of the fault that closes the port for a time."""
 
 BAD_FRAME: Mapping[str, Policy] = {
     "skip": POLICIES[Role.CAMERA, Transport.TCP],
@@ -62,21 +73,12 @@ BAD_FRAME: Mapping[str, Policy] = {
 """What the quirk ``bad_frame`` means on TCP; a broken body or an unknown id never matters."""
 
 
-class Station(Protocol):
+class Station(Watch, Protocol):
     """What links want from the emulator behind them."""
-
-    @property
-    def spoken(self) -> Dialect:
-        """The dialect."""
-        ...
 
     @property
     def quirks(self) -> Quirks:
         """The quirks."""
-        ...
-
-    def step(self) -> AbstractContextManager[object]:
-        """Bring the device's time up; afterwards deliver what it said."""
         ...
 
     def received(self, link: Link, message: m.Message) -> None:
@@ -95,13 +97,19 @@ class Station(Protocol):
         """A machine saw a frame, or bytes that make none."""
         ...
 
+    def traced_parcel(self, link: Link, sender: m.Sender, parcel: Parcel) -> None:
+        """What faults made of a message has passed, or is lost."""
+        ...
+
 
 class Link(ABC):
     """One client's way to the camera."""
 
     def __init__(self, station: Station, transport: Transport, peer: str) -> None:
         self.peer = peer
-        self.closed = False
+        self.closed: bool = False
+        self.hearing: str | None = None
+        """Kinds of the faults that acted on what the camera hears just now."""
         self._station = station
         self._machine = Machine(
             station.spoken,
@@ -111,31 +119,105 @@ class Link(ABC):
             policy=BAD_FRAME[station.quirks.bad_frame] if transport is Transport.TCP else None,
             trace=self._trace,
         )
+        self._passage: Passage | None = None  # there while faults act
 
     def say(self, message: m.Message) -> None:
         """Put a message behind those that :meth:`flush` will write."""
+        passage = self._passage
+        if self._station.queue.said and passage is None:
+            passage = self._enter_passage()
         try:
             self._machine.send(message)
         except LocalProtocolError as exc:
             _log.warning("! %s: not sent: %s", self.peer, exc)
+            return
+        if passage is not None and passage.saying is not None:
+            passage.say(passage.saying, b"".join(self._machine.data_to_send()))
 
-    @abstractmethod
     def flush(self) -> None:
         """Write everything said."""
+        passage = self._passage
+        if passage is None:
+            self._write_frames(self._machine.data_to_send())
+            return
+        passage.run()
+        if passage.idle:
+            self._passage = None
 
     @abstractmethod
     def close(self, reason: str) -> None:
         """End the link; nothing is read or written any more."""
 
-    def _take(self, data: bytes) -> None:
+    def dismiss(self, reason: str) -> None:
+        """End the link because another client has the session; a dead one stays as it is."""
+        if self._passage is None or not self._passage.dead:
+            self.close(reason)
+
+    def heard(self) -> None:
+        """The camera heard something: write what it said to it."""
+        self.flush()
+
+    def feed(self, data: bytes) -> None:
         """Feed the machine and pass its messages on."""
         self._machine.receive_data(data)
         for event in self._machine.events():
             if isinstance(event, m.Message) and not self.closed:
                 self._station.received(self, event)
 
+    @abstractmethod
+    def write(self, data: bytes) -> bool:
+        """Write bytes that belong together; False if it was not possible."""
+
+    @abstractmethod
+    def part(self, how: Literal["close", "reset"]) -> None:
+        """End the link as a fault has it."""
+
+    @abstractmethod
+    def stop_listening(self) -> None:
+        """Read nothing more."""
+
+    @abstractmethod
+    def heal(self) -> None:
+        """End what a fault does to the link for long."""
+
+    def overflow(self) -> None:
+        """Faults hold back too much."""
+        self.close(f"more than {WRITE_LIMIT} bytes are held back")
+
+    def traced_parcel(self, sender: m.Sender, parcel: Parcel) -> None:
+        """What faults made of a message has passed, or is lost."""
+        self._station.traced_parcel(self, sender, parcel)
+
+    @abstractmethod
+    def _write_frames(self, frames: list[bytes]) -> None:
+        """Write frames as they are."""
+
+    def _take(self, data: bytes) -> None:
+        """Take what came: bytes of a stream, or one datagram."""
+        if self._passage is None and not self._station.queue.heard:
+            self.feed(data)
+        else:
+            self._enter_passage().take(data)
+
+    def _enter_passage(self) -> Passage:
+        if self._passage is None:
+            self._write_frames(self._machine.data_to_send())
+            self._passage = Passage(
+                self._station, self, self._machine, max_length=MAX_INPUT, limit=WRITE_LIMIT
+            )
+        return self._passage
+
+    def _leave(self) -> None:
+        self.closed = True
+        if self._passage is not None:
+            self._passage.close()
+
     def _trace(self, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        self._station.traced(self, sender, what)
+        passage = self._passage
+        if passage is None or sender is m.Sender.CLIENT or isinstance(what, RemoteProtocolError):
+            self._station.traced(self, sender, what)
+        else:
+            passage.saying = what
 
 
 def _peer_text(address: Any) -> str:
@@ -153,12 +235,14 @@ class _TcpLink(Link, asyncio.Protocol):
     def __init__(self, listener: TcpListener, station: Station) -> None:
         super().__init__(station, Transport.TCP, "?")
         self._listener = listener
+        self._farewell: asyncio.TimerHandle | None = None
+        self._end_waits = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
         self.peer = _peer_text(transport.get_extra_info("peername"))
         self._listener.links.add(self)
-        if not self._listener.open:
+        if self._listener.down:
             self.close("the camera is down")
             return
         if len(self._listener.links) > MAX_LINKS:
@@ -169,34 +253,76 @@ class _TcpLink(Link, asyncio.Protocol):
             transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def data_received(self, data: bytes) -> None:
+        if self.closed:  # it says farewell
+            return
         with self._station.step():
             self._take(data)
-            self.flush()  # also what was said before a Disconnect in the same bytes
-            if self._machine.state is State.FAILED:
-                self.close("a broken frame came")
+            self.heard()
+
+    def eof_received(self) -> bool:
+        """The client has closed its side: that waits behind what faults hold back."""
+        self._end_waits = self._passage is not None and self._passage.unheard
+        return self._end_waits
+
+    def heard(self) -> None:
+        self.flush()  # also what was said before a Disconnect in the same bytes
+        if self._machine.state is State.FAILED:
+            self.close("a broken frame came")
+        elif self._end_waits and (self._passage is None or not self._passage.unheard):
+            self._transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self.closed = True
+        if self._farewell is not None:
+            self._farewell.cancel()
+        self._leave()
         self._listener.links.discard(self)
         with self._station.step():
             self._station.lost(self)
 
-    def flush(self) -> None:
-        data = b"".join(self._machine.data_to_send())
-        if not data or self.closed:
-            return
+    def write(self, data: bytes) -> bool:
+        if self.closed:
+            return False
         if self._transport.get_write_buffer_size() + len(data) > WRITE_LIMIT:
             self.close(f"it does not read: more than {WRITE_LIMIT} bytes wait for it")
-            return
+            return False
         self._transport.write(data)
+        return True
 
     def close(self, reason: str) -> None:
+        self._listener.links.discard(self)
         if not self.closed:
-            self.closed = True
+            self._leave()
             _log.info("= %s: connection closed: %s", self.peer, reason)
-            self._transport.abort()
-            self._listener.links.discard(self)
             self._station.lost(self)
+        self._transport.abort()
+
+    def part(self, how: Literal["close", "reset"]) -> None:
+        if how == "reset":
+            with contextlib.suppress(OSError):  # the client may be gone already
+                sock = self._transport.get_extra_info("socket")
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+            self.close("a fault resets it")
+            return
+        self._leave()
+        _log.info("= %s: connection closed: a fault ends it", self.peer)
+        self._station.lost(self)
+        # a socket that is closed with unread bytes sends a reset, so it stays until the client
+        # has closed its side, too
+        with contextlib.suppress(OSError):
+            self._transport.write_eof()
+        loop = asyncio.get_running_loop()
+        self._farewell = loop.call_later(FAREWELL, self._transport.abort)
+
+    def stop_listening(self) -> None:
+        self._transport.pause_reading()
+
+    def heal(self) -> None:
+        if self._passage is not None and self._passage.muted is not None:
+            self.part("reset")
+
+    def _write_frames(self, frames: list[bytes]) -> None:
+        if frames:
+            self.write(b"".join(frames))
 
 
 class Listener(ABC):
@@ -212,6 +338,10 @@ class Listener(ABC):
     @abstractmethod
     async def serve(self, sock: socket.socket) -> None:
         """Serve a bound socket."""
+
+    @abstractmethod
+    def close_port(self) -> None:
+        """Close the port, at once; links stay."""
 
     @abstractmethod
     def shut(self) -> None:
@@ -235,6 +365,8 @@ class TcpListener(Listener):
 
     def __init__(self, station: Station) -> None:
         self.links: set[_TcpLink] = set()
+        self.down: bool = True
+        """Whether connections that were accepted before are too late."""
         self._station = station
         self._socket: socket.socket | None = None
         self._waiting: asyncio.Task[None] | asyncio.TimerHandle | None = None
@@ -245,18 +377,21 @@ class TcpListener(Listener):
         """The links that are open."""
         return list(self.links)
 
-    @property
-    def open(self) -> bool:
-        """Whether the port is open."""
-        return self._socket is not None
-
     async def serve(self, sock: socket.socket) -> None:
         """Serve a bound socket that listens."""
         self._socket = sock
+        self.down = False
         self._listen(sock)
 
     def shut(self) -> None:
         """Close the port and every link, at once; the socket is its owner's to close."""
+        self.down = True
+        self.close_port()
+        for link in self.all_links:
+            link.close("the camera is down")
+
+    def close_port(self) -> None:
+        """Close the port, at once; the socket is its owner's to close."""
         sock, self._socket = self._socket, None
         if sock is not None:
             with contextlib.suppress(NotImplementedError):
@@ -264,8 +399,6 @@ class TcpListener(Listener):
         if self._waiting is not None:
             self._waiting.cancel()
             self._waiting = None
-        for link in self.all_links:
-            link.close("the camera is down")
 
     async def wait_closed(self) -> None:
         """Wait until the event loop has let go of all sockets."""
@@ -340,13 +473,36 @@ class _UdpLink(Link):
             self._take(data)
             self.flush()
 
-    def flush(self) -> None:
-        for frame in self._machine.data_to_send():
+    def write(self, data: bytes) -> bool:
+        return not data or self._listener.send(data, self._address)
+
+    def part(self, how: Literal["close", "reset"]) -> None:
+        self.close(f"a fault ends it ({how})")
+
+    def stop_listening(self) -> None:
+        pass  # the passage takes nothing any more
+
+    def heal(self) -> None:
+        if self._passage is not None and self._passage.muted != REFUSED:
+            self._passage.heal()
+
+    def shut_off(self) -> None:
+        """The port is closed for a time: what is said is lost."""
+        passage = self._enter_passage()
+        passage.muted = passage.muted or REFUSED
+
+    def let_in(self) -> None:
+        """The port is open again."""
+        if self._passage is not None and self._passage.muted == REFUSED:
+            self._passage.muted = None
+
+    def _write_frames(self, frames: list[bytes]) -> None:
+        for frame in frames:
             self._listener.send(frame, self._address)
 
     def close(self, reason: str) -> None:
         if not self.closed:
-            self.closed = True
+            self._leave()
             _log.debug("= %s: forgotten: %s", self.peer, reason)
             self._listener.links.pop(self._address, None)
             self._station.lost(self)
@@ -371,14 +527,25 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         """Serve a bound socket."""
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=sock)
+        for link in self.links.values():
+            link.let_in()
+
+    def close_port(self) -> None:
+        """Close the port, at once; what is said meanwhile is lost."""
+        for link in self.links.values():
+            link.shut_off()
+        self._close_socket()
 
     def shut(self) -> None:
         """Close the port and every link, at once."""
+        self._close_socket()
+        for link in self.all_links:
+            link.close("the camera is down")
+
+    def _close_socket(self) -> None:
         transport, self._transport = self._transport, None
         if transport is not None:
             transport.abort()
-        for link in self.all_links:
-            link.close("the camera is down")
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """Pass it to the link of its address; too many links drop the one silent for longest."""
@@ -394,12 +561,13 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         """Nobody reads the answers at a peer any more; the camera does not notice."""
         _log.debug("! datagram not delivered: %s", exc)
 
-    def send(self, frame: bytes, address: Any) -> None:
-        """Send one datagram."""
+    def send(self, frame: bytes, address: Any) -> bool:
+        """Send one datagram; False if it is lost here."""
         if self._transport is None:
-            return
+            return False
         # the abstract class lacks it, every transport of asyncio has it
         if cast("asyncio.Transport", self._transport).get_write_buffer_size() > WRITE_LIMIT:
             _log.warning("! %s: datagram dropped: the network is too slow", _peer_text(address))
-            return
+            return False
         self._transport.sendto(frame, address)
+        return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["LOST_CLOCK", "CalendarClock", "InputQueue"]
+__all__ = ["LOST_CLOCK", "CalendarClock", "InputQueue", "RunChange"]
 
 LOST_CLOCK = datetime(1970, 1, 1, tzinfo=UTC)
 """What the clock shows after a restart: it is lost (published for a sibling, the value inferred).
@@ -109,3 +110,18 @@ class InputQueue:
         """Forget everything, the last one too."""
         self._queue.clear()
         self._last = None
+
+
+@dataclass(slots=True)
+class RunChange:
+    """What faults change of one inspection.
+
+    Attributes:
+        late: how much longer it takes, nanoseconds.
+        silent: it sends nothing.
+        extra: how often its container comes beside the first time.
+    """
+
+    late: int = 0
+    silent: bool = False
+    extra: int = 0

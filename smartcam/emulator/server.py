@@ -7,22 +7,24 @@ the device says goes ``Device.take_output -> Machine -> one write``. Everything 
 
 from __future__ import annotations
 
-import asyncio
 import logging
-import os
-import socket
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import ValidationError
 
+from smartcam.emulator.acting import Stage, act
 from smartcam.emulator.application import Application, make_application
 from smartcam.emulator.clock import Clock, RealClock
 from smartcam.emulator.device import Device
-from smartcam.emulator.links import MAX_LINKS, TcpListener, UdpListener
+from smartcam.emulator.fault_queue import FaultQueue
+from smartcam.emulator.faults import DeviceFault
+from smartcam.emulator.links import TcpListener, UdpListener
+from smartcam.emulator.port import Port
 from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scenario import Scenario, load_scenario
 from smartcam.emulator.scene import TableScene
+from smartcam.emulator.stranger import Stranger
 from smartcam.emulator.traffic import LogEntry, TrafficLog
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
@@ -32,13 +34,16 @@ from smartcam.settings import validation_text
 
 if TYPE_CHECKING:
     from collections import deque
-    from collections.abc import Generator, Iterable
+    from collections.abc import Generator, Iterable, Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
     from typing import Self
 
     from smartcam.emulator.clock import TimerHandle
+    from smartcam.emulator.fault_queue import Row
+    from smartcam.emulator.faults import BaseFault, Fault, FiredFault
     from smartcam.emulator.links import Link, Listener
+    from smartcam.emulator.parcels import Parcel
     from smartcam.exceptions import RemoteProtocolError
     from smartcam.protocols.base import Dialect, Protocol
     from smartcam.protocols.framing import Frame
@@ -47,7 +52,6 @@ __all__ = ["EmulatedCamera"]
 
 _log = logging.getLogger("smartcam.emulator")
 
-_RETRY = 0.2  # seconds between tries to get the port back after a reboot
 _LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
     Transport.TCP: TcpListener,
     Transport.UDP: UdpListener,
@@ -80,6 +84,8 @@ class EmulatedCamera:
         running: in run mode from the beginning.
         seed: of the scene's noise; default 0.
         builtins: have the built-in applications.
+        faults: exact misbehaviour, in order: faults of :mod:`smartcam.emulator.faults`, or mappings
+            of their fields with ``kind``. Those that wait for no message happen when it starts.
 
     Attributes:
         host: as given.
@@ -112,6 +118,7 @@ class EmulatedCamera:
         running: bool | None = None,
         seed: int | None = None,
         builtins: bool | None = None,
+        faults: Iterable[BaseFault | Mapping[str, Any]] = (),
     ) -> None:
         plan = _plan(
             scenario,
@@ -144,30 +151,35 @@ class EmulatedCamera:
         kind = _known({t.value: t for t in Transport}, "transport", transport)
         self._scheme = next(s for s, t in self._protocol.schemes.items() if t is kind)
         self._listener: Listener = _LISTENERS[kind](self)
+        self._port = Port(self._listener, host, port, self.name)
         self._traffic = TrafficLog(self.spoken)
-        self._port = port
-        self._address: tuple[int, Any] = (socket.AF_INET, (host, port))
-        self._socket: socket.socket | None = None
-        self._opening: asyncio.Task[None] | None = None
-        self._active: Link | None = None
+        self.queue: FaultQueue = FaultQueue(self.spoken, self.clock, self.device.applications)
+        self._stage = Stage(
+            device=self.device, refuse=self._refuse, let_stranger_in=self._let_stranger_in
+        )
+        self._active: Link | Stranger | None = None
+        self._refusal: TimerHandle | None = None
+        self._refused_until = 0.0
+        self._stepping = False
         self._started = False
         self._down = False
         self._moved_at = 0.0
         self._timer: TimerHandle | None = None
         self._timer_at: float | None = None
+        self.queue.add(faults)
 
     # ------------------------------------------------------------------ what it is
 
     @property
     def port(self) -> int:
         """The port it listens on; the one given until it is started."""
-        return self._port
+        return self._port.number
 
     @property
     def url(self) -> str:
         """Its address with the dialect pinned."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self._scheme}://{host}:{self._port}?dialect={self.dialect}"
+        return f"{self._scheme}://{host}:{self.port}?dialect={self.dialect}"
 
     @property
     def scene(self) -> TableScene:
@@ -198,6 +210,16 @@ class EmulatedCamera:
     def links(self) -> list[str]:
         """Address and port of all clients that are connected, with a session or without."""
         return [link.peer for link in self._listener.all_links]
+
+    @property
+    def faults(self) -> list[Fault]:
+        """The faults that still wait, in the order in which they were given."""
+        return self.queue.waiting
+
+    @property
+    def fired(self) -> deque[FiredFault]:
+        """The last faults that have happened, oldest first."""
+        return self.queue.fired
 
     async def wait_received(
         self, what: int | type[m.Message], *, count: int = 1, timeout: float = 5.0
@@ -244,22 +266,16 @@ class EmulatedCamera:
         if self._started:
             return
         try:
-            self._address = await self._resolve()
-            self._socket = self._bind()
-            self._port = self._socket.getsockname()[1]
-            await self._listener.serve(self._socket)
+            await self._port.open()
         except (OSError, ValueError, OverflowError) as exc:
-            self._shut()
             raise ConfigurationError(
-                f"emulator: cannot listen on {self.transport} {self.host}:{self._port}: {exc}"
+                f"emulator: cannot listen on {self.transport} {self.host}:{self.port}: {exc}"
             ) from exc
-        except BaseException:
-            self._shut()
-            raise
         self._started = True
         self._down = False
         self._moved_at = self.clock.now
-        self._arm()
+        with self.step():
+            self._act_at_once()
         _log.info("= %s: listening on %s", self.name, self.url)
 
     async def stop(self) -> None:
@@ -270,36 +286,115 @@ class EmulatedCamera:
         if self._started:
             self._started = False
             self._disarm()
-            self._shut()
-            opening, self._opening = self._opening, None
-            if opening is not None:
-                await asyncio.wait({opening})
-            await self._listener.wait_closed()
+            self._end_refusal()
+            if isinstance(self._active, Stranger):
+                self._leave_session()
+            self._port.shut()
+            await self._port.wait_closed()
+
+    # ------------------------------------------------------------------ faults
+
+    def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
+        """Add faults behind those that wait; what waits for no message happens now.
+
+        Call it in the event loop's thread. Before the emulator is started they wait until then.
+
+        Args:
+            faults: faults of :mod:`smartcam.emulator.faults`, or mappings with ``kind``.
+
+        Raises:
+            ConfigurationError: one is wrong, or too many would wait; none was added.
+        """
+        self.queue.add(faults)
+        if self._started:
+            with self.step():
+                self._act_at_once()
+
+    def clear_faults(self) -> None:
+        """Forget the faults that wait, and end those that last.
+
+        BUSY falls, the port opens, the second client goes, connections that are half open or
+        stalled are reset. What is delayed comes at its time, and a reboot takes its time.
+        """
+        self.queue.clear()
+        with self.step():
+            self.device.end_faults()
+            self._end_refusal()
+            if isinstance(self._active, Stranger):
+                self._leave_session()
+            for link in self._listener.all_links:
+                link.heal()
+
+    def _refuse(self, seconds: float) -> None:
+        """Close the port for a time; connections that are open stay."""
+        self._refused_until = max(self._refused_until, self.clock.now + seconds)
+        if self._refusal is not None:
+            self._refusal.cancel()
+        elif not self._down:
+            self._port.close()
+        self._refusal = self.clock.call_at(self._refused_until, self._wake_port)
+
+    def _let_stranger_in(self) -> None:
+        """Another client connects and gets the session, unless a quirk refuses newcomers."""
+        if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
+            return
+        self._hand_session(Stranger(self.spoken, self._traced_stranger))
+
+    def _act_at_once(self) -> None:
+        self._act(self.queue.at_once(), None)
+
+    def _provoke(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
+        """Let the device faults happen that come before a message; return all it brings about."""
+        if not waiting:
+            return ()
+        faults = self.queue.by_message(waiting, message)
+        self._act(faults, "before")
+        return faults
+
+    def _act(self, faults: Iterable[Fault], when: Literal["before", "after"] | None) -> None:
+        """Let device faults happen; what the camera says to it wakes no other device fault."""
+        for fault in faults:
+            if isinstance(fault, DeviceFault) and when in {None, fault.when}:
+                act(self._stage, fault)
+                self._say_all(self.device.take_output(), provoke=False)
 
     # ------------------------------------------------------------------ steps
 
     @contextmanager
     def step(self) -> Generator[None]:
-        """Bring the device's time up, do the body, deliver what came of it, set the timer."""
-        if not self._started:
+        """Bring the device's time up, do the body, deliver what came of it, set the timer.
+
+        Inside another step it is a part of that one.
+        """
+        if not self._started or self._stepping:
             yield
             return
-        self._move()
+        self._stepping = True
         try:
-            yield
+            self._move()
+            try:
+                yield
+            finally:
+                if self._started:
+                    self._settle()
         finally:
-            if self._started:
-                self._settle()
+            self._stepping = False
 
     def received(self, link: Link, message: m.Message) -> None:
         """A link received a message; who has no session is heard with Connect only."""
-        if isinstance(message, m.Connect):
+        connects = isinstance(message, m.Connect)
+        if not connects and link is not self._active:
+            return
+        faults = self._provoke(self.queue.device_heard, message)
+        if connects and not link.closed:
             self._connect(link)
-        elif link is self._active:
+        elif link is self._active:  # a fault may have given the session to another
             self.device.handle(message)
             if isinstance(message, m.Disconnect):
                 self._active = None
         self._collect()
+        if faults:
+            self._act(faults, "after")
 
     def serves(self, link: Link) -> bool:
         """Whether the link has the session."""
@@ -308,28 +403,51 @@ class EmulatedCamera:
     def lost(self, link: Link) -> None:
         """A link is gone; if it had the session, that is over."""
         if link is self._active:
-            self._active = None
-            self.device.disconnect()
+            self._leave_session()
 
     def traced(self, link: Link, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
         """A machine saw a frame, or bytes that make none."""
-        entry = self._traffic.add(self.clock.now, link.peer, sender, what)
+        entry = self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
         if _log.isEnabledFor(logging.DEBUG):
             mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
             _log.debug("%s %s: %s", mark, link.peer, entry.error or entry.message or what)
 
+    def traced_parcel(self, link: Link, sender: m.Sender, parcel: Parcel) -> None:
+        """What faults made of a message has passed, or is lost."""
+        self._trace_parcel(link.peer, sender, parcel)
+
+    def _traced_stranger(self, parcel: Parcel) -> None:
+        self._trace_parcel(Stranger.peer, m.Sender.CAMERA, parcel)
+
+    def _trace_parcel(self, peer: str, sender: m.Sender, parcel: Parcel) -> None:
+        entry = self._traffic.add_parcel(self.clock.now, peer, sender, parcel)
+        if _log.isEnabledFor(logging.DEBUG):
+            mark = "<" if entry.direction == "in" else ">"
+            what = entry.message or parcel.what
+            _log.debug("%s %s: %s (%s; on the wire: %s)", mark, peer, what, entry.fault, entry.wire)
+
     def _connect(self, link: Link) -> None:
         """Give the session to ``link``: the newcomer wins, unless a quirk says otherwise."""
+        if not self._may_take_over(link):
+            link.close("another client has the session")
+            return
+        self._hand_session(link)
+
+    def _may_take_over(self, newcomer: Link | None) -> bool:
+        free = self._active is None or self._active is newcomer
+        return free or self.transport != "tcp" or self.quirks.second_client != "refuse"
+
+    def _hand_session(self, newcomer: Link | Stranger) -> None:
         old = self._active
-        if old is not None and old is not link:
-            if self.transport == "tcp" and self.quirks.second_client == "refuse":
-                link.close(f"{old.peer} has the session")
-                return
-            self._active = None
-            self.device.disconnect()
-            old.close(f"{link.peer} takes the session over")
-        self._active = link
+        if old is not None and old is not newcomer:
+            self._leave_session()
+            old.dismiss(f"{newcomer.peer} takes the session over")
+        self._active = newcomer
         self.device.handle(m.Connect())
+
+    def _leave_session(self) -> None:
+        self._active = None
+        self.device.disconnect()
 
     def _wake(self) -> None:
         self._timer = self._timer_at = None
@@ -344,9 +462,21 @@ class EmulatedCamera:
     def _collect(self) -> None:
         """Put what the device said into the active link's next write."""
         output = self.device.take_output()
-        if self._active is not None:
+        if self.queue.device_said:
+            self._say_all(output, provoke=True)
+        elif self._active is not None:
+            say = self._active.say
             for message in output:
-                self._active.say(message)
+                say(message)
+
+    def _say_all(self, output: list[m.Message], *, provoke: bool) -> None:
+        """Say messages to the one that has the session; they may bring faults about."""
+        session = self._active
+        for message in output:
+            faults = self._provoke(self.queue.device_said, message) if provoke else ()
+            if session is not None and session is self._active and self.device.connected:
+                session.say(message)
+            self._act(faults, "after")
 
     def _settle(self) -> None:
         self._collect()
@@ -375,63 +505,32 @@ class EmulatedCamera:
 
     # ------------------------------------------------------------------ the port
 
-    async def _resolve(self) -> tuple[int, Any]:
-        loop = asyncio.get_running_loop()
-        found = await loop.getaddrinfo(self.host, self._port, type=self._listener.kind)
-        return found[0][0], found[0][4]
-
-    def _bind(self) -> socket.socket:
-        family, address = self._address
-        sock = socket.socket(family, self._listener.kind)
-        try:
-            sock.setblocking(False)
-            if self._listener.kind is socket.SOCK_STREAM and os.name == "posix":
-                # the camera comes up on its old port while old connections linger
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            sock.bind((address[0], self._port, *address[2:]))
-            if self._listener.kind is socket.SOCK_STREAM:
-                sock.listen(MAX_LINKS)
-        except BaseException:
-            sock.close()
-            raise
-        return sock
-
     def _go_down(self) -> None:
         """The camera restarts: every connection is lost, the port is shut."""
         _log.info("= %s: rebooting", self.name)
         self._down = True
-        self._shut()
+        self._active = None
+        self._port.shut()
 
     def _come_up(self) -> None:
-        """Open the port again, at once if possible."""
+        """The camera is there again."""
         _log.info("= %s: up again", self.name)
         self._down = False
-        try:
-            self._socket = self._bind()
-        except OSError:
-            self._socket = None  # another program took it, or the loop has not let go of it yet
-        self._opening = asyncio.get_running_loop().create_task(
-            self._reopen(), name=f"smartcam.emulator[{self.name}].reopen"
-        )
+        if self._refusal is None:
+            self._port.reopen()
 
-    async def _reopen(self) -> None:
-        while True:
-            try:
-                self._socket = self._socket or self._bind()
-                await self._listener.serve(self._socket)
-            except OSError as exc:
-                _log.warning("! %s: port %d is not to be had: %s", self.name, self._port, exc)
-                await asyncio.sleep(_RETRY)
-            else:
-                return
+    def _end_refusal(self) -> None:
+        """Open the port that a fault closed."""
+        refusal, self._refusal = self._refusal, None
+        self._refused_until = 0.0
+        if refusal is not None:
+            refusal.cancel()
+            if self._started and not self._down:
+                self._port.reopen()
 
-    def _shut(self) -> None:
-        if self._opening is not None:
-            self._opening.cancel()
-        self._listener.shut()
-        sock, self._socket = self._socket, None
-        if sock is not None:
-            sock.close()  # serves nothing yet, or is closed already
+    def _wake_port(self) -> None:
+        with self.step():
+            self._end_refusal()
 
 
 def _known(table: Any, what: str, name: str) -> Any:

@@ -10,6 +10,7 @@ from smartcam.exceptions import RemoteProtocolError, ResponseTimeoutError
 from smartcam.protocols.messages import Message, Sender, UnknownMessage
 
 if TYPE_CHECKING:
+    from smartcam.emulator.parcels import Parcel
     from smartcam.protocols.base import Dialect
     from smartcam.protocols.framing import Frame
 
@@ -17,6 +18,9 @@ __all__ = ["LogEntry", "TrafficLog"]
 
 MAX_ENTRIES = 10_000
 """Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
+
+
+Direction = Literal["in", "out"]
 
 
 class LogEntry(NamedTuple):
@@ -32,15 +36,23 @@ class LogEntry(NamedTuple):
         hex: the frame's payload, or the first bytes that make no frame.
         error: why it was ignored, None for a frame. A whole frame that is ignored has two
             entries: the frame, then the reason.
+        fault: kinds of the faults that acted on it, in order; ``connection ended`` or ``not sent``
+            behind them where it was lost for that reason. None where none did. The entry of a
+            message is made when it has passed, or is lost. What the camera sends is told as it
+            meant it, what it hears as it heard it.
+        wire: the bytes that really passed, header included, as hex; empty for nothing. None: those
+            of the frame.
     """
 
     time: float
-    direction: Literal["in", "out"]
+    direction: Direction
     peer: str
     message_id: int | None
     message: Message | None
     hex: str
     error: str | None = None
+    fault: str | None = None
+    wire: str | None = None
 
 
 class TrafficLog:
@@ -53,18 +65,42 @@ class TrafficLog:
         self._changed = asyncio.Event()
 
     def add(
-        self, time: float, peer: str, sender: Sender, what: Frame | RemoteProtocolError
+        self,
+        time: float,
+        peer: str,
+        sender: Sender,
+        what: Frame | RemoteProtocolError,
+        fault: str | None = None,
     ) -> LogEntry:
         """Keep what a machine traced, and return it as an entry."""
-        direction: Literal["in", "out"] = "in" if sender is Sender.CLIENT else "out"
+        direction: Direction = "in" if sender is Sender.CLIENT else "out"
         if isinstance(what, RemoteProtocolError):
-            entry = LogEntry(time, direction, peer, None, None, what.data.hex(" "), str(what))
+            data, error = what.data.hex(" "), str(what)
+            entry = LogEntry(time, direction, peer, None, None, data, error, fault)
         else:
+            message_id, payload = what
             message = self._decode(sender, what)
-            payload = what.payload.hex(" ")
-            entry = LogEntry(time, direction, peer, what.message_id, message, payload)
+            entry = LogEntry(
+                time, direction, peer, message_id, message, payload.hex(" "), None, fault
+            )
             if sender is Sender.CLIENT:
-                self._count(what.message_id, message)
+                self._count(message_id, message)
+        self.entries.append(entry)
+        return entry
+
+    def add_parcel(self, time: float, peer: str, sender: Sender, parcel: Parcel) -> LogEntry:
+        """Keep what faults made of a message, and return it as an entry."""
+        direction: Direction = "in" if sender is Sender.CLIENT else "out"
+        what, wire = parcel.what, parcel.wire
+        if isinstance(what, bytes):
+            entry = LogEntry(time, direction, peer, None, None, what.hex(" "))
+        else:
+            message_id, payload = what
+            message = self._decode(sender, what)
+            entry = LogEntry(time, direction, peer, message_id, message, payload.hex(" "))
+        entry = entry._replace(
+            fault=", ".join(parcel.faults) or None, wire=None if wire is None else wire.hex(" ")
+        )
         self.entries.append(entry)
         return entry
 

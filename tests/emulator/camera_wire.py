@@ -113,6 +113,65 @@ class TcpClient:
         assert rest == b""
 
 
+class RawClient:
+    """A TCP socket without streams: it tells an orderly end from a reset."""
+
+    def __init__(self, emulator: EmulatedCamera) -> None:
+        self.socket = socket.create_connection((emulator.host, emulator.port), timeout=TIMEOUT)
+        self.socket.setblocking(False)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self.socket.close()
+
+    @property
+    def address(self) -> str:
+        """Its address as the emulator tells it."""
+        host, port = self.socket.getsockname()
+        return f"{host}:{port}"
+
+    def send(self, *frames: bytes) -> None:
+        self.socket.send(b"".join(frames))
+
+    async def receive(self, limit: int = 1 << 16) -> bytes:
+        """Return what one call of recv gives."""
+        async with asyncio.timeout(TIMEOUT):
+            return await asyncio.get_running_loop().sock_recv(self.socket, limit)
+
+    async def expect(self, *frames: bytes) -> None:
+        """Read exactly these bytes."""
+        for expected in frames:
+            got = b""
+            while len(got) < len(expected):
+                data = await self.receive(len(expected) - len(got))
+                assert data, f"the end came after {got.hex(' ')}"
+                got += data
+            assert got.hex(" ") == expected.hex(" ")
+
+    async def expect_fin(self) -> None:
+        """See the orderly end, and nothing before it."""
+        assert await self.receive() == b""
+
+    async def expect_reset(self) -> None:
+        """See a reset, and nothing before it."""
+        try:
+            data = await self.receive()
+        except ConnectionResetError:
+            return
+        raise AssertionError(f"no reset: {data.hex(' ') or 'the orderly end'}")
+
+    def expect_silence(self) -> None:
+        """See that nothing has come so far."""
+        try:
+            data = self.socket.recv(1)
+        except BlockingIOError:
+            return
+        raise AssertionError(f"something came: {data.hex(' ') or 'the orderly end'}")
+
+
 class UdpClient:
     """A plain UDP client."""
 
@@ -143,3 +202,17 @@ class UdpClient:
         """See that nothing was on its way: the next datagram answers ``request``."""
         self.send(request)
         await self.expect(answer)
+
+    @property
+    def address(self) -> str:
+        """Its address as the emulator tells it."""
+        host, port = self.socket.getsockname()
+        return f"{host}:{port}"
+
+    def expect_silence(self) -> None:
+        """See that nothing has come so far."""
+        try:
+            data = self.socket.recv(1 << 16)
+        except BlockingIOError:
+            return
+        raise AssertionError(f"something came: {data.hex(' ')}")

@@ -135,11 +135,11 @@ async def test_start_cancelled_leaves_it_stopped(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(emulator._listener, "serve", serve)
     task = asyncio.create_task(emulator.start())
-    await until(lambda: emulator._socket is not None)
+    await until(lambda: emulator._port._socket is not None)
     task.cancel()
     await asyncio.wait({task})
     assert task.cancelled()
-    assert emulator._socket is None
+    assert emulator._port._socket is None
     assert await refused(emulator)
 
 
@@ -155,7 +155,7 @@ async def test_accept_that_fails_is_tried_again(
                 raise failures.pop(0)
             return super().accept()
 
-    monkeypatch.setattr("smartcam.emulator.server.socket.socket", Scarce)
+    monkeypatch.setattr("smartcam.emulator.port.socket.socket", Scarce)
     async with EmulatedCamera() as emulator:
         monkeypatch.undo()
         async with await TcpClient.open(emulator) as client:
@@ -284,7 +284,7 @@ async def test_reboot_stop_while_it_comes_up() -> None:
 async def test_reboot_port_taken_meanwhile_is_tried_again(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("smartcam.emulator.server._RETRY", 0.001)
+    monkeypatch.setattr("smartcam.emulator.port._RETRY", 0.001)
     clock = ManualClock()
     async with EmulatedCamera(clock=clock) as emulator:
         emulator.device.reboot()
@@ -293,7 +293,9 @@ async def test_reboot_port_taken_meanwhile_is_tried_again(
             clock.advance(30.0)
             await until(lambda: "is not to be had" in caplog.text)
         thief.close()
-        await until(lambda: emulator._opening is not None and emulator._opening.done())
+        opening = emulator._port._opening
+        assert opening is not None
+        await until(opening.done)
         async with await TcpClient.open(emulator) as client:
             client.send(wire.CONNECT)
             await client.expect(*HELLO)

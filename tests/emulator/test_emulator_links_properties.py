@@ -11,13 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.emulator import Quirks
+from smartcam.emulator import ManualClock, Quirks
+from smartcam.emulator.fault_queue import FaultQueue
 from smartcam.emulator.links import MAX_INPUT, TcpListener, _TcpLink
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import HANDBOOK
 
 if TYPE_CHECKING:
     from smartcam.emulator.links import Link
+    from smartcam.emulator.parcels import Parcel
 
 PIECES = st.one_of(
     st.sampled_from(
@@ -64,6 +66,8 @@ class Station:
     quirks = Quirks()
 
     def __init__(self) -> None:
+        self.clock = ManualClock()
+        self.queue = FaultQueue(HANDBOOK, self.clock)
         self.messages: list[m.Message] = []
 
     def step(self) -> nullcontext[None]:
@@ -83,11 +87,14 @@ class Station:
     def traced(self, link: Link, sender: m.Sender, what: object) -> None:
         pass
 
+    def traced_parcel(self, link: Link, sender: m.Sender, parcel: Parcel) -> None:
+        pass
+
 
 def open_link() -> tuple[_TcpLink, Station]:
     station = Station()
     listener = TcpListener(station)
-    listener._socket = object()  # type: ignore[assignment]  # it counts as open
+    listener.down = False
     link = _TcpLink(listener, station)
     link.connection_made(Transport())
     return link, station
@@ -129,5 +136,6 @@ def test_link_closed_is_closed_once(times: int) -> None:
     for _ in range(times):
         link.close("enough")
     assert link.closed
+    assert not link.write(b"?")
     link.data_received(wire.CONNECT)
     assert station.messages == []
