@@ -39,7 +39,7 @@ FEWEST_NUMBERS = 64
 """Triggers until a narrow field's numbers begin again; its step is smaller for that."""
 
 MAX_OWED = 1024
-"""Numbers of given-up triggers that are remembered; an older one's result counts as streamed."""
+"""Given-up triggers that are remembered; an older one's result counts as streamed."""
 
 
 @dataclass(slots=True)
@@ -86,48 +86,61 @@ class Verdict(NamedTuple):
     extra: bool = False
 
 
+@dataclass(slots=True, eq=False)
+class _Owed:
+    """Results of a trigger that was given up, which may still come."""
+
+    fate: Debt
+    number: int | None
+    missing: int
+
+
 class Attribution:
     """Decides whose each container is; knows no wire and no time.
 
     Attributes:
         pending: the trigger under way.
-        debt: fate of the result of an earlier trigger that may still come.
         unsettled: a result of somebody else's inspection may still be in flight.
         numbering: how to read a container's number while ours are about; None where none is.
     """
 
     def __init__(self) -> None:
         self.pending: PendingTrigger | None = None
-        self.debt: Debt | None = None
         self.unsettled: bool = False
         self.numbering: Interpretation | None = None
         self._ordered = False
         self._drops_waiting = False  # the camera is known to show a trigger in its status
         self._satisfied = False  # the last trigger has its results, no other inspection was seen
-        self._owed: dict[int, Debt] = {}
+        self._owed: list[_Owed] = []
+        self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
         self._last_number: int | None = None  # of the last trigger that had its results
         # another client's numbers, perhaps still in flight, lie elsewhere most probably
         self._turn = random.randrange(1, 1 << 20)  # noqa: S311
         self._given: int | None = None
+
+    @property
+    def debt(self) -> Debt | None:
+        """Fate of the result of an earlier trigger that may still come."""
+        return self._owed[0].fate if self._owed else None
 
     # ------------------------------------------------------------------ the session
 
     def begin_session(self, *, ordered: bool) -> None:
         """A new link: what earlier triggers owe may still come over it."""
         self._ordered = ordered
-        self._drops_waiting = self._satisfied = False
-        self.unsettled = False
+        self._satisfied = self.unsettled = False
 
     def settled(self) -> None:
         """Nothing of before can come: the application was stopped, and all of that was heard."""
-        self.debt, self.unsettled, self._satisfied = None, False, False
+        self._owed.clear()
+        self._satisfied = self.unsettled = False
 
     # ------------------------------------------------------------------ the trigger
 
     def take_number(self, highest: int) -> int:
         """Return the next trigger's number, 0 to ``highest``: the one the user has set, or ours."""
         given, self._given = self._given, None
-        if given is not None and given <= highest:
+        if given is not None and given <= highest and given not in self._given_up:
             return given
         self._turn += 1
         step = min(NUMBER_STEP, (highest + 1) // FEWEST_NUMBERS)
@@ -147,16 +160,24 @@ class Attribution:
         """The trigger has all its results."""
         self._satisfied, self._last_number = True, pending.number
 
-    def give_up(self, pending: PendingTrigger, debt: Debt = "late") -> None:
-        """Nobody waits for the trigger any more; its result may still come."""
-        if pending.given_up or len(pending.results) >= pending.wanted:
+    def give_up(self, pending: PendingTrigger, fate: Debt = "late", *, unread: int = 0) -> None:
+        """Nobody waits for the trigger any more; its results may still come.
+
+        Args:
+            pending: the trigger.
+            fate: of what still comes.
+            unread: containers of it that came and could not be interpreted.
+        """
+        missing = pending.wanted - len(pending.results) - unread
+        if pending.given_up or missing <= 0:
             return
         pending.given_up = True
-        self.debt = debt
+        self._owed.append(_Owed(fate, pending.number, missing))
+        del self._owed[:-MAX_OWED]
         if pending.number is not None:
-            self._owed[pending.number] = debt
-            if len(self._owed) > MAX_OWED:
-                del self._owed[next(iter(self._owed))]
+            self._given_up[pending.number] = fate
+            if len(self._given_up) > MAX_OWED:
+                del self._given_up[next(iter(self._given_up))]
 
     # ------------------------------------------------------------------ what comes
 
@@ -166,9 +187,10 @@ class Attribution:
             return
         if previous is not None and Status.WAITING_FOR_TRIGGER not in previous:
             return
+        self._drops_waiting = self._drops_waiting or previous is not None
         pending = self.pending
         if pending is not None and not pending.outcome.done():
-            pending.dropped_waiting = self._drops_waiting = True
+            pending.dropped_waiting = True
         else:
             self._satisfied = False
             self.unsettled = self.debt is None  # else it is our own that was given up
@@ -191,13 +213,22 @@ class Attribution:
         return self._judge_other(number)
 
     def _judge_other(self, number: int | None) -> Verdict:
-        if number is not None and (number in self._owed or number == self._last_number):
-            if number not in self._owed:
-                return Verdict("nobody", extra=True)
-            fate = self._owed.pop(number)
-            self.debt = None if not self._owed else self.debt
-            return Verdict(fate)
-        if self.debt is not None and not (self._owed and number is not None):
-            fate, self.debt = self.debt, None
-            return Verdict(fate)
+        if number is not None and number in self._given_up:
+            self._pay([one for one in self._owed if one.number == number])
+            return Verdict(self._given_up[number])
+        if number is not None and number == self._last_number:
+            return Verdict("nobody", extra=True)
+        # a number that is none of ours may be that of a trigger that was sent without one
+        open_ = [one for one in self._owed if number is None or one.number is None]
+        if open_:
+            return Verdict(self._pay(open_))
         return Verdict("nobody", extra=self._satisfied)
+
+    def _pay(self, owed: list[_Owed]) -> Debt:
+        """One result of the first of these has come."""
+        if not owed:
+            return "late"
+        owed[0].missing -= 1
+        if owed[0].missing == 0:
+            self._owed.remove(owed[0])
+        return owed[0].fate

@@ -29,11 +29,11 @@ def is_transient(error: BaseException) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Backoff:
-    """Delays between tries to reach a camera again: each is longer than the one before.
+    """Delays between tries to reach a camera again, which grow up to a maximum.
 
     Attributes:
         initial: the first delay, seconds. A link that was cut is often back at once.
-        factor: how much longer each delay is than the one before.
+        factor: how much longer each delay is than the one before, until ``maximum``.
         maximum: the longest delay, seconds. A rebooting camera is away for about 30 s.
         jitter: share of each delay that is left to chance, so that many clients do not come all at
             the same instant: 0 (none) to 1.

@@ -431,11 +431,11 @@ class Conversation:
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
         if input_data is not None:
-            inbox.input_in_doubt = True  # until its result is there
             words.append(m.SetInput(data=input_data))
         inbox.attribution.send(pending)
         try:
             link.send(*words, m.Trigger())
+            inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
             async with asyncio.timeout_at(deadline):
                 await link.drain()
                 return await outcome

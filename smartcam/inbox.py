@@ -323,7 +323,7 @@ class Inbox:
             result = self._interpret(container, owner, now, at)
         except InterpretationError as error:
             account.fates["late" if fate == "late" else "uninterpretable"] += 1
-            self._deliver_error(error, owner, now, current=current)
+            self._deliver_error(error, owner, number, now, current=current)
         else:
             account.fates[fate] += 1
             self._deliver(result, owner, now, current=current)
@@ -381,7 +381,13 @@ class Inbox:
                 owner.outcome.set_result(owner.results)
 
     def _deliver_error(
-        self, error: InterpretationError, owner: PendingTrigger | None, now: float, *, current: bool
+        self,
+        error: InterpretationError,
+        owner: PendingTrigger | None,
+        number: int | None,
+        now: float,
+        *,
+        current: bool,
     ) -> None:
         for stream in tuple(self.result_streams):
             stream.offer(error, now)
@@ -392,9 +398,10 @@ class Inbox:
             self._observers.error(self.name, error)
             return
         self._end_input_doubt(owner)
-        if owner.number is not None or owner.wanted > 1:
-            self.attribution.give_up(owner)  # its own may still come
-        else:
+        # where its number cannot be read, it may be another's, and its own still come
+        certain = owner.number is None or number == owner.number
+        self.attribution.give_up(owner, unread=int(certain))
+        if not owner.given_up:
             self.attribution.done(owner)
         owner.outcome.set_exception(error)
 

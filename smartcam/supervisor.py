@@ -215,7 +215,8 @@ class Supervisor:
                 return error
             silence = _silence(error, self._settings.liveness_timeout)
             short = asyncio.get_running_loop().time() - silence - made_at < TAKEN_WITHIN
-            if again and short and not self._excused and _may_be_taken(error):
+            ordered = session.link.machine.transport is Transport.TCP
+            if again and short and not self._excused and _may_be_taken(error, ordered=ordered):
                 return self._taken(error)
             self._short_lived = self._short_lived + 1 if again and short else 0
             self._excused = restarting
@@ -329,9 +330,16 @@ class Supervisor:
 
 def _silence(error: ConnectionLostError, liveness_timeout: float | None) -> float:
     """Return how many seconds ago a link was lost when it is noticed: only silence may tell."""
-    return liveness_timeout or 0.0 if isinstance(error.__cause__, TimeoutError) else 0.0
+    cause = error.__cause__
+    if isinstance(cause, ResponseTimeoutError) or not isinstance(cause, TimeoutError):
+        return 0.0
+    return liveness_timeout or 0.0
 
 
-def _may_be_taken(error: ConnectionLostError) -> bool:
-    """Whether it may be another client's doing; a broken frame and a fault of ours are not."""
-    return isinstance(error.__cause__, OSError)
+def _may_be_taken(error: ConnectionLostError, *, ordered: bool) -> bool:
+    """Whether it may be another client's doing.
+
+    A broken frame and a fault of ours are not, nor, on TCP, is an answer that came too late for us.
+    """
+    cause = error.__cause__
+    return isinstance(cause, OSError) and not (ordered and isinstance(cause, ResponseTimeoutError))

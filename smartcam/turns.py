@@ -235,7 +235,6 @@ class Turns:
         """Have an application and a run state, by the least that is needed; None: as it is."""
         talk = self._talk
         deadline = talk.deadline(self._switch_timeout)
-        await talk.until(lambda status: Status.BUSY not in status, deadline, "not BUSY")
         active = await talk.query_loaded(deadline)
         if application is not None and active != application:
             await talk.switch(application, deadline, start=running is True)

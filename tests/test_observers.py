@@ -1,0 +1,173 @@
+"""What observers see, in which order, and what becomes of one that fails."""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import smartcam
+from smartcam import Connected, Observer, Result, SmartCamError
+from smartcam.connection import TraceEntry
+from smartcam.observers import Observers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+AT = datetime(2024, 5, 1, tzinfo=UTC)
+FRAME = TraceEntry(AT, "press 4", ">", 0x40, "Trigger", {}, "00")
+EVENT = Connected(camera="press 4", at=AT, url="bvs://127.0.0.1:1")
+RESULT = Result("press 4", 7, None, 1, None, AT, None, b"", b"")
+ERROR = SmartCamError("no result")
+
+
+class Everything(Observer):
+    """Notes every call."""
+
+    def __init__(self, name: str, calls: list[tuple[Any, ...]]) -> None:
+        self.name = name
+        self.calls = calls
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        self.calls.append((self.name, "frame", entry))
+
+    def on_state(self, event: smartcam.CameraEvent) -> None:
+        self.calls.append((self.name, "state", event))
+
+    def on_result(self, result: Result) -> None:
+        self.calls.append((self.name, "result", result))
+
+    def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
+        self.calls.append((self.name, "error", camera, error, triggered_at))
+
+
+class Broken(Everything):
+    """Raises at every call, after it has noted it."""
+
+    def _fail(self) -> None:
+        raise RuntimeError("the observer's own")
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        super().on_frame(entry)
+        self._fail()
+
+    def on_state(self, event: smartcam.CameraEvent) -> None:
+        super().on_state(event)
+        self._fail()
+
+    def on_result(self, result: Result) -> None:
+        super().on_result(result)
+        self._fail()
+
+    def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
+        super().on_error(camera, error, triggered_at)
+        self._fail()
+
+
+class Blind(Observer):
+    """Overrides nothing."""
+
+
+def _frame(observers: Observers) -> None:
+    trace = observers.trace
+    assert trace is not None
+    trace(FRAME)
+
+
+HOOKS: dict[str, tuple[Callable[[Observers], None], tuple[Any, ...]]] = {
+    "frame": (_frame, (FRAME,)),
+    "state": (lambda observers: observers.state(EVENT), (EVENT,)),
+    "result": (lambda observers: observers.result(RESULT), (RESULT,)),
+    "error": (
+        lambda observers: observers.error("press 4", ERROR, AT),
+        ("press 4", ERROR, AT),
+    ),
+}
+EACH = pytest.mark.parametrize("hook", HOOKS)
+
+
+@EACH
+def test_hook_gets_what_it_is_told(hook: str) -> None:
+    calls: list[tuple[Any, ...]] = []
+    call, arguments = HOOKS[hook]
+    call(Observers([Everything("one", calls)]))
+    assert calls == [("one", hook, *arguments)]
+
+
+@EACH
+def test_hooks_are_called_in_the_order_given(hook: str) -> None:
+    calls: list[tuple[Any, ...]] = []
+    HOOKS[hook][0](Observers(Everything(name, calls) for name in ("one", "two", "three")))
+    assert [call[0] for call in calls] == ["one", "two", "three"]
+
+
+@EACH
+def test_observer_that_raises_is_logged_and_the_rest_are_called(
+    hook: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls: list[tuple[Any, ...]] = []
+    HOOKS[hook][0](
+        Observers([Everything("one", calls), Broken("two", calls), Everything("three", calls)])
+    )
+    assert [call[0] for call in calls] == ["one", "two", "three"]
+    (record,) = caplog.records
+    assert (record.name, record.levelno) == ("smartcam.client", logging.ERROR)
+    assert "an observer failed" in record.getMessage()
+    assert f"on_{hook}" in record.getMessage()
+    assert record.exc_info is not None
+    assert str(record.exc_info[1]) == "the observer's own"
+
+
+@EACH
+def test_observer_that_overrides_nothing_does_nothing(hook: str) -> None:
+    call = HOOKS[hook][0]
+    if hook == "frame":
+        assert Observers([Blind()]).trace is None
+    else:
+        call(Observers([Blind()]))
+
+
+def test_error_that_is_no_triggers_has_no_time() -> None:
+    calls: list[tuple[Any, ...]] = []
+    Observers([Everything("one", calls)]).error("press 4", ERROR)
+    assert calls == [("one", "error", "press 4", ERROR, None)]
+
+
+def test_frames_are_not_asked_for_where_nobody_looks() -> None:
+    assert Observers().trace is None
+    assert Observers([Blind(), Observer()]).trace is None
+
+
+def test_frames_go_only_to_observers_that_look() -> None:
+    calls: list[tuple[Any, ...]] = []
+    looking: list[Observer] = [Blind(), Everything("one", calls), Blind()]
+    trace = Observers(looking).trace
+    assert trace is not None
+    trace(FRAME)
+    assert calls == [("one", "frame", FRAME)]
+
+
+def test_frames_go_to_an_observer_that_inherits_the_hook() -> None:
+    class Heir(Everything):
+        pass
+
+    assert Observers([Heir("heir", [])]).trace is not None
+
+
+def test_observers_given_as_a_generator_are_kept() -> None:
+    calls: list[tuple[Any, ...]] = []
+    observers = Observers(Everything("one", calls) for _ in range(1))
+    for _ in range(2):
+        observers.result(RESULT)
+    assert len(calls) == 2
+
+
+def test_exit_is_not_held_up_by_an_observer() -> None:
+    class Quitter(Observer):
+        def on_result(self, result: Result) -> None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Observers([Quitter()]).result(RESULT)
