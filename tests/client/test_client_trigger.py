@@ -402,7 +402,7 @@ async def test_input_of_a_trigger_without_result_is_never_taken_for_the_next() -
 async def test_trigger_when_busy_mistyped_is_refused() -> None:
     async with by_hand() as (_, camera):
         with pytest.raises(ConfigurationError, match="when_busy is 'wait' or 'refuse'"):
-            await camera.trigger(when_busy="refused")  # type: ignore[arg-type]
+            await camera.trigger(when_busy="refused")  # type: ignore[call-overload]
 
 
 # ---------------------------------------------------------------------- turns and debts
