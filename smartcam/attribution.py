@@ -222,7 +222,7 @@ class Attribution:
         open_ = [one for one in self._owed if number is None or one.number is None]
         if open_:
             return Verdict(self._pay(open_))
-        return Verdict("nobody", extra=self._satisfied)
+        return Verdict("nobody", extra=self._satisfied and number is None)
 
     def _pay(self, owed: list[_Owed]) -> Debt:
         """One result of the first of these has come."""

@@ -280,7 +280,8 @@ class SmartCamera:
         Cancellation: safe.
         """
         self._talk.require_link()
-        return await self._talk.until(predicate, self._talk.deadline(timeout), "the status wanted")
+        deadline = self._talk.deadline(timeout)
+        return await self._talk.until(predicate, deadline, "the status wanted", insist=False)
 
     async def wait_ready(self, timeout: float = 10.0) -> Status:
         """Wait until the camera is not BUSY, and Running if a start was asked for.
@@ -554,7 +555,8 @@ class SmartCamera:
         """Set the number of the next run (0 to 4294967295); nothing confirms it.
 
         :meth:`trigger` takes it for the next run's where the layout has an ``@sequence`` field;
-        otherwise it picks numbers of its own there.
+        otherwise it picks numbers of its own there. A run that something else triggers in between
+        would take this number: then leave the numbers to :meth:`trigger`.
 
         Raises:
             LocalProtocolError: the number does not fit.

@@ -23,6 +23,7 @@ from smartcam.exceptions import (
     ConfigurationError,
     ConnectionClosedError,
     InputContainerError,
+    LocalProtocolError,
     NotRunningError,
     RemoteProtocolError,
     ResponseTimeoutError,
@@ -240,22 +241,62 @@ class Conversation:
             lock.release()
 
     async def until(
-        self, predicate: Callable[[Status], bool], deadline: float, what: str
+        self,
+        predicate: Callable[[Status], bool],
+        deadline: float,
+        what: str,
+        *,
+        insist: bool = True,
     ) -> Status:
         """Wait for a status.
+
+        Args:
+            predicate: says which.
+            deadline: loop time.
+            what: it in words.
+            insist: have it said again where it may have been lost.
 
         Raises:
             ResponseTimeoutError: says what was waited for and what the status is.
         """
         begin = asyncio.get_running_loop().time()
         try:
-            return await self.inbox.wait_status(predicate, deadline)
+            if not insist:
+                return await self.inbox.wait_status(predicate, deadline)
+            return await self._wait_status(predicate, deadline)
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
                 f"{self.name}: waited {round(waited, 2):g} s for {what}; status: {self.status}",
                 waited=waited,
             ) from exc
+
+    async def _wait_status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
+        """Wait for a status; over UDP, where one may be lost, have it said again half-way.
+
+        Raises:
+            TimeoutError: at ``deadline``.
+        """
+        if not self._ordered:
+            now = asyncio.get_running_loop().time()
+            with contextlib.suppress(TimeoutError):
+                return await self.inbox.wait_status(predicate, now + 0.5 * (deadline - now))
+            await self._ask_for_status(deadline)
+        return await self.inbox.wait_status(predicate, deadline)
+
+    async def _ask_for_status(self, deadline: float) -> None:
+        """Have the camera say its status: Connect brings one (SC manual p. 29, published).
+
+        A Query goes first: who has lost the session must not take it back by this.
+        """
+        link = self.require_link()
+        try:
+            await self._fence(deadline)
+            link.send(m.Connect())
+        except ResponseTimeoutError:
+            pass  # its own time may not be over; liveness sees to the rest
+        except LocalProtocolError as exc:  # the last one's answer never came
+            link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 
     # ------------------------------------------------------------------ run state, application
 
@@ -493,7 +534,7 @@ class Conversation:
                     f"{self.name}: the camera does not wait for a trigger: {status}"
                 )
             try:
-                await self.inbox.wait_status(_is_decided, deadline)
+                await self._wait_status(_is_decided, deadline)
             except TimeoutError as exc:
                 free = _WHY_READY if is_ready(status) else ""
                 waited = max(0.0, deadline - begin)

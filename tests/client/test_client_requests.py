@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ from camera_by_hand import (
 )
 from clientkit import SHORT, by_hand, cancelled, emulated, steps, until
 
+import smartcam
 from smartcam import (
     ConnectionLostError,
     InterpretationError,
@@ -382,3 +384,25 @@ async def test_answer_of_another_kind_than_asked_for_is_an_error() -> None:
         del camera._inbox.answers[m.QueryAnswer]
         with pytest.raises(RemoteProtocolError, match="QueryAnswer was expected"):
             await asking
+
+
+class _SlowWatcher(smartcam.Observer):
+    """Somebody's callback that holds the loop up when the application changes."""
+
+    def on_state(self, event: smartcam.CameraEvent) -> None:
+        if isinstance(event, smartcam.ApplicationChanged) and event.previous is not None:
+            time.sleep(3 * SHORT)
+
+
+async def test_owed_answer_and_another_question_before_its_waiter_wakes() -> None:
+    watchers = [_SlowWatcher()]
+    async with by_hand(liveness_timeout=4 * SHORT, observers=watchers) as (box, camera):
+        usual = box.script[QUERY]
+        box.script[QUERY] = lambda _: b""
+        await box.wait_for(QUERY, 2)  # liveness asks
+        asking = asyncio.create_task(camera.query_application())
+        await steps(2)
+        box.script[QUERY] = usual
+        box.active = 3
+        box.send(box.frame(QUERY, words(3)))
+        assert await asking == 3

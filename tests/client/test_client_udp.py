@@ -16,6 +16,7 @@ from camera_by_hand import (
     QUERY,
     READY,
     RESULT,
+    RUNNING,
     START,
     STATUS,
     STOP,
@@ -191,3 +192,34 @@ async def test_newcomer_over_udp_takes_the_session() -> None:
         assert (await second.trigger()).raw == struct.pack("20s", b"Hello World")
         with pytest.raises(TriggerTimeoutError):
             await first.trigger(timeout=SHORT)
+
+
+async def test_status_that_is_lost_is_said_again() -> None:
+    async with by_hand(box={"transport": "udp"}) as (box, camera):
+        usual = box.script[TRIGGER]
+        box.script[TRIGGER] = lambda _: box.status_frame(RUNNING) + box.result_frame(b"first")
+        assert (await camera.trigger()).raw == b"first"
+        box.script[TRIGGER] = usual
+        box.status = READY  # its datagram was lost
+        assert (await camera.trigger(timeout=4 * SHORT)).raw == b"found"
+        assert box.ids[-3:] == [QUERY, CONNECT, TRIGGER]
+
+
+async def test_status_that_is_lost_is_not_asked_for_where_the_session_is_gone() -> None:
+    async with by_hand(box={"transport": "udp"}) as (box, camera):
+        box.send(box.status_frame(RUNNING))
+        await camera.wait_status(lambda status: Status.WAITING_FOR_TRIGGER not in status)
+        box.script[QUERY] = lambda _: b""
+        with pytest.raises(TriggerTimeoutError, match="did not wait for a trigger"):
+            await camera.trigger(timeout=2 * SHORT)
+        assert box.ids.count(CONNECT) == 1
+
+
+async def test_answer_to_the_connect_that_asks_for_a_status_may_be_lost_once() -> None:
+    async with by_hand(box={"transport": "udp"}) as (box, camera):
+        box.send(box.status_frame(RUNNING))
+        await camera.wait_status(lambda status: Status.WAITING_FOR_TRIGGER not in status)
+        box.script[CONNECT] = lambda _: b""
+        for error in (TriggerTimeoutError, ConnectionLostError):
+            with pytest.raises(error):
+                await camera.trigger(timeout=2 * SHORT)
