@@ -1,0 +1,212 @@
+"""First inputs: the frames of the golden vectors, the layouts and scenarios of the documents."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import struct
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fuzz_interpreters import SPECS
+
+from smartcam.emulator.application import BUILTIN_APPLICATIONS, LOCALIZATIONS
+from smartcam.exceptions import LayoutError
+from smartcam.layout import Layout
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import Role, Transport
+from smartcam.protocols.bvs import BVS, MESSAGES
+from smartcam.protocols.machine import State
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["seeds"]
+
+ROOT = Path(__file__).parents[2]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+FILES = (*sorted((ROOT / "examples").rglob("*.yaml")),)
+LAYOUT = re.compile(r"\"([^\"\n]*\w: ?(?:u?int\d|real\d|bool|string\[)[^\"\n]*)\"")
+URL = re.compile(r"bvs(?:\+udp)?://[^\s\"'`)>]+")
+
+ODD_YAML = (
+    "&a {name: *a}",
+    "applications: &a [{id: *a}, *a]",
+    "<<: [{name: x}, {seed: 1}]",
+    'name: "\\ud800 \\U0001F600"',
+    "? [name]\n: 1",
+    "seed: 1:30:30",
+    "active: 0xffffffffffffffffffffff",
+    "running: 2001-01-01 00:00:00 +23:59",
+    "name: !!binary aGVsbG8=",
+    "applications: !!pairs [id: 5]",
+    "name: &x [a, a]\nactive: &y [*x, *x]\nseed: &z [*y, *y]\nquirks: [*z, *z]",
+    'applications:\n  - {id: 5, layout: "n: int32", constant: [.nan]}',
+    'applications:\n  - {id: 5, layout: "s: string[3]", constant: {s: "\\ud800"}}',
+    'applications:\n  - {id: 5, layout: "(s: string[9])*", slots: 65535, constant: []}',
+    'applications:\n  - {id: 5, layout: "n: int32", generator: input, input: "n: int32"}',
+    'applications:\n  - {id: 5, layout: "x: real32", generator: tangram, parameters: {pieces: 5}}',
+    'applications:\n  - {id: 5, layout: "n: int8", generator: sequence, rate: 1000}\nrunning: true',
+)
+"""What YAML can say and nobody writes."""
+
+WRONG_LAYOUTS = (
+    "x: int8, x: int8",
+    "n: bool, (x: int8)[n]",
+    "n: int8, (x: int8)[m]",
+    "(x: int8)[0]",
+    "s: string[65536]",
+    "records: int8, (x: int8)*",
+    "a: int8 @sequence, b: int8 @sequence",
+    "x: bool mm",
+    "class: int8",
+    "(x: (y: int8)*)*",
+    "x: float",
+    "x: int8 y: int8",
+    "_x: int8",
+)
+"""Mistakes that a text can have."""
+
+PART = struct.pack("<50sfifff", b"bolt", 0.98, 0, 0.112, 0.045, 0.31)
+
+
+def seeds(name: str) -> list[bytes]:
+    """Return the first inputs of a target, each once."""
+    return list(dict.fromkeys(_MAKERS[name]()))
+
+
+def vectors() -> Iterator[tuple[int, m.Sender, bytes]]:
+    """Yield dialect's place, sender and bytes of every golden vector."""
+    for place, dialect in enumerate(BVS.dialects):
+        path = ROOT / "tests" / "vectors" / f"bvs_{dialect}.toml"
+        given: list[dict[str, Any]] = tomllib.loads(path.read_text(encoding="utf-8"))["vector"]
+        for one in given:
+            yield place, m.Sender(one["sender"]), bytes.fromhex(one["hex"])
+
+
+def broken_lengths(frame: bytes, limit: int) -> Iterator[bytes]:
+    """Yield a frame with lengths that are impossible, too large, or one too small or too large."""
+    length = int.from_bytes(frame[4:8], "little")
+    for wrong in {0, 3, length - 1, length + 1, limit + 1, limit + 5, 0xFFFFFFFF} - {-1, length}:
+        yield frame[:4] + wrong.to_bytes(4, "little") + frame[8:]
+
+
+def documents() -> str:
+    """Return the text of every page."""
+    return "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+
+
+def layouts() -> Iterator[str]:
+    """Yield the layout texts of the documents and of the built-in applications."""
+    yield from (application.layout or "" for application in BUILTIN_APPLICATIONS)
+    yield from LAYOUT.findall(documents())
+    yield from WRONG_LAYOUTS
+
+
+def _framing() -> Iterator[bytes]:
+    limit, as_bytes, cuts = 64, 0, (b"\0", b"\1\5", b"\1\1", b"\2\0\x0d")
+    for turn, (place, _, frame) in enumerate(vectors()):
+        yield bytes((place, limit, as_bytes)) + cuts[turn % len(cuts)] + frame
+        if turn % 4 == 0:
+            yield bytes((place, limit, turn % 3)) + cuts[1] + frame[3:] + frame + frame[:7]
+    for place, _, frame in vectors():
+        for broken in broken_lengths(frame, limit):
+            yield bytes((place, limit, as_bytes, 0)) + broken + frame
+
+
+def _messages() -> Iterator[bytes]:
+    for place, sender, frame in vectors():
+        number = int.from_bytes(frame[8:12], "little")
+        row = next((i for i, row in enumerate(MESSAGES) if row.message_id == number), None)
+        sent_by = list(m.Sender).index(sender)
+        chosen = b"\xff" + frame[8:12] if row is None else bytes((row,))
+        yield bytes((place, sent_by)) + chosen + frame[12:]
+
+
+def _machine() -> Iterator[bytes]:
+    connecting, connected = (list(State).index(one) for one in (State.CONNECTING, State.CONNECTED))
+    for place, sender, frame in vectors():
+        role = list(Role).index(Role.CLIENT if sender is m.Sender.CAMERA else Role.CAMERA)
+        for transport in range(len(Transport)):
+            for state in (0, connecting, connected):
+                start = bytes((place, role, transport, 0, state, 64))
+                yield start + bytes((0, len(frame))) + frame
+                for broken in broken_lengths(frame, 64):
+                    yield start + bytes((0, len(frame))) + broken + bytes((0, len(frame))) + frame
+    # a session in the client's role: what it says, and what comes to that
+    says = [bytes((5, place, 0)) for place in range(18)]
+    frames = [f for place, who, f in vectors() if place == 0 and who is m.Sender.CAMERA]
+    hears = b"".join(bytes((0, len(frame))) + frame for frame in frames[:4])
+    yield bytes((0, 0, 0, 0, 0, 64)) + says[0] + hears + says[5] + hears + says[7] + says[9] + hears
+
+
+def _layout() -> Iterator[bytes]:
+    payload = bytes.fromhex("ff 02000000 0000cb42 000050c0 4142430000000000")
+    for turn, text in enumerate(layouts()):
+        yield text.encode() + b"\0" + bytes(((4, 6, 4 + 8, 4 + 16, 4 + 32)[turn % 5], 2)) + payload
+
+
+def _interpreters() -> Iterator[bytes]:
+    for place in range(len(SPECS)):
+        for options in (0, 4, 6):
+            yield bytes((place, options, place % 2, 1)) + PART
+    yield bytes((0, 0, 0, 9)) + PART + bytes(len(PART)) + PART
+    yield bytes((4, 0, 0, 9)) + b"a short text".ljust(50, b"\0") + b"x" * 50 + bytes(50)
+
+
+def _scenario() -> Iterator[bytes]:
+    texts = [path.read_text(encoding="utf-8") for path in FILES]
+    texts += re.findall(r"^```yaml\n(.*?)^```$", documents(), re.DOTALL | re.MULTILINE)
+    yield from (text.encode() for text in ODD_YAML)
+    for text in texts:
+        yield text.encode()
+        begin, *parts = re.split(r"^(?=  - id:)", text, flags=re.MULTILINE)
+        for part in parts:
+            yield b"applications:\n" + part.encode()
+        yield begin.encode()
+
+
+def _layout_file() -> Iterator[bytes]:
+    for text in layouts():
+        yield text.encode()
+        with contextlib.suppress(LayoutError):  # the documents show mistakes as well
+            yield Layout(text).to_yaml().encode()
+    yield from (text.encode() for text in ODD_YAML)
+
+
+def _camera() -> Iterator[bytes]:
+    requests = [bytes((2, place)) for place in range(8)]
+    for application in range(len(BUILTIN_APPLICATIONS) + 1):
+        for place in range(8):
+            start = bytes((place % 2, place % 4, application, place // 4))
+            yield start + requests[0] + b"\x05ab\xff" + requests[1] + b"\x07\x07" + requests[place]
+            yield start + bytes((8, place, 1)) + requests[place] + b"\x03\x01\x07" + requests[0]
+    for place, sender, frame in vectors():
+        if sender is m.Sender.CLIENT:
+            yield bytes((place, 0, 1, 1, 0, len(frame))) + frame + b"\x06\x05"
+
+
+def _address() -> Iterator[bytes]:
+    for url in URL.findall(documents()):
+        yield b"\0" + url.encode()
+    for host in ("192.168.0.10", "[::1]:36701", "camera-3.local:1"):
+        yield b"\x01" + host.encode()
+
+
+def _spec() -> Iterator[bytes]:
+    yield from (text.encode() for text in (*SPECS, *layouts(), f"table: {LOCALIZATIONS}"))
+
+
+_MAKERS: dict[str, Callable[[], Iterator[bytes]]] = {
+    "framing": _framing,
+    "messages": _messages,
+    "machine": _machine,
+    "layout": _layout,
+    "interpreters": _interpreters,
+    "scenario": _scenario,
+    "camera": _camera,
+    "layout_file": _layout_file,
+    "address": _address,
+    "spec": _spec,
+}

@@ -1,0 +1,166 @@
+"""The short form of fuzzing: every input of the corpora and some thousand changed ones.
+
+Needs no atheris. Inputs that are named, not numbered, were findings once.
+"""
+
+from __future__ import annotations
+
+import random
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from fuzz_known import KNOWN, describe, known
+from fuzz_seeds import seeds
+from fuzz_targets import CORPUS, TARGETS, Target
+
+import smartcam.emulator.scenario as scenario_module
+import smartcam.layout as layout_module
+from smartcam.emulator import Device
+from smartcam.interpreters.localizations import Localizations
+from smartcam.layout import Layout
+from smartcam.layout.text import parse_text
+from smartcam.protocols.base import Dialect
+from smartcam.protocols.framing import Framer
+from smartcam.protocols.machine import Machine
+from smartcam.settings import Address
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+SEED = 20_240_229
+CHANGED = {"scenario": 60, "layout_file": 60, "camera": 60, "layout": 200}
+"""Changed inputs of the slow targets; the others get :data:`MANY`."""
+MANY = 700
+LARGEST_CORPUS = 300_000
+
+each_target = pytest.mark.parametrize("target", TARGETS.values(), ids=lambda one: one.name)
+
+
+def files(target: Target) -> list[Path]:
+    return sorted(target.corpus.iterdir())
+
+
+def row_of(path: Path) -> Any:
+    """Return the row of :data:`KNOWN` that the file of a finding belongs to, None for another."""
+    return next(
+        (row for row in KNOWN if row.target == path.parent.name and path.name.startswith(row.name)),
+        None,
+    )
+
+
+def run(target: Target, data: bytes, what: str) -> None:
+    """Check one input; what is found and not known fails with the input."""
+    try:
+        target.load()(data)
+    except Exception as error:
+        if known(target.name, error) is None:
+            error.add_note(
+                f"{what}\npython tests/fuzz/fuzz.py --reproduce {target.name} {data.hex()}"
+            )
+            raise
+
+
+def run_corpus(target: Target) -> None:
+    for path in files(target):
+        run(target, path.read_bytes(), path.name)
+
+
+@each_target
+def test_corpus_gives_no_finding(target: Target) -> None:
+    assert any(row_of(path) is None for path in files(target))
+    run_corpus(target)
+
+
+@each_target
+def test_seeds_give_no_finding(target: Target) -> None:
+    first = seeds(target.name)
+    assert first
+    for data in first:
+        run(target, data, "a seed")
+
+
+@each_target
+def test_changed_inputs_give_no_finding(target: Target) -> None:
+    inputs = [path.read_bytes() for path in files(target) if row_of(path) is None]
+    made = changed([*inputs, *seeds(target.name)], target)
+    for number, data in enumerate(islice(made, CHANGED.get(target.name, MANY))):
+        run(target, data, f"changed input {number} of seed {SEED}")
+
+
+def changed(inputs: list[bytes], target: Target) -> Iterator[bytes]:
+    """Yield inputs with some bytes changed, cut out, put in or taken from one another."""
+    dice = random.Random(f"{SEED} {target.name}")  # noqa: S311 - the same ones always
+    words = (*target.words, b"\0", b"\xff", b"\x7f\xff")
+    while True:
+        data = bytearray(dice.choice(inputs))
+        for _ in range(dice.randint(1, 4)):
+            at = dice.randint(0, len(data))
+            end = dice.randint(at, min(len(data), at + 8))
+            other = dice.choice(inputs)
+            begin = dice.randint(0, len(other))
+            data[at:end] = dice.choice(
+                (b"", dice.randbytes(end - at), dice.choice(words), other[begin : begin + 16])
+            )
+        yield bytes(data[: target.max_length])
+
+
+# ---------------------------------------------------------------------- what is known
+
+
+FINDINGS = [path for path in sorted(CORPUS.glob("*/*")) if row_of(path) is not None]
+
+
+@pytest.mark.parametrize("path", FINDINGS, ids=lambda path: f"{path.parent.name}-{path.name}")
+def test_known_finding_is_still_there(path: Path) -> None:
+    """Where this fails the mistake is mended: delete its row of ``KNOWN``, keep the input."""
+    row = row_of(path)
+    with pytest.raises(Exception) as caught:  # noqa: PT011 - the row says which
+        TARGETS[row.target].load()(path.read_bytes())
+    assert known(row.target, caught.value) is not None, describe(caught.value)
+
+
+def test_every_known_finding_has_its_input() -> None:
+    assert set(KNOWN) == {row_of(path) for path in FINDINGS}
+
+
+# ---------------------------------------------------------------------- the net has no holes
+
+
+def divide_by_zero(*_: object) -> float:
+    return 1 / 0
+
+
+def forget_everything(framer: Framer) -> int:
+    skipped = framer.buffered
+    framer.clear()
+    return skipped
+
+
+MISTAKES: dict[str, tuple[object, str, Any]] = {
+    "framing": (Framer, "resync", forget_everything),
+    "messages": (Dialect, "surplus", lambda *_: 0),
+    "machine": (Machine, "_wanted", lambda *_: True),
+    "layout": (Layout, "sequence", lambda *_: None),
+    "interpreters": (Localizations, "_check_finite", lambda *_: None),
+    "scenario": (scenario_module, "_line", divide_by_zero),
+    "camera": (Device, "_report", lambda *_: None),
+    "layout_file": (Layout, "to_yaml", lambda _: "x: bool"),
+    "address": (Address, "url", property(lambda address: f"bvs://{address.host}")),
+    "spec": (layout_module, "parse_text", lambda text, start: parse_text(text[start:])),
+}
+"""A mistake for each target: what is replaced, and by what."""
+
+
+@each_target
+def test_corpus_finds_a_mistake(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(*MISTAKES[target.name])
+    with pytest.raises((AssertionError, ArithmeticError)):
+        run_corpus(target)
+
+
+def test_corpora_are_small_and_belong_to_a_target() -> None:
+    paths = [path for path in CORPUS.rglob("*") if path.is_file()]
+    assert {path.parent.name for path in paths} == set(TARGETS)
+    assert sum(path.stat().st_size for path in paths) < LARGEST_CORPUS

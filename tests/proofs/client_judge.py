@@ -1,0 +1,514 @@
+"""A real client and the emulated camera on one loop, and somebody who judges what comes of it.
+
+For the stateful test of the client: its rules start calls and meddle; what must hold stands here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from client_model import CameraModel, Program, TimedLoop
+
+import smartcam
+from smartcam import (
+    Backoff,
+    Connected,
+    ConnectionClosedError,
+    ConnectionLostError,
+    ConnectionTakenError,
+    Disconnected,
+    Observer,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+)
+from smartcam.emulator import EmulatedCamera
+from smartcam.emulator.device import Mode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+    from client_model import Run as Inspection
+
+    from smartcam import CameraEvent, SmartCamera
+    from smartcam.connection import TraceEntry
+    from smartcam.emulator.generators import Run
+    from smartcam.settings import CameraOptions
+    from smartcam.streams import Subscription
+
+__all__ = [
+    "COMMAND_ERRORS",
+    "FED",
+    "FREE",
+    "LINE",
+    "LINK_ERRORS",
+    "OTHER",
+    "TRIGGER_ERRORS",
+    "Call",
+    "ClientJudge",
+]
+
+# Times of the camera end in odd microseconds, those of the rules do not: so the model never has to
+# say which of two things comes first at one instant.
+LINE, OTHER, FREE, FED = 7, 3, 9, 5
+PROGRAMS = {
+    LINE: Program(processing=0.080137, loading=0.120311),
+    OTHER: Program(processing=0.020731, loading=0.050173),
+    FREE: Program(processing=0.010937, loading=0.050419, rate=3.0),
+    FED: Program(processing=0.030517, loading=0.070829),
+}
+REBOOT_TIME = 0.400631
+TAKEN_WITHIN = 10.0
+A_MOMENT = 1e-5
+"""Seconds of the loop's time in which nothing happens but what can happen at once."""
+MOST_CALLS = 8
+
+LINK_ERRORS = (ConnectionLostError, ConnectionTakenError, ConnectionClosedError)
+TRIGGER_ERRORS = (
+    smartcam.OvertriggeredError,
+    smartcam.NotRunningError,
+    smartcam.CameraBusyError,
+    smartcam.CameraFaultError,
+    smartcam.InputContainerError,
+    smartcam.TriggerTimeoutError,
+    smartcam.WrongApplicationError,
+    smartcam.InterpretationError,
+    smartcam.CommandRejectedError,
+    smartcam.UnsupportedError,
+    *LINK_ERRORS,
+)
+COMMAND_ERRORS = (smartcam.ResponseTimeoutError, smartcam.CommandRejectedError, *LINK_ERRORS)
+
+CALLER: contextvars.ContextVar[int] = contextvars.ContextVar("CALLER", default=-1)
+
+
+@dataclass(eq=False, slots=True)
+class Call:
+    """A call of the client that goes on beside the rules.
+
+    Attributes:
+        kind: name of the method.
+        key: which call it is.
+        task: that runs it.
+        errors: what it may end with.
+        losses: how many links were lost before it.
+        part: input data sent with a trigger.
+        cancelled: whether a rule cancelled it.
+        outlives: it may go on after a loss: what waits for a session, and the user's own code.
+    """
+
+    kind: str
+    key: int
+    task: asyncio.Task[Any]
+    errors: tuple[type[BaseException], ...]
+    losses: int
+    part: int | None = None
+    cancelled: bool = False
+    outlives: bool = False
+
+
+@dataclass(slots=True)
+class Witness(Observer):
+    """Sees which call sends a trigger, over which link, and what happens to the links."""
+
+    loop: asyncio.AbstractEventLoop
+    camera: SmartCamera | None = None
+    peers: list[str] = field(default_factory=list[str])
+    received_before: int = 0
+    sends: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
+    events: list[tuple[float, CameraEvent]] = field(
+        default_factory=list[tuple[float, "CameraEvent"]]
+    )
+    losses: int = 0
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        if entry.direction == ">" and entry.message == "Trigger":
+            self.sends[self.peers[-1]].append(CALLER.get())
+
+    def on_state(self, event: CameraEvent) -> None:
+        assert self.camera is not None
+        self.events.append((self.loop.time(), event))
+        if isinstance(event, Connected | Reconnected):
+            session = self.camera._supervisor.session
+            assert session is not None
+            host, port = session.link._transport.get_extra_info("sockname")
+            self.peers.append(f"{host}:{port}")
+            self.sends[self.peers[-1]] = []
+            self.received_before = self.camera.statistics().received
+        elif isinstance(event, Disconnected):
+            self.losses += 1
+
+
+class ClientJudge:
+    """Client, camera and model, on a loop of their own.
+
+    Attributes:
+        calls: those that have not ended yet.
+        given_up: keys of the triggers that ended without a result.
+        delivered: triggers of the present client that gave a result.
+        undecided: those that did not, though the client may have counted their result.
+        taken: numbers of the results that each stream gave.
+        quiet: nothing more happens at once.
+    """
+
+    transport: ClassVar[Literal["tcp", "udp"]] = "tcp"
+    numbered: ClassVar[bool] = False
+
+    def __init__(self) -> None:
+        self.runner = asyncio.Runner(loop_factory=TimedLoop)
+        self.loop = self.runner.get_loop()
+        self.calls: list[Call] = []
+        self.count = 0
+        self.numbers = 0
+        self.camera: SmartCamera | None = None
+        self.witness: Witness | None = None
+        self.streams: list[Subscription[Result]] = []
+        self.taken: dict[int, list[int]] = {}
+        self.delivered = 0
+        self.undecided = 0
+        self.given_up: set[int] = set()
+        self.box: EmulatedCamera
+        self.model = CameraModel(PROGRAMS, LINE, REBOOT_TIME)
+        self.origin = 0.0
+        self.quiet = True
+
+    def _make_box(self, quirks: dict[str, Any]) -> EmulatedCamera:
+        def values(run: Run) -> dict[str, int]:
+            part = (run.input or {}).get("part", 0)
+            return {"n": run.number, "part": part, "at": round(run.time * 1e6) % (1 << 32)}
+
+        return EmulatedCamera(
+            [
+                {
+                    "id": key,
+                    "layout": "n: int32, part: int32, at: uint32",
+                    "generator": values,
+                    "input": "part: int32" if key == FED else None,
+                    "load_time": program.loading,
+                    "processing_time": program.processing,
+                    "rate": program.rate,
+                }
+                for key, program in PROGRAMS.items()
+            ],
+            transport=self.transport,
+            builtins=False,
+            quirks={"reboot_time": REBOOT_TIME, "overtriggered_time": 0.100213, **quirks},
+        )
+
+    # ------------------------------------------------------------------ the loop
+
+    def run(self, coroutine: Coroutine[Any, Any, Any]) -> Any:
+        return self.runner.run(coroutine)
+
+    def go(self, steps: int | None) -> None:
+        """Let the loop run for some steps, or until nothing more happens at once."""
+        self.run(self._go(steps))
+        self.quiet = steps is None
+
+    async def _go(self, steps: int | None) -> None:
+        if steps is None:
+            await asyncio.sleep(A_MOMENT)
+        for _ in range(steps or 0):
+            await asyncio.sleep(0)
+
+    def begin(
+        self,
+        kind: str,
+        call: Coroutine[Any, Any, Any],
+        errors: tuple[type[BaseException], ...],
+        *,
+        part: int | None = None,
+        outlives: bool = False,
+    ) -> None:
+        """Start a call; it goes on beside the rules."""
+        assert self.witness is not None
+        self.count += 1
+        context = contextvars.copy_context()
+        context.run(CALLER.set, self.count)
+        task = self.loop.create_task(call, name=f"call {self.count}: {kind}", context=context)
+        self.calls.append(
+            Call(kind, self.count, task, errors, self.witness.losses, part, outlives=outlives)
+        )
+
+    @property
+    def is_alive(self) -> bool:
+        """There is a client, and another has not taken its camera."""
+        if self.camera is None:
+            return False
+        return not isinstance(self.camera._inbox.end, ConnectionTakenError)
+
+    @property
+    def can_call(self) -> bool:
+        return self.is_alive and len(self.calls) < MOST_CALLS
+
+    # ------------------------------------------------------------------ the client's life
+
+    # ------------------------------------------------------------------ what is done
+
+    def connect(self, application: int | None, *, restore: bool) -> None:
+        layout = "n: int32 @sequence" if self.numbered else "n: int32"
+        self.witness = Witness(self.loop)
+        camera = smartcam.connect(
+            self.box.url,
+            application=application,
+            restore=restore,
+            interpret_as=f"{layout}, part: int32, at: uint32",
+            reconnect=Backoff(initial=0.03, maximum=1.0, jitter=0),
+            connect_timeout=2.0,
+            request_timeout=1.0,
+            switch_timeout=2.0,
+            observers=[self.witness],
+        )
+        self.witness.camera = camera
+        self.events = camera.events()
+        try:
+            self.run(camera.open())
+        except (smartcam.ConnectFailedError, *COMMAND_ERRORS):
+            assert not camera.connected
+            return
+        self.camera = camera
+        self.delivered = self.undecided = 0
+        self.go(None)
+
+    def close(self) -> None:
+        if self.camera is None:
+            return
+        began = self.loop.time()
+        self.run(self.camera.close())
+        assert self.loop.time() - began < 5
+        self.go(None)
+        self._settle_calls()
+        assert not [call for call in self.calls if not call.outlives]
+        for call in self.calls:
+            self._cancel(call)
+        self.go(None)
+        self._settle_calls()
+        assert not self.calls
+        self._check_accounts()
+        self._check_events()
+        for stream in self.streams:
+            assert stream.ended
+        self.streams.clear()
+        self.camera = None
+
+    def _begin_trigger(self, timeout: float) -> None:
+        assert self.camera is not None
+        self.begin("trigger", self.camera.trigger(timeout=timeout), TRIGGER_ERRORS)
+
+    def _cancel(self, call: Call) -> None:
+        call.cancelled = True
+        call.task.cancel()
+
+    def _begin_next_result(self, timeout: float) -> None:
+        camera = self.camera
+        assert camera is not None
+
+        async def registered() -> Result:
+            return await camera.next_result(timeout=timeout)
+
+        errors = (smartcam.TriggerTimeoutError, *LINK_ERRORS)
+        self.begin("next_result", registered(), errors)
+
+    def _act(self, does: Callable[[], object], is_noted: Callable[[float], object]) -> None:
+        self.model.read(self.box.log)
+        does()
+        is_noted(self.loop.time())
+
+    def _note_cut(self, now: float) -> None:
+        self.model.advance(now)
+        self.model.session = None
+
+    def _deed(self, what: str) -> tuple[Callable[[], object], Callable[[float], object]]:
+        device, model = self.box.device, self.model
+        deeds: dict[str, tuple[Callable[[], object], Callable[[float], object]]] = {
+            "trigger": (device.trigger, lambda now: model.trigger(now, None)),
+            "start": (device.start, model.start),
+            "stop": (device.stop, model.stop),
+            "overheat": (lambda: device.set_condition(Status.OVERHEAT, True), model.advance),
+        }
+        if what == "trigger" and Status.OVERTRIGGERED in device.status:
+            # if ours came just behind it, it would be dropped and no status would tell
+            what = "overheat"
+        return deeds[what]
+
+    def _cut(self) -> None:
+        """Every link breaks; over UDP the camera forgets who it spoke to."""
+        with self.box.step():
+            for link in self.box._listener.all_links:
+                link.close("cut")
+
+    async def _visit(self) -> None:
+        """Somebody else takes the camera for a moment."""
+        options: CameraOptions = {"reconnect": None, "connect_timeout": 0.2, "connect_attempts": 1}
+        try:
+            async with smartcam.connect(self.box.url, **options):
+                pass
+        except smartcam.ConnectFailedError:
+            assert self.box.device.rebooting
+
+    # ------------------------------------------------------------------ what must hold
+
+    def _is_alone(self) -> bool:
+        """Wait until nobody is in between; whether client and camera are there then."""
+        self.run(asyncio.sleep(5.0))  # whatever is under way ends in it
+        self._settle_calls()
+        if self.box.device.mode in {Mode.SWITCHING, Mode.REBOOTING} or self.calls:
+            return False
+        camera = self.camera
+        # a way back that failed is told to the next command
+        return camera is not None and camera.connected and camera._turns._failed is None
+
+    def _agrees(self) -> bool:
+        """Assert that the client knows the camera's state; whether there is a session."""
+        camera, device = self.camera, self.box.device
+        assert camera is not None
+        try:
+            active = self.run(camera.query_application())
+        except (smartcam.ResponseTimeoutError, *LINK_ERRORS):
+            return False  # the next session tells
+        self.go(None)
+        assert active == camera.active_application == device.active_application
+        assert camera.status == device.status
+        assert not camera._inbox.answers
+        return True
+
+    def _settle_calls(self) -> None:
+        """Judge every call that has ended."""
+        self.model.read(self.box.log)
+        for call in [call for call in self.calls if call.task.done()]:
+            self.calls.remove(call)
+            if call.kind == "trigger" and (call.task.cancelled() or call.task.exception()):
+                self.given_up.add(call.key)
+            if call.task.cancelled():
+                assert call.cancelled, call
+                self.undecided += call.kind == "trigger"
+            elif (error := call.task.exception()) is not None:
+                assert isinstance(error, call.errors), (call, repr(error))
+                if isinstance(error, ConnectionTakenError):
+                    self._check_taken()
+                # with what was lost at that moment its result may have come
+                self.undecided += call.kind == "trigger"
+                assert len(self._runs_by(call)) <= 1
+            elif call.kind == "trigger":
+                self._check_own(call, call.task.result())
+            elif call.kind == "next_result":
+                run = self._run_of(call.task.result())
+                assert self._owner(run) not in self.given_up, "nobody waited for it any more"
+
+    def _runs_by(self, call: Call) -> list[Inspection]:
+        assert self.witness is not None
+        sent = sum(keys.count(call.key) for keys in self.witness.sends.values())
+        assert sent <= 1, "a trigger was sent twice"
+        return [run for run in self.model.runs if self._owner(run) == call.key]
+
+    def _owner(self, run: Inspection) -> int | None:
+        """Return the call of the present client that triggered an inspection."""
+        assert self.witness is not None
+        peer, index = run.by or ("", 0)
+        keys = self.witness.sends.get(peer)
+        return keys[index] if keys is not None else None
+
+    def _run_of(self, result: Result) -> Inspection:
+        """Return the inspection that a result is from."""
+        for run in self.model.sent:
+            at = round((run.began - self.origin) * 1e6)
+            if abs(at - result.value.at) <= 2 and run.application == result.application:
+                assert run.number == result.value.n
+                return run
+        raise AssertionError(f"no inspection made {result}")
+
+    def _check_own(self, call: Call, result: Result) -> None:
+        runs = self._runs_by(call)
+        run = self._run_of(result)
+        assert [run] == runs, f"{call.kind} {call.key}: {result} is of {run}, not of {runs}"
+        if call.part is not None and result.application == FED:
+            assert result.value.part == call.part
+        if self.numbered:
+            assert result.sequence == run.number
+        self.delivered += 1
+
+    def _check_accounts(self) -> None:
+        assert self.camera is not None
+        count = self.camera.statistics()
+        fates = count.triggered + count.streamed + count.late + count.wrong_application
+        assert count.received == fates + count.uninterpretable + count.unclaimed
+        assert (
+            self.delivered <= count.triggered <= self.delivered + self.undecided + len(self.calls)
+        )
+        for one in count.subscribers:
+            assert one.offered == one.taken + one.dropped + one.queued
+        for stream in self.streams:
+            one = stream.statistics()
+            assert one.offered == one.taken + one.dropped + one.queued
+
+    def _check_losses(self) -> None:
+        """Whoever waited when a link was lost has been told."""
+        assert self.camera is not None
+        assert self.witness is not None
+        for call in self.calls:
+            assert call.outlives or call.losses == self.witness.losses, call
+            assert call.outlives or self.camera.connected, call
+
+    def _check_received(self) -> None:
+        """Every container that the camera sent over the present link has come."""
+        assert self.camera is not None
+        assert self.witness is not None
+        peer = self.witness.peers[-1]
+        sent = sum(run.peer == peer for run in self.model.sent)
+        received = self.camera.statistics().received - self.witness.received_before
+        assert received == sent if self.camera.connected else received <= sent
+
+    def _check_tasks(self) -> None:
+        names = [task.get_name() for task in asyncio.all_tasks(self.loop)]
+        ours = [name for name in names if name.startswith("smartcam[")]
+        jobs = [name for name in ours if not name.endswith(".supervisor")]
+        assert self.camera is not None
+        ended = isinstance(self.camera._inbox.end, ConnectionTakenError)
+        assert len(ours) - len(jobs) == (0 if ended else 1)
+        assert len(jobs) <= MOST_CALLS + 1
+        rest = [n for n in names if not n.startswith(("smartcam[", "smartcam.emulator", "call "))]
+        assert not rest
+
+    def _check_events(self) -> None:
+        """Sessions begin and end by turns, and each status follows on the one before."""
+        assert self.camera is not None
+        assert self.witness is not None
+        seen: list[CameraEvent] = []
+
+        async def read() -> None:
+            while self.events.statistics().queued:
+                seen.append(await anext(self.events))
+
+        self.run(read())
+        told = [event for _, event in self.witness.events]
+        assert seen == told[len(told) - len(seen) :]
+        begin: type[CameraEvent] = Connected
+        linked, status = False, None
+        for event in told:
+            match event:
+                case Connected() | Reconnected():
+                    assert type(event) is begin
+                    assert not linked
+                    linked, begin = True, Reconnected
+                case Disconnected():
+                    assert linked
+                    linked = False
+                case StatusChanged():
+                    assert linked
+                    assert event.previous == status
+                    status = event.status
+                case _:
+                    assert linked
+        assert linked or not self.camera.connected
+        assert status == self.camera.status
+
+    def _check_taken(self) -> None:
+        """Only a session that was lost soon after a reconnect says that somebody took it."""
+        assert self.witness is not None
+        began = [at for at, e in self.witness.events if isinstance(e, Reconnected)]
+        ended = [at for at, e in self.witness.events if isinstance(e, Disconnected)]
+        assert ended[-1] - began[-1] < TAKEN_WITHIN

@@ -1,0 +1,352 @@
+"""Cells of the fault matrix whose fault is the camera's: its frames, its answers, its life."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from matrix_cells import AT_ONCE, LOST, NONE, SILENT, TWICE, Cell, Fault, Place
+from matrix_ops import OPS, TRIGGER_OUTCOMES
+from matrix_world import AWAY, HOME, PATIENT, SHORT, STRAY
+
+from smartcam import exceptions as e
+from smartcam.emulator import faults as f
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from matrix_cells import Errors
+    from matrix_world import Bench, World
+
+__all__ = ["device_cells", "frame_cells", "request_cells"]
+
+UNREAD: Errors = (e.InterpretationError,)
+DENIED: Errors = (e.CommandRejectedError,)
+
+UNKNOWN_ID = 0x77
+NO_APPLICATION = 99
+GARBAGE = bytes.fromhex("000102 80feff 0d")
+MAX_LENGTH = 1 << 20
+"""The client's limit, by default."""
+
+HEADER = 12
+LENGTH_AT, ID_AT = 4, 8
+"""Size of a header, and where the length and the id stand in it, in both dialects."""
+
+ANSWERS: Mapping[str, Mapping[str, int | str]] = {
+    "ConnectAnswer": {"version": 1},
+    "QueryAnswer": {"application": AWAY},
+    "SwitchAnswer": {"code": 0, "application": AWAY},
+    "ClockAnswer": {"year": 1999, "month": 1, "day": 1, "hour": 1, "minute": 1, "second": 1},
+}
+"""Answers, with what would be wrong values."""
+
+
+def by_camera(given: Sequence[f.Fault], allowed: Errors = SILENT, **more: Any) -> Fault:
+    """Return what faults of the emulated camera do."""
+
+    def arm(bench: Bench) -> None:
+        bench.box.inject(*given)
+
+    def fired(bench: Bench) -> bool:
+        happened = [one.fault for one in bench.box.fired]
+        return all(one in happened for one in given)
+
+    return Fault(arm, fired, allowed, **more)
+
+
+# ---------------------------------------------------------------------- frames
+
+
+def _length(place: Place, change: int | None, value: int | None = None) -> list[f.Fault]:
+    """Return what writes another length into a frame's header."""
+    now = int.from_bytes(place.frame.wire[LENGTH_AT:ID_AT], "little")
+    length = (value if value is not None else now + (change or 0)).to_bytes(4, "little")
+    return [
+        f.Corrupt(**_on(place), offset=LENGTH_AT + index, value=byte)
+        for index, byte in enumerate(length)
+    ]
+
+
+def _on(place: Place) -> dict[str, Any]:
+    return {"on": place.frame.message, "nth": place.number}
+
+
+WITHHELD = frozenset(
+    {"dropped", "unknown id", "short body"}
+    | {f"{what} instead" for what in ("status", "warm status", "container", "foreign container")}
+    | {f"{what} instead" for what in ANSWERS}
+)
+"""What withholds a status if it is done to one."""
+
+
+class _Mangling(NamedTuple):
+    """What is done to a frame of the camera."""
+
+    name: str
+    faults: list[f.Fault]
+    allowed: Errors = SILENT
+    harmless: bool = False
+    copies: int = 1
+    strays: bool = False
+    garbled: bool = False
+
+
+def _broken(place: Place) -> Iterator[_Mangling]:
+    """Frames that are none, or not the one they say they are."""
+    on = _on(place)
+    container = place.frame.message == "ResultContainer"
+    over = MAX_LENGTH + 1 + (place.size - HEADER < _told(place)) * 4
+    unread = UNREAD if container else NONE
+    any_error: dict[str, Any] = {"allowed": (*TRIGGER_OUTCOMES, *SILENT, *DENIED), "garbled": True}
+    for offset in range(4):
+        yield _Mangling(f"magic {offset}", [f.Corrupt(**on, offset=offset, xor=0x20)])
+    for change in (-4, -1, 1, 4, 100):
+        yield _Mangling(f"length {change:+}", _length(place, change), **any_error)
+    for value, name in ((0, "0"), (0xFFFFFFFF, "bomb"), (over, "over the limit")):
+        yield _Mangling(f"length {name}", _length(place, None, value))
+    yield _Mangling("unknown id", [f.Corrupt(**on, offset=ID_AT, value=UNKNOWN_ID)])
+    short = f.Truncate(**on, keep=place.size - 4, then="continue")
+    yield _Mangling("short body", [short, *_length(place, -4)], (*SILENT, *unread))
+    longer = f.Insert(**on, data=bytes(4), where="after")
+    yield _Mangling("long body", [*_length(place, 4), longer], unread, harmless=True)
+    for keep in (1, HEADER - 1, HEADER, place.size - 1):
+        cut = f.Truncate(**on, keep=keep, then="continue")
+        yield _Mangling(f"only {keep} bytes", [cut], **any_error)
+    for where in ("before", "after"):
+        for name, data in (("garbage", GARBAGE), ("half a frame", place.frame.wire[:HEADER])):
+            noise = f.Insert(**on, data=data, where=where)
+            yield _Mangling(f"{name} {where}", [noise], **any_error)
+
+
+def _told(place: Place) -> int:
+    return int.from_bytes(place.frame.wire[LENGTH_AT:ID_AT], "little")
+
+
+def _wrong_words(place: Place) -> Iterator[_Mangling]:
+    """Whole frames that should not come, or not now."""
+    on = _on(place)
+    name = place.frame.message
+    yield _Mangling("dropped", [f.Drop(**on)])
+    twice = f.Duplicate(**on)
+    yield _Mangling("twice", [twice], NONE, harmless=True, copies=2)
+    yield _Mangling("soon", [f.Delay(**on, seconds=0.02)], NONE, harmless=True)
+    yield _Mangling("late", [f.Delay(**on, seconds=0.25)])
+    for other, fields in ANSWERS.items():
+        if other != name:
+            wrong = f.Insert(**on, message=other, fields=dict(fields), where="instead")
+            # while a switch is open, a SwitchAnswer is an answer to it, and not the right one
+            answers = other == "SwitchAnswer"
+            denied = (*SILENT, *DENIED) if answers else SILENT
+            yield _Mangling(f"{other} instead", [wrong], denied)
+            for where in ("before", "after"):
+                more = f.Insert(**on, message=other, fields=dict(fields), where=where)
+                allowed = denied if answers else NONE
+                yield _Mangling(f"{other} {where}", [more], allowed, harmless=not answers)
+    yield from _stray_statuses(place)
+    yield from _stray_containers(place)
+
+
+def _stray_statuses(place: Place) -> Iterator[_Mangling]:
+    on = _on(place)
+    # what is said is true, but need not be said
+    after = place.status
+    if place.frame.message == "StatusReport":
+        after = Status(int.from_bytes(place.frame.wire[HEADER : HEADER + 4], "little"))
+    where: Literal["before", "after", "instead"]
+    for where, status in (("before", place.status), ("after", after), ("instead", place.status)):
+        for name, bits in (("status", status), ("warm status", status | Status.OVERHEAT)):
+            stray = f.Insert(
+                **on, message="StatusReport", fields={"status": int(bits)}, where=where
+            )
+            instead = where == "instead"
+            allowed = SILENT if instead else NONE
+            yield _Mangling(f"{name} {where}", [stray], allowed, harmless=not instead)
+
+
+def _stray_containers(place: Place) -> Iterator[_Mangling]:
+    on = _on(place)
+    where: Literal["before", "after", "instead"]
+    for where in ("before", "after", "instead"):
+        for name, application in (("container", HOME), ("foreign container", NO_APPLICATION)):
+            data = b"".join(one.to_bytes(4, "little", signed=True) for one in (5, STRAY, 0, 1))
+            stray = f.Insert(
+                **on,
+                message="ResultContainer",
+                fields={"application": application, "data": data.hex()},
+                where=where,
+            )
+            # the next trigger may come too soon: the camera is still at work
+            allowed: Errors = (e.WrongApplicationError, e.OvertriggeredError)
+            if where == "instead":
+                allowed = (*SILENT, *allowed)
+            yield _Mangling(
+                f"{name} {where}", [stray], allowed, harmless=where != "instead", strays=True
+            )
+
+
+def frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cell]:
+    """Give what can be wrong with what the camera says."""
+    for place in found:
+        if place.way == "up":
+            continue
+        for family, manglings in (("frame", _broken(place)), ("word", _wrong_words(place))):
+            for one in manglings:
+                if one.name in {"soon", "late"} and world.transport == "udp":
+                    continue  # there others overtake it: the cells of the link have it
+                # a datagram is a frame or nothing: what is broken is lost
+                lost = world.transport == "udp" and family == "frame"
+                status = place.frame.message == "StatusReport"
+                fault = by_camera(
+                    one.faults,
+                    (*SILENT, *one.allowed) if lost else one.allowed,
+                    bounds=PATIENT if one.harmless and not lost else SHORT,
+                    copies=one.copies,
+                    strays=one.strays and not world.numbered,
+                    garbled=one.garbled,
+                    blind=world.transport == "tcp"
+                    and (one.garbled or (status and one.name in WITHHELD)),
+                )
+                yield Cell(
+                    f"{world.transport} {family}", world, name, f"{place.name}: {one.name}", fault
+                )
+
+
+def request_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cell]:
+    """Give what can become of what the client says before the camera hears it."""
+    udp = world.transport == "udp"
+    for place in found:
+        if place.way == "down":
+            continue
+        on = _on(place)
+        asked: dict[str, tuple[list[f.Fault], Errors, bool]] = {
+            "dropped": ([f.Drop(**on)], SILENT, False),
+            "twice": ([f.Duplicate(**on)], TWICE.get(place.frame.message, NONE), True),
+            # a datagram alone is late, and others overtake it
+            "soon": ([f.Delay(**on, seconds=0.02)], SILENT if udp else NONE, not udp),
+            "late": ([f.Delay(**on, seconds=0.25)], SILENT, False),
+            "magic": ([f.Corrupt(**on, offset=1, xor=0x20)], SILENT, False),
+            "unknown id": ([f.Corrupt(**on, offset=ID_AT, value=UNKNOWN_ID)], SILENT, False),
+            "length +1": (_length(place, 1), SILENT, False),
+            "length bomb": (_length(place, None, 0xFFFFFFFF), SILENT, False),
+        }
+        if place.size > HEADER:
+            flipped = f.Corrupt(**on, offset=HEADER, xor=0x40)
+            asked["other body"] = ([flipped], (*SILENT, *DENIED), False)
+        for label, (faults, allowed, harmless) in asked.items():
+            # what breaks one frame may cost the next, and then an inspection has no input
+            starved = (e.InputContainerError,) if name == "input" and not harmless else NONE
+            held = sum(one.seconds for one in faults if isinstance(one, f.Delay)) if udp else 0.0
+            fault = by_camera(
+                faults,
+                (*allowed, *starved),
+                bounds=PATIENT if harmless else SHORT,
+                lasts=held,
+                garbled=label == "other body",
+            )
+            yield Cell(f"{world.transport} request", world, name, f"{place.name}: {label}", fault)
+
+
+# ---------------------------------------------------------------------- the device
+
+
+def _end_faults(bench: Bench) -> None:
+    bench.box.clear_faults()
+    bench.box.device.set_condition(Status.SYSTEM_ERROR, on=False)
+
+
+UNHEARD_STOP = (
+    "the client believes that the application runs: each trigger times out, none says NotRunning"
+)
+STOPPED: Errors = (e.NotRunningError,)
+MEDDLED: Errors = (*STOPPED, e.WrongApplicationError)
+
+
+def device_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cell]:
+    """Give what can happen to the camera while the client speaks to it."""
+    for place in found:
+        if place.frame.message == "Disconnect" and not OPS[name].opened:
+            continue  # without a session the camera takes no notice of it
+        if place.way == "down":
+            on: dict[str, Any] = _on(place)
+            yield from _life_cells(world, name, place, {**on, "when": "before"})
+            continue
+        for when in ("before", "after"):
+            on = {**_on(place), "when": when}
+            yield from _life_cells(world, name, place, on)
+            yield from _operator_cells(world, name, place, on)
+        if place.frame.message == "Trigger":
+            yield from _run_cells(world, name, place)
+
+
+def _life_cells(world: World, name: str, place: Place, on: dict[str, Any]) -> Iterator[Cell]:
+    """Give what ends the session: a reboot, another client, a refusal."""
+    lost: dict[str, Any] = {"bounds": PATIENT, "at_once": AT_ONCE}
+    allowed: Errors = (*LOST, e.ConnectFailedError)
+    if world.transport == "udp":  # nobody tells
+        lost, allowed = {"bounds": SHORT}, (*SILENT, e.ConnectFailedError)
+    label = f"{place.name} {on['when']}: "
+    reboot = by_camera([f.Reboot(**on, seconds=0.05)], allowed, **lost)
+    yield Cell(f"{world.transport} reboot", world, name, label + "reboot", reboot)
+    other = by_camera([f.SecondClient(**on)], allowed, **lost)
+    yield Cell(f"{world.transport} second client", world, name, label + "second client", other)
+    # behind a request: in place of it the camera would not hear it
+    ending = f.Reset(**{**on, "when": "before" if place.way == "down" else "after"})
+    refused = by_camera([f.Refuse(**on, seconds=0.15), ending], allowed, **lost)
+    yield Cell(f"{world.transport} refused", world, name, label + "refused", refused)
+
+
+def _operator_cells(world: World, name: str, place: Place, on: dict[str, Any]) -> Iterator[Cell]:
+    label = f"{place.name} {on['when']}: "
+    busy = by_camera([f.BusyForEver(**on)], SILENT, heal=_end_faults)
+    yield Cell(f"{world.transport} busy", world, name, label + "busy for ever", busy)
+    meddling: dict[str, tuple[f.Fault, Errors, Errors]] = {
+        "stop": (f.Stop(**on), SILENT, STOPPED),
+        "start": (f.Start(**on), (*SILENT, *DENIED), NONE),
+        "switch": (f.SwitchApplication(**on, application=AWAY), (*SILENT, *DENIED), MEDDLED),
+        "switch and run": (
+            f.SwitchApplication(**on, application=AWAY, running=True),
+            (*SILENT, *DENIED),
+            MEDDLED,
+        ),
+        "system error": (
+            f.Condition(**on, condition="system_error"),
+            (*SILENT, e.CameraFaultError),
+            NONE,
+        ),
+    }
+    for what, (one, allowed, repairs) in meddling.items():
+        fault = by_camera([one], allowed, repairs=repairs, heal=_end_faults)
+        yield Cell(f"{world.transport} operator", world, name, label + what, fault)
+        if world.transport == "udp" and name == "query" and what != "system error":
+            # the client has nothing to do, and does not hear of it
+            unheard = [one, *(f.Drop(on="StatusReport", nth=number) for number in (1, 2, 3))]
+            known = UNHEARD_STOP if what == "stop" else ""
+            fault = by_camera(unheard, allowed, repairs=repairs, known=known)
+            yield Cell("udp operator", world, name, f"{label}{what}, unheard", fault)
+
+
+def _run_cells(world: World, name: str, place: Place) -> Iterator[Cell]:
+    """Give what can happen to an inspection."""
+    on = _on(place)
+    odd: dict[str, tuple[f.Fault, Errors, bool]] = {
+        "overtriggered": (f.Overtrigger(**on), (e.OvertriggeredError,), True),
+        "a little late": (f.LateResult(**on, seconds=0.05), NONE, True),
+        "late": (f.LateResult(**on, seconds=0.45), SILENT, False),
+        "later": (f.LateResult(**on, seconds=0.9), SILENT, False),
+        "no result": (f.NoResult(**on), SILENT, False),
+        "2 results": (f.ExtraResult(**on, count=1), NONE, True),
+        "4 results": (f.ExtraResult(**on, count=3), NONE, True),
+    }
+    for what, (one, allowed, harmless) in odd.items():
+        fault = by_camera([one], allowed, bounds=PATIENT if harmless else SHORT, heal=_end_faults)
+        yield Cell(f"{world.transport} run", world, name, f"{place.name}: {what}", fault)
+    if name in {"trigger", "input"}:
+        # it comes when the next trigger is under way. That the camera says all in order is what
+        # holds without a number
+        late = f.Delay(
+            on="ResultContainer", nth=place.number, seconds=0.13, overtaken=world.numbered
+        )
+        slow = f.LateResult(on="Trigger", nth=place.number + 1, seconds=0.07)
+        fault = by_camera([late, slow], SILENT, bounds=SHORT._replace(trigger=0.1))
+        yield Cell(f"{world.transport} run", world, name, f"{place.name}: overtaken", fault)

@@ -1,0 +1,157 @@
+"""The fault matrix, a sample of it: ``fault_matrix.py`` has the long form."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from dataclasses import replace
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import fault_matrix
+import pytest
+from fault_matrix import Runner, cells, sample
+from matrix_camera import by_camera
+from matrix_cells import LOST, NONE, SILENT, Cell, Fault, by_rule
+from matrix_ops import OPS
+from matrix_world import PATIENT, BookKeeper, Ear, World
+
+from smartcam.client import SmartCamera
+from smartcam.emulator import faults as f
+from smartcam.testing import rules
+
+if TYPE_CHECKING:
+    from matrix_world import Bench
+
+    from smartcam.connection import TraceEntry
+
+STRIDE = 100
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="link proxies need add_reader")
+
+TCP = World("handbook", "tcp", numbered=True)
+CUT = by_rule(OPS["trigger"], rules.Cut(at=30), LOST, bounds=PATIENT)
+STALL = by_rule(OPS["trigger"], rules.Stall(at=30), SILENT)
+
+
+async def test_sample_of_the_fault_matrix_passes(capsys: pytest.CaptureFixture[str]) -> None:
+    runner = Runner()
+    every = await cells()
+    assert len({cell.name for cell in every}) == len(every) > 20_000
+    for transport in ("tcp", "udp"):
+        assert {one.op for one in every if one.world.transport == transport} == set(OPS)
+    done = await runner.run(sample(every, STRIDE))
+    with capsys.disabled():
+        print(f"\n{fault_matrix.table(done)}")  # noqa: T201
+    assert fault_matrix.failures(done, most=5) == ""
+    assert runner.reports == []
+
+
+async def judged(fault: Fault, op: str = "trigger", world: World = TCP) -> str:
+    """Return what is found to be wrong with one cell."""
+    runner = Runner()
+    (verdict,) = await runner.run([Cell("one", world, op, "fault", fault)])
+    return "\n".join([*verdict.wrong, *runner.reports])
+
+
+def armed_with(act: Any) -> Fault:
+    """Return a fault that does something of this test beside cutting the link."""
+
+    def arm(bench: Bench) -> None:
+        CUT.arm(bench)
+        act(bench)
+
+    return replace(CUT, arm=arm)
+
+
+# ---------------------------------------------------------------------- the matrix itself
+
+
+async def test_cell_in_order_has_nothing_wrong() -> None:
+    assert await judged(CUT) == ""
+    assert await judged(STALL) == ""
+
+
+async def test_error_that_is_not_allowed_is_wrong() -> None:
+    assert "ended with ConnectionLostError" in await judged(replace(CUT, allowed=NONE))
+
+
+async def test_error_that_does_not_come_at_once_is_wrong() -> None:
+    assert "its bound is 0.000 s" in await judged(replace(STALL, at_once=0.0))
+
+
+async def test_fault_that_does_not_happen_is_wrong() -> None:
+    far = by_rule(OPS["trigger"], rules.Cut(at=1_000_000), LOST)
+    assert await judged(far) == "the fault did not happen"
+
+
+async def test_client_that_does_not_work_again_is_wrong() -> None:
+    busy = by_camera([f.BusyForEver(on="Trigger")], SILENT)
+    assert "does not work again: {'TriggerTimeoutError'" in await judged(busy)
+
+
+async def test_result_of_an_earlier_run_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BookKeeper, "time", 1e6)
+    assert "a stale result: run" in await judged(CUT)
+
+
+async def test_clock_that_is_not_the_cameras_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def get_clock(_: SmartCamera) -> datetime:
+        return datetime(2000, 1, 1)  # noqa: DTZ001 - it has no zone
+
+    monkeypatch.setattr(SmartCamera, "get_clock", get_clock)
+    assert "clock 2000-01-01" in await judged(CUT, "query")
+
+
+async def test_container_that_the_client_counts_and_nobody_hears_is_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    on_frame = Ear.on_frame
+
+    def deaf(ear: Ear, entry: TraceEntry) -> None:
+        if entry.message != "ResultContainer":
+            on_frame(ear, entry)
+
+    monkeypatch.setattr(Ear, "on_frame", deaf)
+    found = await judged(CUT)
+    assert "0 containers heard, 2 in account" in found
+    assert "lost without a loss of the link" in found
+
+
+async def test_task_that_is_left_is_wrong() -> None:
+    left: list[asyncio.Task[Any]] = []
+
+    def leave(_: Bench) -> None:
+        left.append(asyncio.create_task(asyncio.sleep(3600), name="left alone"))
+
+    try:
+        assert await judged(armed_with(leave)) == "tasks were left: ['left alone']"
+    finally:
+        for task in left:
+            task.cancel()
+
+
+async def test_socket_that_is_left_is_wrong() -> None:
+    left: list[socket.socket] = []
+
+    def leave(bench: Bench) -> None:
+        left.append(socket.create_connection((bench.proxy.host, bench.proxy.port)))
+
+    try:
+        assert await judged(armed_with(leave)) == "a socket was left open"
+    finally:
+        for sock in left:
+            sock.close()
+
+
+async def test_known_failure_that_does_not_happen_is_wrong() -> None:
+    assert await judged(replace(CUT, known="it hangs")) == "no longer so: it hangs"
+    assert await judged(replace(CUT, allowed=NONE, known="it ends")) == ""
+
+
+async def test_report_of_the_loop_is_wrong() -> None:
+    def report(_: Bench) -> None:
+        asyncio.get_running_loop().call_exception_handler({"message": "lost and found"})
+
+    assert "lost and found" in await judged(armed_with(report))
