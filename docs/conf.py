@@ -65,6 +65,7 @@ LIMITS = (
     "handshake.DETECTION_SHARE",
     "conversation.MAX_APPLICATION_ID",
     "conversation.LATE_GRACE",
+    "conversation.OVERTRIGGERED_GRACE",
     "attribution.NUMBER_STEP",
     "attribution.MAX_OWED",
     "supervisor.TAKEN_WITHIN",

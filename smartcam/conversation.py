@@ -58,6 +58,11 @@ LATE_GRACE = 0.25
 late, and stopping and starting an application costs more."""
 
 
+OVERTRIGGERED_GRACE = 1.0
+"""Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set it
+cannot tell that ours was dropped; a camera on which it stays set must not stop the line."""
+
+
 class TriggerRequest(NamedTuple):
     """What a trigger is to do.
 
@@ -448,6 +453,9 @@ class Conversation:
         if self._halted or (attribution.debt is not None and not decided):
             await self._settle_debt(deadline)
         await self._wait_for_trigger(deadline, wait=request.wait)
+        if Status.OVERTRIGGERED in self.status:
+            await self._see_overtriggered_fall(deadline)
+            await self._wait_for_trigger(deadline, wait=request.wait)
         while attribution.unsettled and not decided and self._ordered:
             await self._settle_others(deadline)
             await self._wait_for_trigger(deadline, wait=request.wait)
@@ -573,6 +581,16 @@ class Conversation:
             await self._enter_run_mode(deadline)
         attribution.settled()
 
+    async def _see_overtriggered_fall(self, deadline: float) -> None:
+        """Wait a moment for Overtriggered to fall: only then can it rise for our trigger.
+
+        Source: it falls by itself (SC manual p. 30, published); when is unknown.
+        """
+        now = asyncio.get_running_loop().time()
+        grace = now + min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))
+        with contextlib.suppress(TimeoutError):
+            await self.inbox.wait_status(_is_not_overtriggered, grace)
+
     async def _settle_others(self, deadline: float) -> None:
         """Have heard the result of an inspection that somebody else triggered."""
         attribution = self.inbox.attribution
@@ -630,6 +648,10 @@ class Conversation:
             f"status: {self.status}",
             message_id=message_id,
         )
+
+
+def _is_not_overtriggered(status: Status) -> bool:
+    return Status.OVERTRIGGERED not in status
 
 
 def _is_not_loading(status: Status) -> bool:

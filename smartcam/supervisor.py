@@ -130,7 +130,7 @@ class Supervisor:
         finally:
             self._inbox.fail(self.closed_error())
             if session is not None:
-                session.link.abort()
+                session.link.give_up(ConnectionAbortedError("closed by this side"))
             if task is not None:
                 if not self._reading:
                     task.cancel()

@@ -52,7 +52,7 @@ class Application(BaseModel):
     layout: _LayoutText | None = Field(default=None, description="layout of the result container")
     rate: float | None = Field(
         default=None,
-        gt=0,
+        ge=0.0001,
         le=1000,
         allow_inf_nan=False,
         description="runs per second of a free-running application; None: it waits for triggers",

@@ -120,11 +120,15 @@ def _from_hex(value: object) -> object:
     return bytes.fromhex(value) if isinstance(value, str) else value
 
 
+def _to_hex(value: bytes) -> str:
+    return value.hex()
+
+
 _Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 _Bytes = Annotated[
     bytes,
     BeforeValidator(_from_hex),
-    PlainSerializer(bytes.hex, return_type=str, when_used="json"),
+    PlainSerializer(_to_hex, return_type=str, when_used="json"),
     WithJsonSchema({"type": "string", "format": "hex"}),
     Field(min_length=1, max_length=MAX_BYTES),
 ]

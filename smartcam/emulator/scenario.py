@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from smartcam.emulator.application import BUILTIN_APPLICATIONS, Application
 from smartcam.emulator.quirks import Quirks
 from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.layout.files import YAML_ALSO_RAISES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -78,7 +79,7 @@ def load_scenario(path: str | Path) -> Scenario:
     except yaml.MarkedYAMLError as exc:
         line = f", line {exc.problem_mark.line + 1}" if exc.problem_mark is not None else ""
         raise ConfigurationError(f"scenario {path}{line}: {exc.problem or exc}") from exc
-    except (yaml.YAMLError, ValueError, RecursionError) as exc:
+    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
         raise ConfigurationError(f"scenario {path}: {exc}") from exc
     if root is not None:
         _refuse_twice(root, path)

@@ -21,6 +21,9 @@ __all__ = ["dump_yaml", "from_data", "load_yaml", "make_model", "to_data"]
 _Name = Annotated[str, ModelField(pattern=r"^[^\W\d]\w*$", max_length=200)]
 _Count = Annotated[int, ModelField(ge=1, le=65_535, strict=True)]
 
+YAML_ALSO_RAISES = (ValueError, LookupError, AttributeError, OverflowError, RecursionError)
+"""What PyYAML lets through beside its own errors, for a tag such as ``!!int`` without a value."""
+
 
 class _FieldData(BaseModel):
     """One field, as it stands in a file."""
@@ -128,7 +131,7 @@ def load_yaml(text: str) -> dict[str, Any] | str:
     yaml = _yaml()
     try:
         loaded: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as exc:
+    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
         # "x: int32, y: int32" is no YAML; a broken document is no layout text either
         try:
             return _checked_text(text)

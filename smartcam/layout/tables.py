@@ -87,5 +87,6 @@ def _converted(field: Field, column: np.ndarray[Any, Any]) -> np.ndarray[Any, An
         values = column != 0
     elif field.unit is not None:
         unit = UNITS[field.unit]
-        values = column.astype(np.float64) * unit.multiply / unit.divide
+        with np.errstate(all="ignore"):  # NaN and infinity pass, as they do one by one
+            values = column.astype(np.float64) * unit.multiply / unit.divide
     return np.asarray(values)

@@ -598,3 +598,27 @@ async def test_extra_results_of_the_emulator_are_counted() -> None:
         statistics = camera.statistics()
         assert (statistics.triggered, statistics.extra_results) == (1, 2)
         assert statistics.unclaimed == 2
+
+
+# ---------------------------------------------------------------------- an older Overtriggered
+
+
+async def test_trigger_waits_until_an_older_overtriggered_has_fallen() -> None:
+    async with by_hand() as (box, camera):
+        box.send(box.status_frame(READY | OVERTRIGGERED))
+        await camera.wait_status(lambda status: Status.OVERTRIGGERED in status)
+        triggering = asyncio.create_task(camera.trigger())
+        await camera.query_application()
+        assert TRIGGER not in box.ids
+        box.send(box.status_frame(READY))
+        assert (await triggering).raw == b"found"
+
+
+async def test_overtriggered_that_stays_does_not_stop_the_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("smartcam.conversation.OVERTRIGGERED_GRACE", SHORT)
+    async with by_hand() as (box, camera):
+        box.send(box.status_frame(READY | OVERTRIGGERED))
+        await camera.wait_status(lambda status: Status.OVERTRIGGERED in status)
+        assert (await camera.trigger()).raw == b"found"

@@ -32,30 +32,6 @@ class Known(NamedTuple):
 
 KNOWN = (
     Known(
-        "table-numpy-warns",
-        "layout",
-        r"RuntimeWarning: .* in tables\.py:_converted",
-        "parse_table() warns of NaN and of numbers too large, where parse() is silent",
-    ),
-    Known(
-        "table-numpy-warns",
-        "interpreters",
-        r"AssertionError: RuntimeWarning: (invalid value|overflow) encountered",
-        "the same, by the interpreter table",
-    ),
-    Known(
-        "yaml-tag-without-a-value",
-        "scenario",
-        r"(Attribute|Key|Index|Overflow)Error: .* in constructor\.py:",
-        "PyYAML raises more than YAMLError and ValueError for !!timestamp, !!bool, !!int, !!float",
-    ),
-    Known(
-        "yaml-tag-without-a-value",
-        "layout_file",
-        r"(Attribute|Key|Index|Overflow)Error: .* in constructor\.py:",
-        "the same, by Layout.from_yaml()",
-    ),
-    Known(
         "unknown-key-is-a-surrogate",
         "scenario",
         r"UnicodeEncodeError: .*surrogates not allowed in main\.py:model_validate",
@@ -78,12 +54,6 @@ KNOWN = (
         "layout",
         r"LayoutError: layout: expected at most 20000 characters",
         "a text that is accepted prints as one that is not: no copy, no pickle, no file",
-    ),
-    Known(
-        "rate-next-to-zero",
-        "scenario",
-        r"OverflowError: cannot convert float infinity to integer in device\.py:",
-        "a rate so low that its period is infinite is accepted, and Start raises",
     ),
     Known(
         "host-with-a-bracket",

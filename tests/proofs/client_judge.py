@@ -330,9 +330,6 @@ class ClientJudge:
             "stop": (device.stop, model.stop),
             "overheat": (lambda: device.set_condition(Status.OVERHEAT, True), model.advance),
         }
-        if what == "trigger" and Status.OVERTRIGGERED in device.status:
-            # if ours came just behind it, it would be dropped and no status would tell
-            what = "overheat"
         return deeds[what]
 
     def _cut(self) -> None:
