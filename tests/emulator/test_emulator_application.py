@@ -231,7 +231,7 @@ def test_default_processing_time_gives_way_to_the_rate() -> None:
         ({"id": 0}, "id: Input should be greater than or equal to 1"),
         ({"id": 1 << 32}, "id: Input should be less than or equal to 4294967295"),
         ({"colour": 1}, "colour: Extra inputs are not permitted"),
-        ({"rate": 0}, "rate: Input should be greater than 0"),
+        ({"rate": 0}, "rate: Input should be greater than or equal to 0.0001"),
         ({"rate": 20, "processing_time": 0.06}, "a run of 0.06 s does not fit a rate of 20"),
         ({"load_time": -1}, "load_time: Input should be greater than or equal to 0"),
         ({"layout": "n: uint8"}, "a layout needs values: constant, cycle or generator"),
