@@ -71,7 +71,8 @@ def test_scenario_without_builtins(tmp_path: Path) -> None:
         ("colour: red\n", "line.yaml, line 1: colour: Extra inputs are not permitted"),
         (
             "applications:\n  - id: 5\n  - id: 6\n    rate: -1\n",
-            "line.yaml, line 4: applications.1.rate: Input should be greater than or equal to 0.0001",
+            "line.yaml, line 4: applications.1.rate: Input should be greater than or equal to "
+            "0.0001",
         ),
         (
             "applications:\n  - id: 5\n  - name: x\n",

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from matrix_cells import AT_ONCE, LOST, SILENT, Cell, Fault
-from matrix_world import AWAY, HOME, PATIENT, SHORT, BenchBase, tracked_tasks
+from matrix_world import AWAY, HOME, PATIENT, SHORT, BenchBase, own_host, tracked_tasks
 
 from smartcam import exceptions as e
 
@@ -67,7 +67,7 @@ class ProcessCamera:
         self.url = ""
         self.killed = self.frozen = False
         self._process: asyncio.subprocess.Process | None = None
-        self._port = 0
+        self._host, self._port = own_host(), 0
         self._folder = ""
 
     async def __aenter__(self) -> Self:
@@ -105,7 +105,15 @@ class ProcessCamera:
         self._process = await asyncio.create_subprocess_exec(
             str(command),
             str(Path(self._folder, "scenario.yaml")),
-            *("--port", str(self._port), "--dialect", self.world.dialect, "--json"),
+            *(
+                "--host",
+                self._host,
+                "--port",
+                str(self._port),
+                "--dialect",
+                self.world.dialect,
+                "--json",
+            ),
             stdout=asyncio.subprocess.PIPE,
         )
         assert self._process.stdout is not None

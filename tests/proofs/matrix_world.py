@@ -52,6 +52,7 @@ __all__ = [
     "bench",
     "caring_for_tasks",
     "come_true",
+    "own_host",
     "tracked_tasks",
 ]
 
@@ -543,7 +544,7 @@ async def tracked_tasks() -> AsyncIterator[list[str]]:
 _NUMBERS = itertools.count(1)
 
 
-def _own_host() -> str:
+def own_host() -> str:
     """Return a loopback address of its own, where the system has more than one.
 
     A camera that restarts shuts its port for a moment; on a shared address another cell's camera
@@ -558,7 +559,7 @@ def _own_host() -> str:
 async def bench(world: World, bounds: Bounds, application: int) -> AsyncIterator[Bench]:
     """Have a bench; what its client leaves behind is found to be wrong."""
     async with tracked_tasks() as left:
-        box = BookKeeper(world, active=application, host=_own_host())
+        box = BookKeeper(world, active=application, host=own_host())
         async with box, LinkProxy(box.host, box.port, transport=world.transport) as proxy:
             made = Bench(world, bounds, box, proxy, application)
             try:
