@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable, Iterator  # noqa: TC003 - old pydantic looks them up
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ConfigurationError, LinkError, PluginError, SmartCamError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 __all__ = ["Backoff", "is_transient"]
 

@@ -21,6 +21,7 @@ import argparse
 import asyncio
 import gc
 import logging
+import signal
 import sys
 import time
 import traceback
@@ -464,6 +465,7 @@ async def _main(options: argparse.Namespace) -> int:
 def main() -> int:
     """Run from the command line."""
     options = _arguments()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that cameras are ended, too
     level = logging.DEBUG if options.only else logging.CRITICAL
     logging.basicConfig(level=level, format="%(relativeCreated)7.0f %(name)s %(message)s")
     return asyncio.run(_main(options))
