@@ -438,6 +438,9 @@ def _arguments() -> argparse.Namespace:
 
 async def _main(options: argparse.Namespace) -> int:
     begun = time.monotonic()
+    me = asyncio.current_task()
+    if me is not None and sys.platform != "win32":  # so that cameras that are processes end, too
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, me.cancel)
     chosen = [cell for cell in await cells() if cell.family.startswith(options.family)]
     chosen = sample(chosen, options.sample)
     if options.only:
@@ -465,7 +468,6 @@ async def _main(options: argparse.Namespace) -> int:
 def main() -> int:
     """Run from the command line."""
     options = _arguments()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that cameras are ended, too
     level = logging.DEBUG if options.only else logging.CRITICAL
     logging.basicConfig(level=level, format="%(relativeCreated)7.0f %(name)s %(message)s")
     return asyncio.run(_main(options))

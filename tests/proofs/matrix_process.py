@@ -90,14 +90,20 @@ class ProcessCamera:
         await asyncio.to_thread(
             Path(self._folder, "scenario.yaml").write_text, json.dumps(scenario), "utf-8"
         )
-        await self.start()
+        try:
+            await self.start()
+        except BaseException:
+            shutil.rmtree(self._folder)
+            raise
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        if self._process is not None:
-            self.kill()
-            await self._process.wait()
-        await asyncio.to_thread(shutil.rmtree, self._folder)
+        try:
+            if self._process is not None:
+                self.kill()
+                await self._process.wait()
+        finally:
+            shutil.rmtree(self._folder)
 
     async def start(self) -> None:
         """Start it; it listens when this returns."""
@@ -117,8 +123,12 @@ class ProcessCamera:
             stdout=asyncio.subprocess.PIPE,
         )
         assert self._process.stdout is not None
-        async with asyncio.timeout(STARTING):
-            said = json.loads(await self._process.stdout.readline())
+        try:
+            async with asyncio.timeout(STARTING):
+                said = json.loads(await self._process.stdout.readline())
+        except BaseException:
+            self.kill()
+            raise
         self.url, self._port = said["url"], said["port"]
         self.killed = self.frozen = False
 
