@@ -115,12 +115,13 @@ class Conversation:
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
         self._halted = False  # stopped by a trigger's fence that has not started it again yet
         self._unconfirmed = False  # a Start or Stop was sent, its status has not come
+        self._status_in_doubt = False  # over UDP: it may have been lost
 
     def begin(self, link: Link) -> None:
         """A new session: nothing is owed on it, its status is heard."""
         self.link = link
         self._due.clear()
-        self._unconfirmed = False
+        self._unconfirmed = self._status_in_doubt = False
 
     def require_link(self) -> Link:
         """Return the link.
@@ -447,6 +448,10 @@ class Conversation:
                 "empties the queue"
             )
         await self._check_application(deadline)
+        if self._status_in_doubt:
+            await self._ask_for_status(deadline)
+            await self._fence(deadline)  # it has come by then, or is lost again
+            self._status_in_doubt = False
         numbering = request.interpretation.numbering(self.inbox.active)
         # an older result shows by its number where each container has one
         decided = numbering is not None and numbering.always
@@ -492,6 +497,8 @@ class Conversation:
             if outcome.done() and not outcome.cancelled():
                 return outcome.result()
             inbox.attribution.give_up(pending)
+            # it may have been stopped: then Waiting did not drop for this trigger
+            self._status_in_doubt = not (self._ordered or pending.dropped_waiting)
             waited = deadline - pending.sent_at
             came = f"{len(pending.results)} of {pending.wanted} results"
             raise TriggerTimeoutError(

@@ -138,12 +138,12 @@ class Turns:
 
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""
-        running = self._talk.runs
-        active = await self._talk.query_loaded(deadline)
         talk = self._talk
+        running = talk.runs
+        active = await talk.query_loaded(deadline)
         before = Before(active, running, talk.inbox.expected, talk.wants_running)
         try:
-            await self._talk.ensure(application, deadline)
+            await talk.ensure(application, deadline)
         except BaseException:
             self.leave(before)
             raise

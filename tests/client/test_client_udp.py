@@ -30,6 +30,7 @@ import smartcam
 from smartcam import (
     ConnectFailedError,
     ConnectionLostError,
+    NotRunningError,
     ResponseTimeoutError,
     Status,
     TriggerTimeoutError,
@@ -150,7 +151,8 @@ async def test_result_over_udp_that_is_lost_times_out_and_the_next_one_is_its_ow
         box.script[TRIGGER] = trigger
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"found"
-        assert box.since(mark) == [STOP, QUERY, START, TRIGGER]
+        asked_for_status = [QUERY, CONNECT, QUERY]
+        assert box.since(mark) == [*asked_for_status, STOP, QUERY, START, TRIGGER]
 
 
 async def test_trigger_over_udp_cancelled_owes_a_result() -> None:
@@ -223,3 +225,15 @@ async def test_answer_to_the_connect_that_asks_for_a_status_may_be_lost_once() -
         for error in (TriggerTimeoutError, ConnectionLostError):
             with pytest.raises(error):
                 await camera.trigger(timeout=2 * SHORT)
+
+
+async def test_stop_whose_status_is_lost_is_noticed_after_a_trigger_without_a_result() -> None:
+    async with by_hand(box={"transport": "udp"}) as (box, camera):
+        box.status = 0  # its datagram was lost
+        box.script[TRIGGER] = lambda _: b""
+        with pytest.raises(TriggerTimeoutError, match="no result"):
+            await camera.trigger(timeout=SHORT)
+        with pytest.raises(NotRunningError):
+            await camera.trigger(timeout=1)
+        assert START not in box.ids
+        assert box.ids.count(TRIGGER) == 1

@@ -16,7 +16,7 @@ from array import array
 from collections import Counter, deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.models import Connected, Reconnected
+from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.observers import Observer
 from smartcam.protocols import messages as m
 
@@ -162,8 +162,8 @@ class ClientEar(Observer):
 
     def _on_sent(self, entry: TraceEntry) -> None:
         match entry.message:
-            case "Connect":
-                self._adopted, self._early = False, 0
+            case "Connect" if not self._adopted:  # in a session it asks for the status
+                self._early = 0
             case "SetSequenceNumber":
                 self._told = entry.fields["number"]
             case "Trigger":
@@ -176,3 +176,5 @@ class ClientEar(Observer):
             self._adopted = True
             self.before += self._early
             self._early = 0
+        elif isinstance(event, Disconnected):
+            self._adopted = self.closing

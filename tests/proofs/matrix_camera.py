@@ -255,9 +255,6 @@ def _end_faults(bench: Bench) -> None:
     bench.box.device.set_condition(Status.SYSTEM_ERROR, on=False)
 
 
-UNHEARD_STOP = (
-    "the client believes that the application runs: each trigger times out, none says NotRunning"
-)
 STOPPED: Errors = (e.NotRunningError,)
 MEDDLED: Errors = (*STOPPED, e.WrongApplicationError)
 
@@ -321,8 +318,7 @@ def _operator_cells(world: World, name: str, place: Place, on: dict[str, Any]) -
         if world.transport == "udp" and name == "query" and what != "system error":
             # the client has nothing to do, and does not hear of it
             unheard = [one, *(f.Drop(on="StatusReport", nth=number) for number in (1, 2, 3))]
-            known = UNHEARD_STOP if what == "stop" else ""
-            fault = by_camera(unheard, allowed, repairs=repairs, known=known)
+            fault = by_camera(unheard, allowed, repairs=repairs)
             yield Cell("udp operator", world, name, f"{label}{what}, unheard", fault)
 
 
