@@ -1,0 +1,4 @@
+"""How fast smartcam is: each figure beside a yardstick that was measured in the same run.
+
+``python -m benchmarks`` runs all of it; ``docs/benchmarks.md`` shows what it printed.
+"""

@@ -1,0 +1,55 @@
+"""``python -m benchmarks``: run them, print the table."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+import time
+from pathlib import Path
+
+from benchmarks.measure import Comparison, Curve, Plan
+from benchmarks.report import as_json, table
+
+BENCHMARKS = {
+    "trigger": "await trigger() against a bare Protocol and pymodbus",
+    "stream": "results as fast as the link gives them, item by item and in batches",
+}
+"""Modules of this package with a ``run(plan)``, and what they measure."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run what is asked for; return 1 where a goal of a full run is missed."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description=__doc__,
+        epilog="benchmarks: " + "; ".join(f"{name}: {about}" for name, about in BENCHMARKS.items()),
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="which ones; default: all")
+    parser.add_argument("--quick", action="store_true", help="only see that all of it works")
+    parser.add_argument("--rounds", type=int, default=9, help="of each side; default: %(default)s")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to FILE")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.names if name not in BENCHMARKS]
+    if unknown or options.rounds < 1:
+        parser.error(
+            f"no benchmark is called {', '.join(unknown)}" if unknown else "--rounds: 1 or more"
+        )
+    plan = Plan(rounds=2, scale=0.02) if options.quick else Plan(options.rounds, 1.0)
+    comparisons: list[Comparison] = []
+    curves: list[Curve] = []
+    for name in options.names or BENCHMARKS:
+        begin = time.monotonic()
+        for found in importlib.import_module(f"benchmarks.{name}").run(plan):
+            (curves if isinstance(found, Curve) else comparisons).append(found)
+        print(f"{name}: {time.monotonic() - begin:.0f} s", file=sys.stderr)
+    print(table(comparisons))
+    if options.json is not None:
+        options.json.write_text(json.dumps(as_json(comparisons, curves), indent=1) + "\n")
+    missed = [one for one in comparisons if one.met is False]
+    return 1 if missed and not plan.quick else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,33 @@
+"""The other side of the benchmarks: small servers in processes of their own, prepared bytes.
+
+They know no smartcam: what they send is written down here with ``struct``. Each is a module that
+prints its port and serves until it is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["peer"]
+
+
+@contextlib.contextmanager
+def peer(module: str, *arguments: str) -> Iterator[int]:
+    """Run ``benchmarks.peers.<module>``; gives the port that it listens to on 127.0.0.1."""
+    command = [sys.executable, "-m", f"benchmarks.peers.{module}", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"{' '.join(command)} did not start")
+        yield int(line)
+    finally:
+        process.kill()
+        process.communicate()
