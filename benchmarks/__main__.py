@@ -15,6 +15,12 @@ from benchmarks.report import as_json, table
 BENCHMARKS = {
     "trigger": "await trigger() against a bare Protocol and pymodbus",
     "stream": "results as fast as the link gives them, item by item and in batches",
+    "decode": "from a container's bytes to a table, localizations, texts",
+    "large": "containers of 1 kB to 1 MB",
+    "fleet": "10, 100 and 1,000 cameras in one process",
+    "emulator": "triggers an emulated camera answers, and 1,000 of them",
+    "startup": "import smartcam, and the first connect",
+    "scaling": "cost of a message over 10^3 to 10^6 of them",
 }
 """Modules of this package with a ``run(plan)``, and what they measure."""
 

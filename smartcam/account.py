@@ -33,8 +33,10 @@ class Times:
         """Count one."""
         self._counts[bisect.bisect_left(HISTOGRAM_BOUNDS, seconds)] += 1
         self._total += seconds
-        self._shortest = min(self._shortest, seconds)
-        self._longest = max(self._longest, seconds)
+        if seconds < self._shortest:
+            self._shortest = seconds
+        if seconds > self._longest:
+            self._longest = seconds
 
     def histogram(self) -> Histogram:
         """Return what was counted so far."""

@@ -86,6 +86,11 @@ class Verdict(NamedTuple):
     extra: bool = False
 
 
+OURS = Verdict("triggered")
+
+_WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
+
+
 @dataclass(slots=True, eq=False)
 class _Owed:
     """Results of a trigger that was given up, which may still come."""
@@ -122,6 +127,16 @@ class Attribution:
     def debt(self) -> Debt | None:
         """Fate of the result of an earlier trigger that may still come."""
         return self._owed[0].fate if self._owed else None
+
+    @property
+    def satisfied(self) -> bool:
+        """The last trigger has its results, and no other inspection was seen since."""
+        return self._satisfied
+
+    @property
+    def quiet(self) -> bool:
+        """Nothing of ours is about: a container that comes is nobody's."""
+        return self.pending is None and not self._owed and self.numbering is None
 
     # ------------------------------------------------------------------ the session
 
@@ -181,11 +196,16 @@ class Attribution:
 
     # ------------------------------------------------------------------ what comes
 
-    def on_status(self, previous: Status | None, status: Status) -> None:
-        """Note where an inspection begins: Waiting for Trigger drops while running."""
-        if Status.WAITING_FOR_TRIGGER in status or Status.RUNNING not in status:
+    def on_status(self, previous: int | None, status: int) -> None:
+        """Note where an inspection begins: Waiting for Trigger drops while running.
+
+        Args:
+            previous: the status before, None where there was none in this session.
+            status: the new one.
+        """
+        if status & _WAITING or not status & _RUNNING:
             return
-        if previous is not None and Status.WAITING_FOR_TRIGGER not in previous:
+        if previous is not None and not previous & _WAITING:
             return
         self._drops_waiting = self._drops_waiting or previous is not None
         pending = self.pending
@@ -205,9 +225,9 @@ class Attribution:
         if pending is not None and not pending.outcome.done():
             if pending.number is None or number is None:
                 if pending.dropped_waiting or not (self._ordered and self._drops_waiting):
-                    return Verdict("triggered")
+                    return OURS
             elif number == pending.number:
-                return Verdict("triggered")
+                return OURS
         elif pending is not None and pending.outcome.cancelled():
             self.give_up(pending)  # its caller was not woken yet
         return self._judge_other(number)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from smartcam.conversation import Conversation, TriggerRequest, is_ready
 from smartcam.exceptions import (
@@ -31,7 +31,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
 from smartcam.protocols.framing import Frame
 from smartcam.settings import CameraOptions, CameraSettings
-from smartcam.streams import Subscription
+from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 from smartcam.supervisor import Supervisor
 from smartcam.turns import Turns
 
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from smartcam.protocols.base import Dialect
 
 __all__ = ["SmartCamera", "connect"]
+
+QueueT = TypeVar("QueueT", bound=Queue[Any])
 
 DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
@@ -216,13 +218,34 @@ class SmartCamera:
 
     # ------------------------------------------------------------------ streams and waits
 
+    @overload
     def results(
         self,
         *,
+        batch: Literal[False] = False,
         min_interval: float = 0.0,
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> Subscription[Result]:
+    ) -> Subscription[Result]: ...
+
+    @overload
+    def results(
+        self,
+        *,
+        batch: Literal[True],
+        min_interval: float = 0.0,
+        max_queue: int = DEFAULT_MAX_QUEUE,
+        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
+    ) -> BatchSubscription[Result]: ...
+
+    def results(
+        self,
+        *,
+        batch: bool = False,
+        min_interval: float = 0.0,
+        max_queue: int = DEFAULT_MAX_QUEUE,
+        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
+    ) -> Subscription[Result] | BatchSubscription[Result]:
         """Subscribe to everything the camera sends, triggered or not; subscribed when called.
 
         The stream goes on over a reconnect; what the camera sent in between nobody got.
@@ -232,13 +255,15 @@ class SmartCamera:
         another application than the one named are counted, not delivered.
 
         Args:
+            batch: give lists of what is there, one result at least, instead of single results:
+                for a camera that sends thousands a second. ``max_queue`` counts results.
             min_interval: seconds; results that come sooner after the last one are dropped.
-            max_queue: results kept for a slow reader.
+            max_queue: results kept for a slow reader. One read of the link brings up to 256 KiB.
             overflow: what happens beyond that.
         """
-        stream: Subscription[Result] = self._stream("results", min_interval, max_queue, overflow)
-        self._inbox.result_streams.add(stream)
-        return stream
+        kind = BatchSubscription[Result] if batch else Subscription[Result]
+        stream = kind("results", max_queue=max_queue, overflow=overflow, min_interval=min_interval)
+        return self._subscribed(self._inbox.result_streams, stream)
 
     def statuses(
         self,
@@ -248,9 +273,10 @@ class SmartCamera:
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[Status]:
         """Subscribe to every status the camera sends from now on; arguments as in `results`."""
-        stream: Subscription[Status] = self._stream("statuses", min_interval, max_queue, overflow)
-        self._inbox.status_streams.add(stream)
-        return stream
+        stream = Subscription[Status](
+            "statuses", max_queue=max_queue, overflow=overflow, min_interval=min_interval
+        )
+        return self._subscribed(self._inbox.status_streams, stream)
 
     def events(
         self,
@@ -263,9 +289,8 @@ class SmartCamera:
         The events are ``Connected``, ``Disconnected``, ``Reconnected``, ``StatusChanged`` and
         ``ApplicationChanged``. Subscribe before :meth:`open` to see the first ones.
         """
-        stream: Subscription[CameraEvent] = self._stream("events", 0.0, max_queue, overflow)
-        self._inbox.event_streams.add(stream)
-        return stream
+        stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
+        return self._subscribed(self._inbox.event_streams, stream)
 
     async def wait_status(
         self, predicate: Callable[[Status], bool], timeout: float = 10.0
@@ -423,8 +448,10 @@ class SmartCamera:
     async def _trigger(
         self, application: int | None, request: TriggerRequest, timeout: float
     ) -> list[Result]:
+        turns = self._turns
+        turn = turns.hold(timeout) if application is None else turns.hold_in(application, timeout)
         try:
-            async with self._turns.hold_in(application, timeout) as deadline:
+            async with turn as deadline:
                 return await self._talk.trigger(request, deadline)
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
@@ -635,14 +662,13 @@ class SmartCamera:
     def _interpretation(self, spec: object) -> Interpretation:
         return Interpretation(spec, lenient=self.settings.lenient, y_down=self.settings.y_down)
 
-    def _stream(self, name: str, min_interval: float, max_queue: int, overflow: str) -> Any:
-        stream: Subscription[Any] = Subscription(
-            name, max_queue=max_queue, overflow=overflow, min_interval=min_interval
-        )
+    def _subscribed(self, subscribers: Subscribers[Any], queue: QueueT) -> QueueT:
+        """Have a queue offered what comes; it has ended already where nothing will."""
         end = self._inbox.end
         if end is not None and self._supervisor.over:  # between two sessions it waits for the next
-            stream.end(None if isinstance(end, ConnectionClosedError) else end)
-        return stream
+            queue.end(None if isinstance(end, ConnectionClosedError) else end)
+        subscribers.add(queue)
+        return queue
 
     async def _await_next(
         self, future: asyncio.Future[Result], deadline: float, timeout: float

@@ -1,8 +1,8 @@
 """One TCP or UDP link to a camera, used once.
 
-The transport hands bytes to the machine of ``protocols/`` and puts what comes out, a chunk of
-events per delivery, into one bounded queue; the client's receive task takes chunks out of it. There
-is no task switch per message.
+The transport hands bytes to the machine of ``protocols/``. What comes out, a chunk of events per
+delivery, goes straight to the receiver that was named with :meth:`Link.deliver_to`: no task is
+switched for it. Before there is one, chunks wait in a bounded queue for :meth:`Link.receive`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ __all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
 logger: logging.Logger = logging.getLogger("smartcam.connection")
 
 MAX_CHUNKS = 256
-"""Chunks that wait for the receive task. It only hands events on and never waits, so a few are
-normal; beyond this TCP stops reading and UDP drops, which is counted."""
+"""Chunks that wait while a session is made, where a few are normal; beyond this TCP stops reading
+and UDP drops, which is counted."""
 
 
 class Chunk(NamedTuple):
@@ -64,7 +64,7 @@ class TraceEntry(NamedTuple):
     hex: str
 
 
-class Link(asyncio.Protocol, asyncio.DatagramProtocol):
+class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     """One link. Made by :func:`open_link`; when it ends, a new one is made.
 
     Args:
@@ -97,6 +97,7 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         self.heard_at: float = self._loop.time()
         self._transport: Any = None
         self._chunks: collections.deque[Chunk] = collections.deque()
+        self._receiver: Callable[[Chunk], None] | None = None
         self._wakeup: asyncio.Future[None] | None = None
         self._closed: asyncio.Future[None] = self._loop.create_future()
         self._loss: BaseException | None = None
@@ -126,12 +127,17 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         finally:
             self._flush()
 
+    @property
+    def writable(self) -> bool:
+        """Whether the transport takes more at once: :meth:`drain` would not wait."""
+        return self._writable.is_set()
+
     async def drain(self) -> None:
         """Wait until the transport takes more; bounded by the caller's deadline."""
         await self._writable.wait()
 
     async def receive(self) -> Chunk:
-        """Return the next chunk; waits without a bound, the reader's life is the link's.
+        """Return the next chunk; waits without a bound, who asks has a deadline.
 
         Raises:
             ConnectionLostError: the link is gone and every chunk was taken.
@@ -141,16 +147,31 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         while not self._chunks:
             if self._loss is not None:
                 raise self.lost_error()
-            self._wakeup = self._loop.create_future()
-            try:
-                await self._wakeup
-            finally:
-                self._wakeup = None
+            await self._wait()
         chunk = self._chunks.popleft()
-        if self._paused and len(self._chunks) < MAX_CHUNKS // 2:
-            self._paused = False
-            self._transport.resume_reading()
+        if len(self._chunks) < MAX_CHUNKS // 2:
+            self._resume()
         return chunk
+
+    def deliver_to(self, receiver: Callable[[Chunk], None]) -> None:
+        """Hand every chunk to ``receiver`` as it comes, first those that wait.
+
+        Args:
+            receiver: takes a chunk; it never waits and never raises.
+        """
+        while self._chunks:
+            receiver(self._chunks.popleft())
+        self._receiver = receiver
+        self._resume()
+
+    async def wait_lost(self) -> ConnectionLostError:
+        """Wait until the link is gone and return why; without a bound, it is the link's life.
+
+        What came before was delivered by then. Cancellation: safe.
+        """
+        while self._loss is None:
+            await self._wait()
+        return self.lost_error()
 
     async def close(self, timeout: float) -> None:
         """Send Disconnect, end the link in order, within ``timeout`` seconds; else abort it.
@@ -223,10 +244,14 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
             if self._liveness_timeout is not None:
                 _keep_alive(sock, self._liveness_timeout)
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """asyncio: where the next bytes of a TCP link go."""
+        return self.machine.room()
+
+    def buffer_updated(self, nbytes: int) -> None:
         """asyncio: bytes of a TCP link."""
         self.heard_at = self._loop.time()
-        self.machine.receive_data(data)
+        self.machine.filled(nbytes)
         self._enqueue()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
@@ -284,7 +309,12 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         events = self.machine.events()
         if not events or self._closing:
             return
-        self._chunks.append(Chunk(self.heard_at, events))
+        chunk = Chunk(self.heard_at, events)
+        if self._receiver is not None:
+            self._receiver(chunk)
+        else:
+            self._chunks.append(chunk)
+            self._wake()
         last = events[-1]
         if isinstance(last, LinkFailed):
             self._lose(last.error)
@@ -296,7 +326,14 @@ class Link(asyncio.Protocol, asyncio.DatagramProtocol):
         ):
             self._paused = True
             self._transport.pause_reading()
-        self._wake()
+
+    async def _wait(self) -> None:
+        """Wait until something is there to take, or the link is gone."""
+        self._wakeup = self._loop.create_future()
+        try:
+            await self._wakeup
+        finally:
+            self._wakeup = None
 
     def _resume(self) -> None:
         if self._paused:

@@ -15,6 +15,7 @@ import contextlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
+from smartcam.alarm import Alarm
 from smartcam.attribution import PendingTrigger
 from smartcam.exceptions import (
     CameraBusyError,
@@ -52,6 +53,11 @@ TIMER_RESOLUTION = 0.02
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
 """The id is a UINT32 on the wire (SC manual p. 34, published)."""
+
+_WAITING = int(Status.WAITING_FOR_TRIGGER)
+_SPEAKS_AGAINST = int(
+    Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
+)  # of these Waiting alone is to be set before a trigger
 
 LATE_GRACE = 0.25
 """Seconds that a late result is waited for before it is made impossible: most are only a little
@@ -116,12 +122,17 @@ class Conversation:
         self._halted = False  # stopped by a trigger's fence that has not started it again yet
         self._unconfirmed = False  # a Start or Stop was sent, its status has not come
         self._status_in_doubt = False  # over UDP: it may have been lost
+        self._alarm = Alarm(self._expire)
 
     def begin(self, link: Link) -> None:
         """A new session: nothing is owed on it, its status is heard."""
         self.link = link
         self._due.clear()
         self._unconfirmed = self._status_in_doubt = False
+
+    def end(self) -> None:
+        """There will be no session any more."""
+        self._alarm.cancel()
 
     def require_link(self) -> Link:
         """Return the link.
@@ -172,6 +183,8 @@ class Conversation:
         """
         link = self.require_link()
         link.send(message, answered=answered)
+        if link.writable:
+            return
         try:
             async with asyncio.timeout_at(deadline):
                 await link.drain()
@@ -439,7 +452,7 @@ class Conversation:
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
-        attribution = self.inbox.attribution
+        attribution, loop = self.inbox.attribution, asyncio.get_running_loop()
         self._raise_fault()
         if request.input_data is not None and self.inbox.input_in_doubt:
             raise InputContainerError(
@@ -447,7 +460,8 @@ class Conversation:
                 "queued in the camera and would be taken for this one's; switch_application() "
                 "empties the queue"
             )
-        await self._check_application(deadline)
+        if self.inbox.expected is not None and self.inbox.active != self.inbox.expected:
+            await self._check_application(deadline)
         if self._status_in_doubt:
             await self._ask_for_status(deadline)
             await self._fence(deadline)  # it has come by then, or is lost again
@@ -457,7 +471,8 @@ class Conversation:
         decided = numbering is not None and numbering.always
         if self._halted or (attribution.debt is not None and not decided):
             await self._settle_debt(deadline)
-        await self._wait_for_trigger(deadline, wait=request.wait)
+        if int(self.status) & _SPEAKS_AGAINST != _WAITING:
+            await self._wait_for_trigger(deadline, wait=request.wait)
         if Status.OVERTRIGGERED in self.status:
             await self._see_overtriggered_fall(deadline)
             await self._wait_for_trigger(deadline, wait=request.wait)
@@ -465,10 +480,10 @@ class Conversation:
             await self._settle_others(deadline)
             await self._wait_for_trigger(deadline, wait=request.wait)
         pending = PendingTrigger(
-            asyncio.get_running_loop().create_future(),
+            loop.create_future(),
             request.interpretation,
             request.input_data is not None,
-            asyncio.get_running_loop().time(),
+            loop.time(),
             datetime.now(UTC),
             wanted=request.results,
             number=attribution.take_number(numbering.highest) if numbering is not None else None,
@@ -487,15 +502,16 @@ class Conversation:
         if input_data is not None:
             words.append(m.SetInput(data=input_data))
         inbox.attribution.send(pending)
+        self._alarm.set(deadline)
         try:
             link.send(*words, m.Trigger())
             inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
-            async with asyncio.timeout_at(deadline):
-                await link.drain()
-                return await outcome
+            if not link.writable:
+                with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
+                    async with asyncio.timeout_at(deadline):
+                        await link.drain()
+            return await outcome
         except TimeoutError as exc:
-            if outcome.done() and not outcome.cancelled():
-                return outcome.result()
             inbox.attribution.give_up(pending)
             # it may have been stopped: then Waiting did not drop for this trigger
             self._status_in_doubt = not (self._ordered or pending.dropped_waiting)
@@ -509,9 +525,19 @@ class Conversation:
         except asyncio.CancelledError:
             if not outcome.done() or outcome.cancelled():
                 inbox.attribution.give_up(pending)
+            else:
+                outcome.exception()  # nobody will look at it
             raise
         finally:
+            self._alarm.clear()
             inbox.attribution.pending = None
+
+    def _expire(self) -> None:
+        """The trigger's deadline: from this moment on its result is late."""
+        pending = self.inbox.attribution.pending
+        if pending is not None and not pending.outcome.done():
+            self.inbox.attribution.give_up(pending)
+            pending.outcome.set_exception(TimeoutError())
 
     async def _check_application(self, deadline: float) -> None:
         """See to it that the application that was named is the active one.
@@ -520,8 +546,6 @@ class Conversation:
             WrongApplicationError: somebody else has switched; nothing was sent but a Query.
         """
         inbox = self.inbox
-        if inbox.expected is None or inbox.active == inbox.expected:
-            return
         await self._fence(deadline)  # what is known may be old
         if inbox.active != inbox.expected:
             raise WrongApplicationError(

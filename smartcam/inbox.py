@@ -8,11 +8,12 @@ to its trigger and to the streams. What the camera is known to be stands here to
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import weakref
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from smartcam.account import Account
 from smartcam.attribution import Attribution, PendingTrigger
@@ -34,6 +35,8 @@ from smartcam.models import (
     StatusChanged,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols.machine import ResultBurst
+from smartcam.streams import Subscribers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,13 +44,23 @@ if TYPE_CHECKING:
     from smartcam.connection import Chunk
     from smartcam.interpretation import Interpretation
     from smartcam.observers import Observers
-    from smartcam.streams import Subscription
+    from smartcam.protocols.machine import Event
+    from smartcam.streams import Queue
 
 __all__ = ["Inbox"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 Answer = m.Message | SmartCamError
+
+# as plain integers: what an IntFlag does in Python costs more than all else that a status needs
+_BUSY, _RUNNING = int(Status.BUSY), int(Status.RUNNING)
+_RUNNING_OR_BUSY = _RUNNING | _BUSY
+_NOTED = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
+_FAILING = int(Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR)
+
+# half the time of a NamedTuple's own; the cast because a bare tuple is generic
+_new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
 @dataclass(slots=True)
@@ -82,9 +95,9 @@ class Inbox:
         self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
         # weak: a waiter that was made and never awaited must not count as a listener
         self.next_results: weakref.WeakSet[asyncio.Future[Result]] = weakref.WeakSet()
-        self.result_streams: weakref.WeakSet[Subscription[Result]] = weakref.WeakSet()
-        self.status_streams: weakref.WeakSet[Subscription[Status]] = weakref.WeakSet()
-        self.event_streams: weakref.WeakSet[Subscription[CameraEvent]] = weakref.WeakSet()
+        self.result_streams: Subscribers[Result] = Subscribers()
+        self.status_streams: Subscribers[Status] = Subscribers()
+        self.event_streams: Subscribers[CameraEvent] = Subscribers()
         self.account: Account = Account()
         self._observers = observers
         self._status_waiters: list[_StatusWaiter] = []
@@ -93,6 +106,13 @@ class Inbox:
         self._heard_status = False  # in this session
         self._loaded_by_us = False
         self._warned_extra = False
+        self._takers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
+            m.StatusReport: self._on_status,
+            m.ResultContainer: self._on_result,
+            ResultBurst: self._on_burst,
+            m.QueryAnswer: self._on_active,
+            m.SwitchAnswer: self._on_switched,
+        }
 
     def begin(self, *, ordered: bool) -> None:
         """A new session; ``ordered`` where messages come in order and none is lost (TCP)."""
@@ -104,27 +124,13 @@ class Inbox:
 
     def dispatch(self, chunk: Chunk) -> None:
         """Hand on every event of a chunk, in order; never waits, never raises."""
-        at = datetime.now(UTC)
+        at, now = datetime.now(UTC), chunk.received_at
         for event in chunk.events:
-            match event:
-                case m.ResultContainer():
-                    self._on_result(event, chunk.received_at, at)
-                case m.StatusReport():
-                    self._on_status(event, chunk.received_at, at)
-                case m.QueryAnswer():
-                    self.set_active(event.application, at)
-                case m.SwitchAnswer():
-                    if event.code == 0:
-                        self.expected = event.application
-                        self.input_in_doubt = False
-                        self._loaded_by_us = True
-                        self.attribution.settled()
-                    self.set_active(event.application, at)
-                case m.Message():
-                    pass
-                case _:
-                    continue  # LinkFailed and LinkEnded: the link tells its reader when drained
-            self._on_answer(event, chunk.received_at)
+            take = self._takers.get(type(event))
+            if take is not None:  # LinkFailed and LinkEnded: the link tells its reader
+                take(event, now, at)
+            if self.answers and isinstance(event, m.Message):
+                self._on_answer(event, now)
 
     def fail(self, error: SmartCamError) -> None:
         """The session is over: tell everybody who waits, and who comes before the next one.
@@ -158,7 +164,7 @@ class Inbox:
 
     # ------------------------------------------------------------------ for the client
 
-    def streams(self) -> list[Subscription[Any]]:
+    def streams(self) -> list[Queue[Any]]:
         """Every subscription that is still referred to."""
         return [*self.result_streams, *self.status_streams, *self.event_streams]
 
@@ -207,7 +213,7 @@ class Inbox:
         """Hand an event to its subscribers."""
         logger.debug("%s = %s", self.name, event)
         self._observers.state(event)
-        for stream in tuple(self.event_streams):
+        for stream in self.event_streams:
             stream.offer(event, 0.0)
 
     # ------------------------------------------------------------------ inside
@@ -221,19 +227,34 @@ class Inbox:
                 self.account.round_trip.add(now - asked_at)
             future.set_result(message)
 
+    def _on_active(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
+        self.set_active(answer.application, at)
+
+    def _on_switched(self, answer: m.SwitchAnswer, now: float, at: datetime) -> None:
+        if answer.code == 0:
+            self.expected = answer.application
+            self.input_in_doubt = False
+            self._loaded_by_us = True
+            self.attribution.settled()
+        self.set_active(answer.application, at)
+
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         before, status = self.status, report.status
-        previous = before if self._heard_status else None
+        bits = int(status)
+        was = int(before) if self._heard_status and before is not None else None
         self.status, self.endian, self._heard_status = status, report.endian, True
-        self._note_changes(Status(0) if previous is None else previous, status)
-        self._fail_trigger(Status(0) if previous is None else previous, status)
-        self.attribution.on_status(previous, status)
-        self._note_loading(previous, status)
-        if status != before:
+        risen, fallen = bits & ~(was or 0), (was or 0) & ~bits
+        if (risen | fallen) & _NOTED:
+            self._note_changes(risen, fallen)
+        if risen & _FAILING or fallen & _RUNNING:
+            self._fail_trigger(risen, fallen)
+        self.attribution.on_status(was, bits)
+        self._note_loading(was, bits)
+        if status != before and self._is_watched:
             self.publish(StatusChanged(camera=self.name, at=at, status=status, previous=before))
-        for stream in tuple(self.status_streams):
+        for stream in self.status_streams:
             stream.offer(status, now)
-        for waiter in tuple(self._status_waiters):
+        for waiter in tuple(self._status_waiters) if self._status_waiters else ():
             if waiter.outcome.done():
                 continue
             try:
@@ -242,52 +263,93 @@ class Inbox:
             except Exception as exc:  # noqa: BLE001 - the user's predicate: its caller gets it
                 waiter.outcome.set_exception(exc)
 
-    def _note_loading(self, previous: Status | None, status: Status) -> None:
+    @property
+    def _is_watched(self) -> bool:
+        """Whether anybody would see an event."""
+        debug = logger.isEnabledFor(logging.DEBUG)
+        return bool(self.event_streams) or bool(self._observers) or debug
+
+    def _note_loading(self, was: int | None, bits: int) -> None:
         """Doubt which application is active when somebody else's switch has ended."""
-        if status.loading:
+        if bits & _RUNNING_OR_BUSY == _BUSY:  # as Status.loading
             self._loaded_by_us = False
-        elif previous is not None and previous.loading:
+        elif was is not None and was & _RUNNING_OR_BUSY == _BUSY:
             by_us = self._loaded_by_us or m.SwitchAnswer in self.answers
             self.active_in_doubt = self.active_in_doubt or not by_us
 
-    def _note_changes(self, previous: Status, status: Status) -> None:
-        risen, fallen = status & ~previous, previous & ~status
-        if Status.OVERTRIGGERED in risen:
+    def _note_changes(self, risen: int, fallen: int) -> None:
+        if risen & Status.OVERTRIGGERED:
             self.account.overtriggers += 1
-        if Status.OVERHEAT in risen:
+        if risen & Status.OVERHEAT:
             logger.warning("%s ! the camera is too hot: inspections may get worse", self.name)
-        if Status.OVERHEAT in fallen:
+        if fallen & Status.OVERHEAT:
             logger.info("%s = the camera is no longer too hot", self.name)
-        if Status.SYSTEM_ERROR in risen:
+        if risen & Status.SYSTEM_ERROR:
             logger.error("%s ! the camera reports System Error", self.name)
 
-    def _fail_trigger(self, previous: Status, status: Status) -> None:
+    def _fail_trigger(self, risen: int, fallen: int) -> None:
         """End the trigger under way where the status says that its result cannot be trusted."""
         pending = self.attribution.pending
         if pending is None or pending.outcome.done():
             return
-        risen, fallen = status & ~previous, previous & ~status
         error: SmartCamError | None = None
-        if Status.SYSTEM_ERROR in risen:
+        if risen & Status.SYSTEM_ERROR:
             error = CameraFaultError(f"{self.name}: the camera reports System Error")
-        elif Status.OVERTRIGGERED in risen:
+        elif risen & Status.OVERTRIGGERED:
             error = OvertriggeredError(
                 f"{self.name}: the camera dropped a trigger while ours was under way; "
                 "it cannot be told whose"
             )
-        elif Status.INPUT_CONTAINER in risen and pending.has_input:
+        elif risen & Status.INPUT_CONTAINER and pending.has_input:
             error = InputContainerError(
                 f"{self.name}: input data and inspections are out of step: "
                 "the result would not belong to this input"
             )
-        elif Status.RUNNING in fallen:
+        elif fallen & Status.RUNNING:
             error = NotRunningError(
                 f"{self.name}: somebody else stopped application {self.active} during the "
-                f"inspection, which voids it; status: {status}"
+                f"inspection, which voids it; status: {self.status}"
             )
         if error is not None:
             self.attribution.give_up(pending, "streamed")  # what still comes is nobody's
             pending.outcome.set_exception(error)
+
+    def _on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
+        """Count and hand on several containers at once; one by one where they may differ."""
+        results = self._read_burst(burst, at)
+        if results is None:
+            for container in burst:
+                self._on_result(container, now, at)
+            return
+        self.set_active(burst.application, at)
+        count = len(burst.data)
+        account = self.account
+        account.received += count
+        account.fates["streamed"] += count
+        if self.attribution.satisfied:
+            self._note_extra(count)
+        for stream in self.result_streams:
+            stream.offer_all(results, now)
+
+    def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
+        """Return the results of a burst that is only streamed; None where one may be anything else.
+
+        A trigger or a single waiter may want one, a debt be paid, an observer look at each; and
+        what cannot be interpreted is an item of its own.
+        """
+        application = burst.application
+        if not self.attribution.quiet or self.next_results or self._observers:
+            return None
+        if self.expected not in {None, application} or not self._listening():
+            return None
+        values = self.interpretation.burst(application, burst.data, self.endian)
+        if values is None:
+            return None
+        name, numbers = self.name, itertools.count(self.account.received + 1)
+        return [
+            _new_tuple(Result, (name, application, None, number, None, at, None, data, value))
+            for number, data, value in zip(numbers, burst.data, values, strict=False)
+        ]
 
     def _on_result(self, container: m.ResultContainer, now: float, at: datetime) -> None:
         account, attribution = self.account, self.attribution
@@ -298,7 +360,8 @@ class Inbox:
         expected = self.expected
         if expected is None and pending is not None:
             expected = pending.application
-        self.set_active(container.application, at)
+        if self.active != container.application:
+            self.set_active(container.application, at)
         if expected is not None and container.application != expected:
             account.fates["wrong_application"] += 1
             if pending is not None:
@@ -311,14 +374,15 @@ class Inbox:
         if verdict.extra:
             self._note_extra()
         owner = pending if verdict.fate == "triggered" else None
-        current = verdict.fate in {"triggered", "nobody"}
-        listening = self._listening()
+        current = verdict.fate == "triggered" or verdict.fate == "nobody"
         fate: str = verdict.fate
-        if fate == "nobody":
-            fate = "streamed" if listening else "unclaimed"
-        if owner is None and not listening:
-            account.fates[fate] += 1
-            return
+        if owner is None:
+            listening = self._listening()
+            if fate == "nobody":
+                fate = "streamed" if listening else "unclaimed"
+            if not listening:
+                account.fates[fate] += 1
+                return
         try:
             result = self._interpret(container, owner, now, at)
         except InterpretationError as error:
@@ -328,8 +392,8 @@ class Inbox:
             account.fates[fate] += 1
             self._deliver(result, owner, now, current=current)
 
-    def _note_extra(self) -> None:
-        self.account.extra_results += 1
+    def _note_extra(self, count: int = 1) -> None:
+        self.account.extra_results += count
         if not self._warned_extra:
             self._warned_extra = True
             logger.warning(
@@ -348,28 +412,31 @@ class Inbox:
     ) -> Result:
         interpretation = owner.interpretation if owner is not None else self.interpretation
         number = self.account.received
-        done = interpretation(container, self.endian, camera=self.name, number=number, at=at)
-        self.account.empty_slots += done.empty_slots
+        value, sequence, empty_slots = interpretation(
+            container, self.endian, camera=self.name, number=number, at=at
+        )
+        self.account.empty_slots += empty_slots
         return Result(
-            camera=self.name,
-            application=container.application,
-            sequence=done.sequence,
-            number=number,
-            triggered_at=owner.triggered_at if owner is not None else None,
-            received_at=at,
-            latency=now - owner.sent_at if owner is not None else None,
-            raw=container.data,
-            value=done.value,
+            self.name,
+            container.application,
+            sequence,
+            number,
+            owner.triggered_at if owner is not None else None,
+            at,
+            now - owner.sent_at if owner is not None else None,
+            container.data,
+            value,
         )
 
     def _deliver(
         self, result: Result, owner: PendingTrigger | None, now: float, *, current: bool
     ) -> None:
         """Hand a result on; ``current`` where it is not known to be an older trigger's."""
-        self._observers.result(result)
-        for stream in tuple(self.result_streams):
+        if self._observers:
+            self._observers.result(result)
+        for stream in self.result_streams:
             stream.offer(result, now)
-        if current:
+        if current and self.next_results:
             for future in self._take_next_results():
                 future.set_result(result)
         if owner is not None:
@@ -389,7 +456,7 @@ class Inbox:
         *,
         current: bool,
     ) -> None:
-        for stream in tuple(self.result_streams):
+        for stream in self.result_streams:
             stream.offer(error, now)
         if current:
             for future in self._take_next_results():

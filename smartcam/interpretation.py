@@ -8,15 +8,29 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
-from smartcam.interpreters.base import Context, Interpreter, Reader, resolve, run, run_sequence
+from smartcam.interpreters.base import (
+    Context,
+    Interpreter,
+    PlainInterpreter,
+    Reader,
+    plain,
+    resolve,
+    run,
+    run_plain,
+    run_sequence,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from datetime import datetime
 
     from smartcam.models import ByteOrder
     from smartcam.protocols.messages import ResultContainer
 
 __all__ = ["Interpretation", "byte_order"]
+
+
+_BYTE_ORDERS: dict[int, ByteOrder] = {0: "little", 1: "big"}
 
 
 def byte_order(endian: int) -> ByteOrder:
@@ -27,10 +41,8 @@ def byte_order(endian: int) -> ByteOrder:
     Raises:
         InterpretationError: any other value.
     """
-    if endian == 0:
-        return "little"
-    if endian == 1:
-        return "big"
+    if endian in _BYTE_ORDERS:
+        return _BYTE_ORDERS[endian]
     raise InterpretationError(
         f"the camera's endian field is {endian}; 0 (little) or 1 (big) was expected",
         field="endian",
@@ -78,8 +90,8 @@ class Interpretation:
     def __init__(self, spec: Any, *, lenient: bool, y_down: bool) -> None:
         self._lenient = lenient
         self._y_down = y_down
-        self._one: Interpreter | None = None
-        self._by_application: dict[int, Interpreter] = {}
+        self._one: _Way | None = None
+        self._by_application: dict[int, _Way] = {}
         if hasattr(spec, "items"):
             for application, one in spec.items():
                 if not isinstance(application, int):
@@ -87,9 +99,9 @@ class Interpretation:
                         f"interpret_as: a mapping goes from application id to a specification; "
                         f"{application!r} is no id"
                     )
-                self._by_application[application] = resolve(one, lenient=lenient)
+                self._by_application[application] = _way(resolve(one, lenient=lenient))
         else:
-            self._one = resolve(spec, lenient=lenient)
+            self._one = _way(resolve(spec, lenient=lenient))
 
     @property
     def by_application(self) -> bool:
@@ -98,28 +110,34 @@ class Interpretation:
 
     def numbering(self, application: int | None) -> Numbering | None:
         """Return how this application's containers carry the sequence number, None if not."""
-        interpreter = self._interpreter(application)
-        layout = interpreter.layout if interpreter is not None else None
-        field = layout.sequence_field if layout is not None else None
-        if layout is None or field is None or field.wire.high is None:
-            return None
-        always = field in layout.head or layout.repeat is None
-        return Numbering(min(field.wire.high, MAX_NUMBER), always)
+        way = self._way(application)
+        return way.numbering if way is not None else None
 
     def number(self, container: ResultContainer, endian: int) -> int | None:
         """Return a container's sequence number, None where it has none or does not fit."""
-        interpreter = self._interpreter(container.application)
-        if interpreter is None or interpreter.layout is None:
+        way = self._way(container.application)
+        if way is None or way.interpreter.layout is None:
             return None
         try:
-            return interpreter.layout.sequence(container.data, byte_order(endian))
+            return way.interpreter.layout.sequence(container.data, byte_order(endian))
         except InterpretationError:
             return None
 
-    def _interpreter(self, application: int | None) -> Interpreter | None:
+    def _way(self, application: int | None) -> _Way | None:
         if self._one is not None or application is None:
             return self._one
         return self._by_application.get(application)
+
+    def _known(self, application: int) -> _Way:
+        way = self._way(application)
+        if way is None:
+            known = sorted(self._by_application)
+            raise WrongApplicationError(
+                f"a result of application {application} came; interpret_as knows {known}",
+                expected=known,
+                got=application,
+            )
+        return way
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
@@ -130,23 +148,56 @@ class Interpretation:
             InterpretationError: it does not fit.
             WrongApplicationError: the mapping does not know its application.
         """
-        interpreter = self._interpreter(container.application)
-        if interpreter is None:
-            known = sorted(self._by_application)
-            raise WrongApplicationError(
-                f"a result of application {container.application} came; interpret_as knows {known}",
-                expected=known,
-                got=container.application,
-            )
+        interpreter, simple, sequenced, _ = self._known(container.application)
+        order = byte_order(endian)
+        if simple is not None and not sequenced:
+            return Interpreted(run_plain(simple, container.data, order), None, 0)
         context = Context(
-            camera=camera,
-            application=container.application,
-            number=number,
-            received_at=at,
-            byte_order=byte_order(endian),
-            y_down=self._y_down,
-            lenient=self._lenient,
+            camera, container.application, number, at, order, self._y_down, self._lenient
         )
         reader = Reader(container.data, context, interpreter.layout)
         value = run(interpreter, reader)
-        return Interpreted(value, run_sequence(interpreter, reader), context.empty_slots)
+        sequence = run_sequence(interpreter, reader) if sequenced else None
+        return Interpreted(value, sequence, context.empty_slots)
+
+    def burst(self, application: int, payloads: list[bytes], endian: int) -> Sequence[Any] | None:
+        """Return the values of several containers that came together.
+
+        None where they are to be interpreted one by one: what an interpreter does with them takes
+        more than their bytes, or one of them does not fit.
+        """
+        way = self._way(application)
+        if way is None or way.simple is None or way.sequenced or endian not in _BYTE_ORDERS:
+            return None
+        try:
+            values = way.simple.read_all(payloads, _BYTE_ORDERS[endian])
+            return values if len(values) == len(payloads) else None
+        except Exception:  # noqa: BLE001 - one by one it shows, with its place
+            return None
+
+
+class _Way(NamedTuple):
+    """How the containers of one application are read.
+
+    Attributes:
+        interpreter: what does it.
+        simple: the same where it wants nothing but the bytes, else None.
+        sequenced: whether it may tell a sequence number.
+        numbering: how the layout carries that, None without one.
+    """
+
+    interpreter: Interpreter
+    simple: PlainInterpreter | None
+    sequenced: bool
+    numbering: Numbering | None
+
+
+def _way(interpreter: Interpreter) -> _Way:
+    layout = interpreter.layout
+    own = type(interpreter).sequence is not Interpreter.sequence
+    field = layout.sequence_field if layout is not None else None
+    numbering = None
+    if layout is not None and field is not None and field.wire.high is not None:
+        always = field in layout.head or layout.repeat is None
+        numbering = Numbering(min(field.wire.high, MAX_NUMBER), always)
+    return _Way(interpreter, plain(interpreter), own or field is not None, numbering)

@@ -106,6 +106,12 @@ class Status(enum.IntFlag):
 _NAMED_BITS = sum(member.value for member in Status)
 
 
+def as_status(word: int) -> Status:
+    """Return the status of a word; for the receiving path, where ``Status(word)`` is slow."""
+    known = Status._value2member_map_.get(word)  # of named bits only, so at most 128
+    return Status(word) if known is None else cast("Status", known)
+
+
 class Position(NamedTuple):
     """A point, metres."""
 

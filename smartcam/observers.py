@@ -62,6 +62,9 @@ class Observers:
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
         self._all = tuple(observers)
 
+    def __bool__(self) -> bool:
+        return bool(self._all)
+
     @property
     def trace(self) -> Callable[[TraceEntry], None] | None:
         """What is to be called with every frame; None where no observer looks at frames."""

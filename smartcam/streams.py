@@ -5,17 +5,18 @@ from __future__ import annotations
 import asyncio
 import collections
 import enum
-from typing import TYPE_CHECKING, Generic, TypeVar
+import weakref
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from smartcam.exceptions import ConfigurationError, SmartCamError, SubscriberOverflowError
 from smartcam.models import SubscriberStatistics
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterator, Sequence
     from types import TracebackType
     from typing import Self
 
-__all__ = ["Overflow", "Subscription"]
+__all__ = ["BatchSubscription", "Overflow", "Queue", "Subscribers", "Subscription"]
 
 T = TypeVar("T")
 
@@ -30,13 +31,8 @@ class Overflow(enum.Enum):
     queued."""
 
 
-class Subscription(Generic[T]):
-    """A bounded stream of items: ``async for item in subscription``.
-
-    It subscribes when it is made and ends when it is closed, garbage collected, or the client
-    closes. Its account always balances: ``offered == taken + dropped + queued``.
-
-    Cancellation: safe, nothing is lost; an item is taken as the last step.
+class Queue(Generic[T]):
+    """What both kinds of subscription are: a bounded queue with an account.
 
     Args:
         name: what is subscribed to.
@@ -70,6 +66,7 @@ class Subscription(Generic[T]):
         self._end_error: SmartCamError | None = None
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
+        self._errors = 0  # among the items
 
     @property
     def ended(self) -> bool:
@@ -91,17 +88,15 @@ class Subscription(Generic[T]):
         """Unsubscribe; what is queued counts as dropped. Idempotent."""
         self._dropped += len(self._items)
         self._items.clear()
+        self._errors = 0
         self.end(None)
 
-    def __aiter__(self) -> AsyncIterator[T]:
-        return self
-
-    async def __anext__(self) -> T:
-        """Return the next item.
+    async def _wait(self) -> None:
+        """Wait until an item is there.
 
         Raises:
             StopAsyncIteration: closed.
-            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+            SmartCamError: how it ended.
         """
         while not self._items:
             if self._ended:
@@ -110,11 +105,6 @@ class Subscription(Generic[T]):
                 raise StopAsyncIteration
             self._ready.clear()
             await self._ready.wait()
-        item = self._items.popleft()
-        self._taken += 1
-        if isinstance(item, SmartCamError):
-            raise item
-        return item
 
     async def __aenter__(self) -> Self:
         return self
@@ -143,10 +133,22 @@ class Subscription(Generic[T]):
                     )
                 )
                 return
-            self._items.popleft()
+            self._errors -= isinstance(self._items.popleft(), SmartCamError)
         self._last = now
+        self._errors += isinstance(item, SmartCamError)
         self._items.append(item)
         self._ready.set()
+
+    def offer_all(self, items: Sequence[T], now: float) -> None:
+        """Hand several items over that came together; as :meth:`offer` for each."""
+        if self._min_interval or len(self._items) + len(items) > self._max_queue:
+            for item in items:
+                self.offer(item, now)
+        elif items and not self._ended:
+            self._offered += len(items)
+            self._last = now
+            self._items.extend(items)
+            self._ready.set()
 
     def end(self, error: SmartCamError | None) -> None:
         """End the stream after what is queued; the first reason stays."""
@@ -154,3 +156,94 @@ class Subscription(Generic[T]):
             self._ended = True
             self._end_error = error
         self._ready.set()
+
+
+class Subscription(Queue[T]):
+    """A bounded stream of items: ``async for item in subscription``.
+
+    It subscribes when it is made and ends when it is closed, garbage collected, or the client
+    closes. Its account always balances: ``offered == taken + dropped + queued``.
+
+    Cancellation: safe, nothing is lost; an item is taken as the last step.
+    """
+
+    def __aiter__(self) -> AsyncIterator[T]:
+        return self
+
+    async def __anext__(self) -> T:
+        """Return the next item.
+
+        Raises:
+            StopAsyncIteration: closed.
+            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+        """
+        if not self._items:
+            await self._wait()
+        item = self._items.popleft()
+        self._taken += 1
+        if isinstance(item, SmartCamError):
+            self._errors -= 1
+            raise item
+        return item
+
+
+class BatchSubscription(Queue[T]):
+    """The same in batches: ``async for items in subscription`` gives a list of what is there.
+
+    Cancellation: safe, nothing is lost; a batch is taken as the last step.
+    """
+
+    def __aiter__(self) -> AsyncIterator[list[T]]:
+        return self
+
+    async def __anext__(self) -> list[T]:
+        """Return all items that are there, one at least; those before an error, if one is there.
+
+        Raises:
+            StopAsyncIteration: closed.
+            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+        """
+        if not self._items:
+            await self._wait()
+        items, batch = self._items, list[T]()
+        if not self._errors:
+            batch = cast("list[T]", list(items))
+            items.clear()
+        while items:
+            item = items.popleft()
+            if not isinstance(item, SmartCamError):
+                batch.append(item)
+            elif batch:
+                items.appendleft(item)
+                break
+            else:
+                self._errors -= 1
+                self._taken += 1
+                raise item
+        self._taken += len(batch)
+        return batch
+
+
+class Subscribers(Generic[T]):
+    """The queues that are offered something; one that nobody refers to any more is gone."""
+
+    __slots__ = ("_references",)
+
+    def __init__(self) -> None:
+        self._references: tuple[weakref.ref[Queue[T]], ...] = ()
+
+    def add(self, queue: Queue[T]) -> None:
+        """Offer it what comes from now on."""
+        self._references = (*self._references, weakref.ref(queue, self._discard))
+
+    def _discard(self, reference: weakref.ref[Queue[T]]) -> None:
+        self._references = tuple(one for one in self._references if one is not reference)
+
+    def __bool__(self) -> bool:
+        return bool(self._references)
+
+    def __iter__(self) -> Iterator[Queue[T]]:
+        for reference in self._references:
+            queue = reference()
+            if queue is not None:
+                yield queue

@@ -26,7 +26,7 @@ from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.protocols.base import Transport
 
 if TYPE_CHECKING:
-    from smartcam.connection import Link
+    from smartcam.connection import Chunk, Link
     from smartcam.conversation import Conversation
     from smartcam.observers import Observers
     from smartcam.settings import Address, CameraSettings
@@ -71,6 +71,7 @@ class Supervisor:
         self._reading = False  # a link, whose end it notices by itself
         self._short_lived = 0  # sessions in a row that were lost soon
         self._excused = False  # an early loss of this session is no other client's doing
+        self._failure: Exception | None = None  # of ours, while a chunk was dispatched
         self._restarting: Link | None = None  # the camera was told to restart over this link
 
     # ------------------------------------------------------------------ for the client
@@ -137,6 +138,7 @@ class Supervisor:
                 await asyncio.wait({task})
             self._inbox.end = self._ended_by or self.closed_error()
             self._inbox.finish()
+            self._talk.end()
 
     async def wait_connected(self, deadline: float, timeout: float) -> None:
         """Wait until there is a session, and what had to be restored in it is.
@@ -199,6 +201,7 @@ class Supervisor:
                 self.session.link.abort()
             self._inbox.account.end()
             self._inbox.finish()
+            self._talk.end()
             self._tell()
             if self._opened is not None and not self._opened.done():
                 self._opened.set_result(error)
@@ -256,29 +259,38 @@ class Supervisor:
         self._tell()
 
     async def _read(self, link: Link) -> ConnectionLostError:
-        """Dispatch chunks until the link ends; return why it did."""
-        try:
-            while True:
-                self._inbox.dispatch(await link.receive())
-                if self._inbox.active_in_doubt:
-                    self._talk.ask_what_is_active()
-        except ConnectionLostError as error:
-            restarting = self._restarting is link
-            expected = self._closing or restarting
-            reason = "the camera restarts" if restarting else str(error.__cause__)
-            reason = "closed by this side" if self._closing else reason
-            if not expected:
-                logger.warning("! %s", error)
-                self._inbox.account.last_error = str(error)
-                self._observers.error(self._talk.name, error)
-            self._inbox.fail(error)
-            self._inbox.publish(
-                Disconnected(
-                    camera=self._talk.name, at=datetime.now(UTC), reason=reason, expected=expected
-                )
+        """Have every chunk dispatched until the link ends; return why it did."""
+        link.deliver_to(self._take)
+        error = await link.wait_lost()
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+        restarting = self._restarting is link
+        expected = self._closing or restarting
+        reason = "the camera restarts" if restarting else str(error.__cause__)
+        reason = "closed by this side" if self._closing else reason
+        if not expected:
+            logger.warning("! %s", error)
+            self._inbox.account.last_error = str(error)
+            self._observers.error(self._talk.name, error)
+        self._inbox.fail(error)
+        self._inbox.publish(
+            Disconnected(
+                camera=self._talk.name, at=datetime.now(UTC), reason=reason, expected=expected
             )
-            self._tell()
-            return error
+        )
+        self._tell()
+        return error
+
+    def _take(self, chunk: Chunk) -> None:
+        """Dispatch a chunk; called by the link as it comes."""
+        try:
+            self._inbox.dispatch(chunk)
+            if self._inbox.active_in_doubt:
+                self._talk.ask_what_is_active()
+        except Exception as exc:  # noqa: BLE001 - a fault of ours: the task raises it
+            self._failure = exc
+            self._talk.require_link().abort(exc)
 
     async def _reconnect(self, loss: ConnectionLostError) -> Session:
         """Make a new session, as often as the policy says.

@@ -18,11 +18,12 @@ from smartcam.models import Status
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Coroutine
+    from types import TracebackType
     from typing import Any
 
     from smartcam.conversation import Conversation
 
-__all__ = ["Before", "Turns"]
+__all__ = ["Before", "Turn", "Turns"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
@@ -44,6 +45,24 @@ class Before:
     wants_running: bool | None
 
 
+class Turn:
+    """One command's turn: ``async with turns.hold(timeout) as deadline``."""
+
+    __slots__ = ("_timeout", "_turns")
+
+    def __init__(self, turns: Turns, timeout: float) -> None:
+        self._turns = turns
+        self._timeout = timeout
+
+    async def __aenter__(self) -> float:
+        return await self._turns.take(self._timeout)
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        self._turns.give_back()
+
+
 class Turns:
     """Gives commands their turn.
 
@@ -58,6 +77,7 @@ class Turns:
         self._talk = talk
         self._switch_timeout = switch_timeout
         self._lock = asyncio.Lock()
+        self._in_line = 0  # commands that wait for the lock
         self._leaving: set[asyncio.Task[None]] = set()
         self._failed: SmartCamError | None = None
 
@@ -89,43 +109,22 @@ class Turns:
 
     # ------------------------------------------------------------------ for commands
 
-    @contextlib.asynccontextmanager
-    async def hold(self, timeout: float) -> AsyncGenerator[float]:
-        """Hold the turn; gives the deadline, the wait for the turn included.
+    def hold(self, timeout: float) -> Turn:
+        """Hold the turn with ``async with``; it gives the deadline, the wait for it included.
 
         Raises:
             ResponseTimeoutError: others had it for ``timeout`` seconds.
             SmartCamError: going back failed before this command, and why.
         """
-        deadline = self._talk.deadline(timeout)
-        self._talk.require_link()
-        try:
-            async with asyncio.timeout_at(deadline):
-                await self._acquire()
-        except TimeoutError as exc:
-            raise ResponseTimeoutError(
-                f"{self._talk.name}: another command had the camera for {timeout:g} s",
-                waited=timeout,
-            ) from exc
-        try:
-            self._talk.require_link()  # it may have been lost meanwhile
-            self._raise_failed()
-            await self._talk.catch_up(deadline)
-            yield deadline
-        finally:
-            self._lock.release()
+        return Turn(self, timeout)
 
     @contextlib.asynccontextmanager
-    async def hold_in(self, application: int | None, timeout: float) -> AsyncGenerator[float]:
-        """Hold the turn with ``application`` running, if one is given; gives the deadline.
+    async def hold_in(self, application: int, timeout: float) -> AsyncGenerator[float]:
+        """Hold the turn with ``application`` running; gives the deadline.
 
         Afterwards the application before is back; after an error or a cancellation that goes on
         behind the caller's back.
         """
-        if application is None:
-            async with self.hold(timeout) as deadline:
-                yield deadline
-            return
         self._talk.deadline(timeout)  # a wrong one is refused before anything is switched
         async with self.hold(self._switch_timeout) as switch_deadline:
             before = await self.enter(application, switch_deadline)
@@ -135,6 +134,41 @@ class Turns:
                 going_back = self.leave(before)
         if going_back is not None:
             await asyncio.wait({going_back})
+
+    async def take(self, timeout: float) -> float:
+        """Take the turn and return the deadline; for :class:`Turn`, which gives it back."""
+        talk = self._talk
+        deadline = talk.deadline(timeout)
+        talk.require_link()
+        if self._lock.locked() or self._in_line or self._leaving:
+            await self._take_in_line(deadline, timeout)
+        else:
+            await self._lock.acquire()  # it is free
+        try:
+            talk.require_link()  # it may have been lost meanwhile
+            self._raise_failed()
+            await talk.catch_up(deadline)
+        except BaseException:
+            self._lock.release()
+            raise
+        return deadline
+
+    def give_back(self) -> None:
+        """Give the turn to the next in line."""
+        self._lock.release()
+
+    async def _take_in_line(self, deadline: float, timeout: float) -> None:
+        self._in_line += 1
+        try:
+            async with asyncio.timeout_at(deadline):
+                await self._acquire()
+        except TimeoutError as exc:
+            raise ResponseTimeoutError(
+                f"{self._talk.name}: another command had the camera for {timeout:g} s",
+                waited=timeout,
+            ) from exc
+        finally:
+            self._in_line -= 1
 
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""

@@ -9,7 +9,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.base import Dialect, MessageRow, Role, Transport
 from smartcam.protocols.bvs import BVS, HANDBOOK, MESSAGES
 from smartcam.protocols.framing import HeaderLayout
-from smartcam.protocols.machine import TRANSITIONS, Event, Machine, State
+from smartcam.protocols.machine import TRANSITIONS, Event, Machine, ResultBurst, State
 
 SIXTEEN = Dialect(
     name="sixteen",
@@ -118,10 +118,22 @@ def receiver_of(
     return made
 
 
+def one_by_one(events: list[Event]) -> list[Event]:
+    """Return events with the containers of each burst in its place."""
+    spread: list[Event] = []
+    for event in events:
+        if isinstance(event, ResultBurst):
+            assert len(event.data) > 1
+            spread += event
+        else:
+            spread.append(event)
+    return spread
+
+
 def feed(made: Machine, *chunks: bytes) -> list[Event]:
     """Give bytes to a machine and return all events."""
     events: list[Event] = []
     for chunk in chunks:
         made.receive_data(chunk)
-        events += made.events()
+        events += one_by_one(made.events())
     return events

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import json
 import math
 import pickle
@@ -569,6 +570,67 @@ def test_table_checks_bools() -> None:
     assert (caught.value.field, caught.value.offset) == ("ok", 3)
     lenient = Layout("(a: int8, ok: bool)*", lenient=True)
     assert lenient.parse_table(b"1\0002\1")["ok"].tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    "text", ["a: int16, b: int8", "(a: int16, b: int8)[2]", "(a: int16, b: int8)*"]
+)
+@pytest.mark.parametrize("size", range(11))
+def test_table_without_conversion_checks_the_size_as_parse_does(text: str, size: int) -> None:
+    layout = Layout(text)
+    layout.dtype_for("little")  # the short way is there from now on
+    payload = bytes(range(size))
+    expected, found = (
+        error_of(face, payload) for face in (layout.parse_records, layout.parse_table)
+    )
+    assert str(found) == str(expected)
+    if found is None:
+        table = layout.parse_table(payload)
+        assert table.tolist() == layout.parse_records(payload)
+        assert not table.flags.writeable
+
+
+def test_table_of_a_bytearray_is_read_only_and_follows_it() -> None:
+    layout, payload = Layout("(a: uint8)*"), bytearray(b"\1\2")
+    layout.dtype_for("little")
+    table = layout.parse_table(payload)
+    payload[0] = 9
+    assert table["a"].tolist() == [9, 2]
+    assert not table.flags.writeable
+
+
+def test_table_in_the_other_byte_order_is_a_copy_in_the_machines() -> None:
+    layout = Layout("(a: int16, s: string[2])*")
+    cases: list[tuple[ByteOrder, bytes]] = [("little", b"\1\0ab"), ("big", b"\0\1ab")]
+    for order, raw in cases:
+        table = layout.parse_table(raw * 2, order)
+        assert table.tolist() == [(1, b"ab")] * 2
+        assert table.dtype == np.dtype([("a", "=i2"), ("s", "S2")])
+
+
+# -- values on the wire ---------------------------------------------------------------------------
+
+
+def test_wire_records_are_not_converted() -> None:
+    layout = Layout("n: int8, (ok: bool, x: int16 mm, s: string[3])[n]")
+    payload = layout.build([(True, 0.005, "a")], slots=3)
+    assert list(layout.wire_records(payload)) == [(0xFF, 5, b"a\0\0")]
+    with pytest.raises(InterpretationError, match="field 'x'"):
+        layout.wire_records(payload[:-4])
+
+
+@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
+@pytest.mark.parametrize("text", ["(a: int8)*", "n: int8, (a: int8)[n]"])
+def test_wire_records_may_be_left_half_read(kind: type, text: str) -> None:
+    # CPython 3.11 crashes where such an iterator holds a memoryview
+    layout = Layout(text)
+    for _ in range(100):
+        rows = layout.wire_records(kind(b"\3\1\2\3"))
+        next(rows)
+        cycle: list[Any] = [rows]
+        cycle.append(cycle)
+    del rows, cycle
+    gc.collect()
 
 
 # -- pydantic, JSON Schema ------------------------------------------------------------------------

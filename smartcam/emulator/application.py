@@ -102,6 +102,14 @@ class Application(BaseModel):
         """The compiled layout of the input data; any byte but zero is a true bool in it."""
         return None if self.input is None else Layout(self.input, lenient=True)
 
+    @property
+    def period(self) -> int | None:
+        """After how many runs its containers come again; None where each run makes its own."""
+        layout = self.result_layout
+        if layout is None or layout.sequence_field is not None or self.generator is not None:
+            return None
+        return 1 if self.cycle is None else len(self.cycle)
+
     def container(
         self,
         *,

@@ -13,9 +13,9 @@ Facts stand in ``docs/protocol.md``. Where the documents are silent the choice i
 from __future__ import annotations
 
 import enum
+import functools
 import logging
 from contextlib import nullcontext
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.emulator.clock import NANOSECONDS
@@ -46,6 +46,15 @@ OPERATOR_CONDITIONS = Status.OVERHEAT | Status.SYSTEM_ERROR
 
 _NUMBERS = 1 << 32  # sequence numbers are UINT32
 
+# the status is put together as a plain number: with an IntFlag each step of that costs a call
+_BUSY = Status.BUSY.value
+_RUNNING = Status.RUNNING.value
+_WAITING = Status.WAITING_FOR_TRIGGER.value
+_OVERTRIGGERED = Status.OVERTRIGGERED.value
+_OVERHEAT = Status.OVERHEAT.value
+_SYSTEM_ERROR = Status.SYSTEM_ERROR.value
+_INPUT_CONTAINER = Status.INPUT_CONTAINER.value
+
 
 class Mode(enum.Enum):
     """What the camera is doing."""
@@ -65,6 +74,8 @@ class _Event(enum.IntEnum):
     BOOTED = 3
     BUSY_ENDS = 4
     FREE_RUN = 5
+
+    __hash__ = int.__hash__  # Enum's own is a function in Python
 
 
 class _Inspection(NamedTuple):
@@ -116,20 +127,18 @@ class Device:
         self.quirks: Quirks = quirks or Quirks()
         self.scene: TableScene = scene or TableScene()
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
-        self._active = self._applications[
-            self._known(next(iter(self._applications)) if active is None else active)
-        ]
+        first = next(iter(self._applications)) if active is None else active
+        self._take_up(self._applications[self._known(first)])
         self._now = 0
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
         self._session = False
         self._owes_switch = False  # the session's
         self._output: list[m.Message] = []
-        self._reported: tuple[Status, int] | None = None
-        self._conditions = Status(0)
+        self._reported: tuple[int, int] | None = None
+        self._conditions = 0
         self._endian = 0
         self._next_number = 0
-        self._runs = 0  # of the active application since it was loaded
         self._processing = False
         self._held_busy = False
         self._trigger_drops = 0  # triggers still to be dropped
@@ -208,15 +217,19 @@ class Device:
         Source: SC manual p. 30 and p. 33 (published); BUSY during an inspection is a quirk; a
         camera with a System Error takes no trigger (inferred).
         """
+        return Status(self._status_word())
+
+    def _status_word(self) -> int:
         word = self._conditions
-        if self._mode is Mode.SWITCHING or self._held_busy:
-            word |= Status.BUSY
-        if self._mode is Mode.RUNNING:
-            word |= Status.RUNNING
+        mode = self._mode
+        if mode is Mode.SWITCHING or self._held_busy:
+            word |= _BUSY
+        if mode is Mode.RUNNING:
+            word |= _RUNNING
             if self._processing:
-                word |= Status.BUSY if self.quirks.busy_while_processing else Status(0)
+                word |= _BUSY if self.quirks.busy_while_processing else 0
             elif self._active.triggered and self._takes_runs:
-                word |= Status.WAITING_FOR_TRIGGER
+                word |= _WAITING
         return word
 
     # ------------------------------------------------------------------ the wire
@@ -341,7 +354,8 @@ class Device:
                 f"device: only {OPERATOR_CONDITIONS} can be set, got {condition}"
             )
         with self.around():
-            self._conditions = self._conditions | condition if on else self._conditions & ~condition
+            bits = condition.value
+            self._conditions = self._conditions | bits if on else self._conditions & ~bits
             if self._faulty:
                 self._void_run()
             self._report()
@@ -413,6 +427,8 @@ class Device:
 
     def _obey(self, message: m.Message) -> None:
         match message:
+            case m.Trigger():
+                self._trigger()
             case m.Query():
                 self._say(m.QueryAnswer(application=self._active.id))
             case m.SwitchApplication(application=application):
@@ -425,8 +441,6 @@ class Device:
                 self._take_input(data)
             case m.SetSequenceNumber(number=number):
                 self._next_number = number
-            case m.Trigger():
-                self._trigger()
             case m.Start():
                 self._enter_run_mode()
             case m.Stop():
@@ -462,7 +476,7 @@ class Device:
             return False
         if self._processing or self._trigger_drops:
             self._trigger_drops = max(0, self._trigger_drops - 1)
-            self._conditions |= Status.OVERTRIGGERED
+            self._conditions |= _OVERTRIGGERED
             self._after(
                 self.quirks.overtriggered_time, _Event.OVERTRIGGER_ENDS, self._end_overtrigger
             )
@@ -487,7 +501,7 @@ class Device:
         self._events.pop(_Event.FREE_RUN, None)
         self._mode = Mode.SWITCHING
         self._owes_switch = answer
-        finish = partial(self._finish_load, target, running=running)
+        finish = functools.partial(self._finish_load, target, running=running)
         self._after(target.load_time, _Event.LOADED, finish)
         self._report()
 
@@ -514,22 +528,28 @@ class Device:
     def _advance(self, target: int) -> None:
         """Let everything happen that is due until ``target``."""
         while self._events:
-            event = min(self._events, key=lambda key: (self._events[key][0], key))
-            if self._events[event][0] > target:
+            when, event = min([(row[0], event) for event, row in self._events.items()])
+            if when > target:
                 break
-            when, action = self._events.pop(event)
+            _, action = self._events.pop(event)
             self._now = max(self._now, when)
             action()
         self._now = target
 
     def _end_overtrigger(self) -> None:
-        self._conditions &= ~Status.OVERTRIGGERED
+        self._conditions &= ~_OVERTRIGGERED
         self._report()
 
+    def _take_up(self, application: Application) -> None:
+        """Make an application the active one."""
+        self._active = application
+        self._period = application.period
+        self._containers: dict[tuple[int, ByteOrder], m.ResultContainer] = {}
+        self._runs = 0  # since it was loaded
+
     def _finish_load(self, target: Application, *, running: bool) -> None:
-        self._active = target
+        self._take_up(target)
         self._forget_inputs()
-        self._runs = 0
         self._mode = Mode.STOPPED
         message = m.SwitchAnswer(code=0, application=target.id)
         answer, self._owes_switch = self._owes_switch, False
@@ -550,7 +570,7 @@ class Device:
         """
         self._mode = Mode.STOPPED
         self._forget_inputs()
-        self._conditions &= Status.OVERHEAT
+        self._conditions &= _OVERHEAT
         self._next_number = self._runs = 0
         self._clock = CalendarClock(LOST_CLOCK, self._now)
 
@@ -558,7 +578,7 @@ class Device:
 
     @property
     def _faulty(self) -> bool:
-        return bool(self._conditions & Status.SYSTEM_ERROR)
+        return bool(self._conditions & _SYSTEM_ERROR)
 
     @property
     def _takes_runs(self) -> bool:
@@ -571,7 +591,10 @@ class Device:
     def _plan_free_run(self, origin: int, count: int) -> None:
         """Plan run ``count`` of a free-running application, counted from its start: no drift."""
         when = origin + _ns(count / (self._active.rate or 1.0))
-        self._events[_Event.FREE_RUN] = (when, partial(self._begin_free_run, origin, count))
+        self._events[_Event.FREE_RUN] = (
+            when,
+            functools.partial(self._begin_free_run, origin, count),
+        )
 
     def _begin_free_run(self, origin: int, count: int) -> None:
         self._plan_free_run(origin, count + 1)
@@ -593,10 +616,8 @@ class Device:
         self._next_number = (self._next_number + 1) % _NUMBERS
         self._runs += 1
         self._processing = True
-        finish = partial(self._finish_run, run)
-        self._after(self._active.processing_time, _Event.INSPECTED, finish)
-        when, action = self._events[_Event.INSPECTED]
-        self._events[_Event.INSPECTED] = (when + change.late, action)
+        ends = self._now + _ns(self._active.processing_time) + change.late
+        self._events[_Event.INSPECTED] = (ends, functools.partial(self._finish_run, run))
         self._report()
 
     def _finish_run(self, run: _Inspection) -> None:
@@ -612,6 +633,18 @@ class Device:
         self._report()
 
     def _result(self, run: _Inspection) -> m.ResultContainer | None:
+        """Return the result; one that comes again and again is built once."""
+        if self._period is None:
+            return self._build_result(run)
+        key = (run.turn % self._period, self._byte_order)
+        result = self._containers.get(key)
+        if result is None:
+            result = self._build_result(run)
+            if result is not None:
+                self._containers[key] = result
+        return result
+
+    def _build_result(self, run: _Inspection) -> m.ResultContainer | None:
         application = self._active
         try:
             data = application.container(
@@ -659,9 +692,9 @@ class Device:
 
     def _in_step(self, *, fits: bool) -> None:
         """Set the bit where containers and inspections are out of step, clear it where not."""
-        self._conditions &= ~Status.INPUT_CONTAINER
+        self._conditions &= ~_INPUT_CONTAINER
         if not fits:
-            self._conditions |= Status.INPUT_CONTAINER
+            self._conditions |= _INPUT_CONTAINER
 
     def _forget_inputs(self) -> None:
         """A newly loaded application has an empty queue (inferred)."""
@@ -676,16 +709,21 @@ class Device:
 
     def _report(self) -> None:
         """Send the status if it differs from the one the client has."""
-        now = (self.status, self._endian)
+        now = (self._status_word(), self._endian)
         if now != self._reported:
             self._reported = now
-            self._say(m.StatusReport(status=now[0], endian=now[1]))
+            self._say(_status_report(*now))
 
     def _known(self, application: int) -> int:
         if application not in self._applications:
             known = ", ".join(str(key) for key in self._applications)
             raise ConfigurationError(f"no application has the id {application}; there are {known}")
         return application
+
+
+@functools.lru_cache(maxsize=64)
+def _status_report(word: int, endian: int) -> m.StatusReport:
+    return m.StatusReport(status=Status(word), endian=endian)
 
 
 def _by_id(applications: Iterable[Application]) -> dict[int, Application]:

@@ -8,7 +8,6 @@ the device says goes ``Device.take_output -> Machine -> one write``. Everything 
 from __future__ import annotations
 
 import logging
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import ValidationError
@@ -25,7 +24,7 @@ from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scenario import Scenario, load_scenario
 from smartcam.emulator.scene import TableScene
 from smartcam.emulator.stranger import Stranger
-from smartcam.emulator.traffic import LogEntry, TrafficLog
+from smartcam.emulator.traffic import TrafficLog
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
@@ -34,7 +33,8 @@ from smartcam.settings import validation_text
 
 if TYPE_CHECKING:
     from collections import deque
-    from collections.abc import Generator, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from contextlib import AbstractContextManager
     from pathlib import Path
     from types import TracebackType
     from typing import Self
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults import BaseFault, Fault, FiredFault
     from smartcam.emulator.links import Link, Listener
     from smartcam.emulator.parcels import Parcel
+    from smartcam.emulator.traffic import Log
     from smartcam.exceptions import RemoteProtocolError
     from smartcam.protocols.base import Dialect, Protocol
     from smartcam.protocols.framing import Frame
@@ -56,6 +57,42 @@ _LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
     Transport.TCP: TcpListener,
     Transport.UDP: UdpListener,
 }
+
+
+class _Step:
+    """A context that begins and ends something; inside itself it does nothing.
+
+    Args:
+        begin: called on the way in; where it raises there is no step.
+        end: called on the way out, after an error too.
+    """
+
+    __slots__ = ("_begin", "_depth", "_end")
+
+    def __init__(self, begin: Callable[[], None], end: Callable[[], None]) -> None:
+        self._begin = begin
+        self._end = end
+        self._depth = 0
+
+    def __enter__(self) -> None:
+        if not self._depth:
+            self._depth = 1
+            try:
+                self._begin()
+            except BaseException:
+                self._depth = 0
+                raise
+        else:
+            self._depth += 1
+
+    def __exit__(self, *error: object) -> None:
+        if self._depth > 1:
+            self._depth -= 1
+            return
+        try:
+            self._end()
+        finally:
+            self._depth = 0
 
 
 class EmulatedCamera:
@@ -145,6 +182,7 @@ class EmulatedCamera:
             quirks=plan.quirks,
             scene=TableScene(seed=plan.seed),
         )
+        self._step = _Step(self._begin_step, self._end_step)
         self.device.around = self.step
         self._protocol = cast("Protocol", PROTOCOLS.load("bvs"))
         self.spoken: Dialect = _known(self._protocol.dialects, "dialect", dialect)
@@ -160,7 +198,6 @@ class EmulatedCamera:
         self._active: Link | Stranger | None = None
         self._refusal: TimerHandle | None = None
         self._refused_until = 0.0
-        self._stepping = False
         self._started = False
         self._down = False
         self._moved_at = 0.0
@@ -192,7 +229,7 @@ class EmulatedCamera:
         return self.device.quirks
 
     @property
-    def log(self) -> deque[LogEntry]:
+    def log(self) -> Log:
         """The last frames in both directions, oldest first."""
         return self._traffic.entries
 
@@ -360,25 +397,20 @@ class EmulatedCamera:
 
     # ------------------------------------------------------------------ steps
 
-    @contextmanager
-    def step(self) -> Generator[None]:
+    def step(self) -> AbstractContextManager[None]:
         """Bring the device's time up, do the body, deliver what came of it, set the timer.
 
         Inside another step it is a part of that one.
         """
-        if not self._started or self._stepping:
-            yield
-            return
-        self._stepping = True
-        try:
+        return self._step
+
+    def _begin_step(self) -> None:
+        if self._started:
             self._move()
-            try:
-                yield
-            finally:
-                if self._started:
-                    self._settle()
-        finally:
-            self._stepping = False
+
+    def _end_step(self) -> None:
+        if self._started:
+            self._settle()
 
     def received(self, link: Link, message: m.Message) -> None:
         """A link received a message; who has no session is heard with Connect only."""
@@ -407,8 +439,9 @@ class EmulatedCamera:
 
     def traced(self, link: Link, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
         """A machine saw a frame, or bytes that make none."""
-        entry = self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
+        self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
         if _log.isEnabledFor(logging.DEBUG):
+            entry = self.log[-1]
             mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
             _log.debug("%s %s: %s", mark, link.peer, entry.error or entry.message or what)
 
@@ -420,8 +453,9 @@ class EmulatedCamera:
         self._trace_parcel(Stranger.peer, m.Sender.CAMERA, parcel)
 
     def _trace_parcel(self, peer: str, sender: m.Sender, parcel: Parcel) -> None:
-        entry = self._traffic.add_parcel(self.clock.now, peer, sender, parcel)
+        self._traffic.add_parcel(self.clock.now, peer, sender, parcel)
         if _log.isEnabledFor(logging.DEBUG):
+            entry = self.log[-1]
             mark = "<" if entry.direction == "in" else ">"
             what = entry.message or parcel.what
             _log.debug("%s %s: %s (%s; on the wire: %s)", mark, peer, what, entry.fault, entry.wire)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections import Counter, deque
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, overload
 
 from smartcam.exceptions import RemoteProtocolError, ResponseTimeoutError
+from smartcam.protocols.framing import Frame
 from smartcam.protocols.messages import Message, Sender, UnknownMessage
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from smartcam.emulator.parcels import Parcel
     from smartcam.protocols.base import Dialect
-    from smartcam.protocols.framing import Frame
 
-__all__ = ["LogEntry", "TrafficLog"]
+__all__ = ["Log", "LogEntry", "TrafficLog"]
 
 MAX_ENTRIES = 10_000
 """Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
@@ -55,14 +59,100 @@ class LogEntry(NamedTuple):
     wire: str | None = None
 
 
+_Traced: TypeAlias = tuple[float, str, Sender, Frame, str | None]
+"""Time, peer, sender, frame, faults: all that an entry is made of."""
+
+_DIRECTIONS: dict[Sender, Direction] = {Sender.CLIENT: "in", Sender.CAMERA: "out"}
+
+
+class Log(Sequence[LogEntry]):
+    """The last frames in both directions, oldest first; the oldest go where it is full.
+
+    Entries are made when somebody reads: until then a frame is kept as it went over the wire.
+
+    Args:
+        dialect: in which frames are decoded.
+        maxlen: entries kept.
+
+    Attributes:
+        maxlen: entries kept.
+    """
+
+    def __init__(self, dialect: Dialect, maxlen: int = MAX_ENTRIES) -> None:
+        self.maxlen: int = maxlen
+        self._dialect = dialect
+        self._entries: deque[LogEntry] = deque(maxlen=maxlen)
+        self._unread: deque[LogEntry | _Traced] = deque(maxlen=maxlen)
+        # called for each frame: the deque's own
+        self.append: Callable[[LogEntry | _Traced], None] = self._unread.append
+        """Put an entry, or what one is made of, behind the others."""
+
+    def __repr__(self) -> str:
+        return f"Log({list(self)!r})"
+
+    def __len__(self) -> int:
+        return min(len(self._entries) + len(self._unread), self.maxlen)
+
+    def __iter__(self) -> Iterator[LogEntry]:
+        return iter(self._read())
+
+    @overload
+    def __getitem__(self, index: int, /) -> LogEntry: ...
+    @overload
+    def __getitem__(self, index: slice, /) -> list[LogEntry]: ...
+    def __getitem__(self, index: int | slice, /) -> LogEntry | list[LogEntry]:
+        """Return an entry, or some as a list.
+
+        Raises:
+            IndexError: there is none.
+        """
+        entries = self._read()
+        return entries[index] if isinstance(index, int) else list(entries)[index]
+
+    def popleft(self) -> LogEntry:
+        """Take the oldest entry away.
+
+        Raises:
+            IndexError: there is none.
+        """
+        return self._read().popleft()
+
+    def clear(self) -> None:
+        """Take all away."""
+        self._entries.clear()
+        self._unread.clear()
+
+    def _read(self) -> deque[LogEntry]:
+        unread = self._unread
+        if unread:
+            self._entries.extend(
+                entry if isinstance(entry, LogEntry) else self._entry(*entry) for entry in unread
+            )
+            unread.clear()
+        return self._entries
+
+    def _entry(
+        self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None
+    ) -> LogEntry:
+        message = _decode(self._dialect, sender, frame)
+        data = frame.payload.hex(" ")
+        return LogEntry(
+            time, _DIRECTIONS[sender], peer, frame.message_id, message, data, None, fault
+        )
+
+
 class TrafficLog:
-    """Keeps the last entries and counts what clients sent."""
+    """Keeps the last entries and counts what clients sent.
+
+    Attributes:
+        entries: the last ones.
+    """
 
     def __init__(self, dialect: Dialect) -> None:
-        self.entries: deque[LogEntry] = deque(maxlen=MAX_ENTRIES)
+        self.entries: Log = Log(dialect)
         self._dialect = dialect
-        self._received: Counter[int | type[Message]] = Counter()
-        self._changed = asyncio.Event()
+        self._received: Counter[int | type[Message] | None] = Counter()
+        self._changed: asyncio.Event | None = None  # there while somebody waits
 
     def add(
         self,
@@ -71,38 +161,33 @@ class TrafficLog:
         sender: Sender,
         what: Frame | RemoteProtocolError,
         fault: str | None = None,
-    ) -> LogEntry:
-        """Keep what a machine traced, and return it as an entry."""
-        direction: Direction = "in" if sender is Sender.CLIENT else "out"
+    ) -> None:
+        """Keep what a machine traced."""
         if isinstance(what, RemoteProtocolError):
+            # not kept itself: it holds on to the place where it was raised
             data, error = what.data.hex(" "), str(what)
-            entry = LogEntry(time, direction, peer, None, None, data, error, fault)
-        else:
-            message_id, payload = what
-            message = self._decode(sender, what)
-            entry = LogEntry(
-                time, direction, peer, message_id, message, payload.hex(" "), None, fault
+            self.entries.append(
+                LogEntry(time, _DIRECTIONS[sender], peer, None, None, data, error, fault)
             )
-            if sender is Sender.CLIENT:
-                self._count(message_id, message)
-        self.entries.append(entry)
-        return entry
+            return
+        self.entries.append((time, peer, sender, what, fault))
+        if sender is Sender.CLIENT:
+            self._count(what)
 
-    def add_parcel(self, time: float, peer: str, sender: Sender, parcel: Parcel) -> LogEntry:
-        """Keep what faults made of a message, and return it as an entry."""
-        direction: Direction = "in" if sender is Sender.CLIENT else "out"
+    def add_parcel(self, time: float, peer: str, sender: Sender, parcel: Parcel) -> None:
+        """Keep what faults made of a message."""
+        direction = _DIRECTIONS[sender]
         what, wire = parcel.what, parcel.wire
         if isinstance(what, bytes):
             entry = LogEntry(time, direction, peer, None, None, what.hex(" "))
         else:
             message_id, payload = what
-            message = self._decode(sender, what)
+            message = _decode(self._dialect, sender, what)
             entry = LogEntry(time, direction, peer, message_id, message, payload.hex(" "))
         entry = entry._replace(
             fault=", ".join(parcel.faults) or None, wire=None if wire is None else wire.hex(" ")
         )
         self.entries.append(entry)
-        return entry
 
     async def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
@@ -124,7 +209,7 @@ class TrafficLog:
         try:
             async with asyncio.timeout(timeout):
                 while self._received[what] < count:
-                    changed = self._changed
+                    changed = self._changed = self._changed or asyncio.Event()
                     await changed.wait()
         except TimeoutError as exc:
             name = f"message {what:#04x}" if isinstance(what, int) else what.__name__
@@ -134,18 +219,28 @@ class TrafficLog:
                 waited=timeout,
             ) from exc
 
-    def _count(self, message_id: int, message: Message | None) -> None:
+    def _count(self, frame: Frame) -> None:
+        message_id, payload = frame
         self._received[message_id] += 1
-        if message is not None:
-            self._received[type(message)] += 1
-        self._changed.set()
-        self._changed = asyncio.Event()
+        self._received[_kind(self._dialect, message_id, len(payload))] += 1
+        if self._changed is not None:
+            self._changed.set()
+            self._changed = None
 
-    def _decode(self, sender: Sender, frame: Frame) -> Message | None:
-        if self._dialect.surplus(sender, frame) > 0:
-            return None
-        try:
-            message = self._dialect.decode(sender, frame)
-        except RemoteProtocolError:
-            return None
-        return None if isinstance(message, UnknownMessage) else message
+
+@functools.lru_cache(maxsize=256)
+def _kind(dialect: Dialect, message_id: int, size: int) -> type[Message] | None:
+    """Return which message a client's frame is; id and size of its payload decide that."""
+    message = _decode(dialect, Sender.CLIENT, Frame(message_id, bytes(size)))
+    return None if message is None else type(message)
+
+
+def _decode(dialect: Dialect, sender: Sender, frame: Frame) -> Message | None:
+    """Return what a frame says; None for an unknown id and for a body that does not fit."""
+    if dialect.surplus(sender, frame) > 0:
+        return None
+    try:
+        message = dialect.decode(sender, frame)
+    except RemoteProtocolError:
+        return None
+    return None if isinstance(message, UnknownMessage) else message

@@ -10,10 +10,20 @@ from smartcam.interpreters.base import (
     Context,
     Function,
     Interpreter,
+    PlainInterpreter,
     Reader,
     Spec,
     resolve,
     run,
 )
 
-__all__ = ["Context", "Function", "Interpreter", "Reader", "Spec", "resolve", "run"]
+__all__ = [
+    "Context",
+    "Function",
+    "Interpreter",
+    "PlainInterpreter",
+    "Reader",
+    "Spec",
+    "resolve",
+    "run",
+]

@@ -2,7 +2,8 @@
 
 An interpreter keeps nothing between results and guesses nothing. The shortest one is a function
 over a :class:`Reader`; one that takes a layout is a subclass of :class:`Interpreter`.
-:func:`resolve` turns what the user wrote into one, :func:`run` is the only place that calls it.
+:func:`resolve` turns what the user wrote into one; the functions whose names begin with ``run`` are
+the only places that call it.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ import functools
 import re
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias
 
 from smartcam.exceptions import (
     ConfigurationError,
@@ -35,19 +36,20 @@ __all__ = [
     "Context",
     "Function",
     "Interpreter",
+    "PlainInterpreter",
     "Reader",
     "Spec",
+    "plain",
     "resolve",
     "run",
+    "run_plain",
     "run_sequence",
 ]
-
-T = TypeVar("T")
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class Context:
     """What an interpreter may know about a container beside its bytes.
 
@@ -98,7 +100,7 @@ class Reader:
         context: Context | None = None,
         layout: Layout | None = None,
     ) -> None:
-        self.data: bytes = bytes(data)
+        self.data: bytes = data if type(data) is bytes else bytes(data)
         self.context: Context = Context() if context is None else context
         self.layout: Layout | None = layout
 
@@ -262,6 +264,39 @@ class Interpreter(ABC):
         return self.layout.sequence(reader.data, reader.context.byte_order)
 
 
+class PlainInterpreter(Interpreter):
+    """An interpreter that looks at nothing but the bytes and their order.
+
+    The client makes neither a :class:`Context` nor a :class:`Reader` for it, which would cost more
+    than a small container's value.
+    """
+
+    def __init_subclass__(cls) -> None:
+        """A class with a :meth:`read` of its own does not inherit another's :meth:`read_all`."""
+        if "read" in vars(cls) and "read_all" not in vars(cls):
+            cls.read_all = PlainInterpreter.read_all  # type: ignore[method-assign]
+
+    @abstractmethod
+    def read(self, data: bytes, byte_order: ByteOrder) -> object:
+        """Return the value of a container.
+
+        Raises:
+            InterpretationError: the bytes do not fit.
+        """
+
+    def read_all(self, containers: Sequence[bytes], byte_order: ByteOrder) -> Sequence[object]:
+        """Return the values of several containers that came together; as :meth:`read` for each.
+
+        It is there to be overridden where that is quicker. Where it raises they are read again,
+        one by one.
+        """
+        return [self.read(data, byte_order) for data in containers]
+
+    def interpret(self, reader: Reader) -> object:
+        """Return what :meth:`read` returns."""
+        return self.read(reader.data, reader.context.byte_order)
+
+
 Function: TypeAlias = Callable[[Reader], object]
 """The shortest interpreter: a function of a reader; ``reader.layout`` is the user's layout."""
 
@@ -287,8 +322,8 @@ class _FunctionInterpreter(Interpreter):
 def run(interpreter: Interpreter, reader: Reader) -> object:
     """Return what ``interpreter`` makes of a container.
 
-    Interpreters are called here and in :func:`run_sequence` only: whatever one raises comes out as
-    an InterpretationError, so a slip in somebody's plug-in is an outcome like any other.
+    Whatever an interpreter raises comes out as an InterpretationError, so a slip in somebody's
+    plug-in is an outcome like any other.
 
     Raises:
         InterpretationError: the bytes do not fit, or the interpreter failed; then the cause is
@@ -296,25 +331,48 @@ def run(interpreter: Interpreter, reader: Reader) -> object:
     """
     if reader.layout is None:
         reader.layout = interpreter.layout
-    return _guarded(interpreter.interpret, reader)
+    try:
+        return interpreter.interpret(reader)
+    except InterpretationError:
+        raise
+    except Exception as exc:
+        raise _failed(exc, reader.data) from exc
 
 
 def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
     """Return the container's sequence number, None without one; raises as :func:`run`."""
-    return _guarded(interpreter.sequence, reader)
-
-
-def _guarded(function: Callable[[Reader], T], reader: Reader) -> T:
     try:
-        return function(reader)
+        return interpreter.sequence(reader)
     except InterpretationError:
         raise
     except Exception as exc:
-        raise InterpretationError(
-            f"the interpreter failed with {type(exc).__name__}: {exc} "
-            f"(the container has {len(reader)} bytes)",
-            got=repr(exc),
-        ) from exc
+        raise _failed(exc, reader.data) from exc
+
+
+def plain(interpreter: Interpreter) -> PlainInterpreter | None:
+    """Return an interpreter that :func:`run_plain` takes, None where it wants a :class:`Reader`."""
+    if not isinstance(interpreter, PlainInterpreter):
+        return None
+    overridden = type(interpreter).interpret is not PlainInterpreter.interpret
+    return None if overridden else interpreter
+
+
+def run_plain(interpreter: PlainInterpreter, data: bytes, byte_order: ByteOrder) -> object:
+    """Return what :func:`run` returns; raises as :func:`run`."""
+    try:
+        return interpreter.read(data, byte_order)
+    except InterpretationError:
+        raise
+    except Exception as exc:
+        raise _failed(exc, data) from exc
+
+
+def _failed(exc: Exception, data: bytes) -> InterpretationError:
+    return InterpretationError(
+        f"the interpreter failed with {type(exc).__name__}: {exc} "
+        f"(the container has {len(data)} bytes)",
+        got=repr(exc),
+    )
 
 
 def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:

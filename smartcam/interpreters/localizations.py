@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from itertools import repeat
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.interpreters.base import Interpreter
@@ -12,23 +13,25 @@ from smartcam.layout.text import UNITS
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Iterator
 
     from smartcam.interpreters.base import Reader
-    from smartcam.layout import Field, Layout, Record
+    from smartcam.layout import Field, Layout
 
 __all__ = ["Localizations"]
 
 _DEFAULTS: dict[str, Any] = {
-    "feature_id": "",
+    "feature_id": b"",
     "quality": 1.0,
     "photo_index": 0,
     "x": 0.0,
     "y": 0.0,
-    "z": 0.0,
     "theta": 0.0,
 }
-"""The fields that are used, in the order of use, and their values where the layout has none."""
+"""The fields that are used beside ``z``, and what stands for those that a layout has not.
+
+In the order of use, which is that of the default layout.
+"""
 
 _QUANTITIES = {
     "quality": ("ratio",),
@@ -77,12 +80,20 @@ class Localizations(Interpreter):
                 )
         for field in fields.values():
             _check(field)
-        names = [*fields, *_DEFAULTS]
+        missing = [name for name in _DEFAULTS if name not in fields]
+        names = [*fields, *missing]
         places = [names.index(name) for name in _DEFAULTS]
-        self._pick = operator.itemgetter(*places)  # of a record and the defaults behind it
-        self._integers = any(
-            name in fields and fields[name].unit is None and fields[name].wire.is_integer
-            for name in _QUANTITIES
+        values = tuple(_DEFAULTS[name] for name in missing)
+        self._missing = repeat(values) if values else None
+        self._pick: Callable[[Any], Any] | None = None  # where they stand in another order
+        if places != [*range(len(names))]:
+            self._pick = operator.itemgetter(*places)
+        self._z = [*fields].index("z") if "z" in fields else None  # which is rare
+        self._scales = _scales(fields)
+        # what is not used must be a text or a bool nevertheless
+        self._checks = any(
+            field.type in {"string", "bool"} and field.name != "feature_id"
+            for field in fields.values()
         )
         self._empty = bytes(self.layout.size)
 
@@ -95,44 +106,91 @@ class Localizations(Interpreter):
         Raises:
             InterpretationError: the bytes do not fit the layout, or a pose has NaN or infinity.
         """
-        layout, context, data = self.layout, reader.context, reader.data
-        header = Header(context.number, context.received_at, context.camera)
-        pick, defaults, empty = self._pick, tuple(_DEFAULTS.values()), self._empty
-        isfinite, sin, cos, size = math.isfinite, math.sin, math.cos, layout.size
-        new = _new_tuple
-        offset = layout.head_size - size
+        context, data = reader.context, reader.data
+        header = _new_tuple(Header, (context.number, context.received_at, context.camera))
+        sin, cos, new = math.sin, math.cos, _new_tuple
+        scales, y_down = self._scales, context.y_down
+        rows: Iterable[Any] = self.layout.wire_records(data, context.byte_order)
+        if self._missing is not None:
+            rows = map(operator.concat, rows, self._missing)
+        if self._pick is not None:
+            rows = map(self._pick, rows)
+        heights = self._heights(reader) if self._z is not None else None
+        total, skipped, z = 0.0, 0, 0.0
         found: list[Localization] = []
-        for record in layout.parse_records(data, context.byte_order):
-            offset += size
-            if data[offset : offset + size] == empty:
-                context.empty_slots += 1
-                continue
-            feature_id, quality, photo_index, x, y, z, theta = pick((*record, *defaults))
-            if not isfinite(x + y + z + theta):
-                self._check_finite(record, offset)
-            if self._integers:
-                quality, x, y, z, theta = map(float, (quality, x, y, z, theta))
-            if context.y_down:
-                y, theta = 0.0 - y, 0.0 - theta  # and no minus zero
-            half = 0.5 * theta
-            orientation = new(Quaternion, (0.0, 0.0, sin(half), cos(half)))
-            pose = new(Pose, (header, new(Position, (x, y, z)), orientation))
-            found.append(new(Localization, (feature_id, quality, photo_index, pose)))
+        try:
+            for text, quality, photo_index, x, y, theta in rows:
+                if heights is not None:
+                    z = next(heights)
+                if not x and self._is_empty(data, len(found) + skipped):
+                    skipped += 1
+                    continue
+                if scales is not None:
+                    quality, x, y, theta, z = _scaled((quality, x, y, theta, z), scales)
+                if y_down:
+                    y, theta = 0.0 - y, 0.0 - theta  # and no minus zero
+                total += x + y + theta + z
+                half = 0.5 * theta
+                orientation = new(Quaternion, (0.0, 0.0, sin(half), cos(half)))
+                pose = new(Pose, (header, new(Position, (x, y, z)), orientation))
+                feature_id = text.partition(b"\0")[0].decode()
+                found.append(new(Localization, (feature_id, quality, photo_index, pose)))
+        except ValueError:  # a text that is not UTF-8, the sine of infinity
+            self._check_finite(reader)
+            raise
+        if not math.isfinite(total):  # large numbers may sum up to infinity
+            self._check_finite(reader)
+        elif self._checks:
+            self.layout.parse_records(data, context.byte_order)
+        if skipped:
+            context.empty_slots += skipped
         return found
 
-    def _check_finite(self, record: Record, start: int) -> None:
-        """Raise for the first NaN or infinity of a pose; large numbers may sum up to one."""
-        offset = start
-        for field, value in zip(self.layout.fields, record, strict=True):
-            if field.name in _POSE and not math.isfinite(value):
-                raise InterpretationError(
-                    f"{field.label} at offset {offset}: expected a finite number, got {value}",
-                    field=field.name,
-                    offset=offset,
-                    expected="a finite number",
-                    got=value,
-                )
-            offset += field.size
+    def _heights(self, reader: Reader) -> Iterator[float]:
+        """Return the values of ``z`` as they are on the wire."""
+        rows = self.layout.wire_records(reader.data, reader.context.byte_order)
+        return map(operator.itemgetter(self._z), rows)
+
+    def _is_empty(self, data: bytes, number: int) -> bool:
+        begin = self.layout.head_size + number * self.layout.size
+        return data[begin : begin + self.layout.size] == self._empty
+
+    def _check_finite(self, reader: Reader) -> None:
+        """Raise for the first NaN or infinity of a pose; for a bad text or bool before that."""
+        offset = self.layout.head_size
+        for record in self.layout.parse_records(reader.data, reader.context.byte_order):
+            for field, value in zip(self.layout.fields, record, strict=True):
+                if field.name in _POSE and not math.isfinite(value):
+                    raise InterpretationError(
+                        f"{field.label} at offset {offset}: expected a finite number, got {value}",
+                        field=field.name,
+                        offset=offset,
+                        expected="a finite number",
+                        got=value,
+                    )
+                offset += field.size
+
+
+class _Scales(NamedTuple):
+    """What turns quality, x, y, theta and z into SI: ``value * multiply / divide``, for each."""
+
+    multiply: tuple[float, ...]
+    divide: tuple[float, ...]
+
+
+def _scales(fields: dict[str, Field]) -> _Scales | None:
+    """Return them, None where the values on the wire are floats in SI already."""
+    used = [fields.get(name) for name in ("quality", "x", "y", "theta", "z")]
+    units = [UNITS[field.unit] if field and field.unit else None for field in used]
+    multiply = tuple(unit.multiply if unit else 1.0 for unit in units)
+    divide = tuple(unit.divide if unit else 1.0 for unit in units)
+    integers = any(field is not None and field.wire.is_integer for field in used)
+    return _Scales(multiply, divide) if integers or {*multiply, *divide} != {1.0} else None
+
+
+def _scaled(values: Iterable[float], scales: _Scales) -> Iterable[float]:
+    """Return floats in SI; integers become floats."""
+    return map(operator.truediv, map(operator.mul, values, scales.multiply), scales.divide)
 
 
 def _check(field: Field) -> None:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from smartcam.interpreters.base import Interpreter
+from smartcam.interpreters.base import PlainInterpreter
 
 if TYPE_CHECKING:
-    from smartcam.interpreters.base import Reader
+    from smartcam.models import ByteOrder
 
 __all__ = ["Raw"]
 
 
-class Raw(Interpreter):
+class Raw(PlainInterpreter):
     """Gives the container's bytes; takes no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
-    def interpret(self, reader: Reader) -> bytes:
+    def read(self, data: bytes, byte_order: ByteOrder) -> bytes:
         """Return the bytes behind the application id."""
-        return reader.data
+        return data

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from smartcam.interpreters.base import Interpreter
+from smartcam.interpreters.base import PlainInterpreter
 
 if TYPE_CHECKING:
-    from smartcam.interpreters.base import Reader
     from smartcam.layout import Layout
+    from smartcam.models import ByteOrder
 
 __all__ = ["Record"]
 
 
-class Record(Interpreter):
+class Record(PlainInterpreter):
     """Gives what :meth:`smartcam.Layout.parse` gives; needs a layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
     layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
-    def interpret(self, reader: Reader) -> Any:
+    def read(self, data: bytes, byte_order: ByteOrder) -> Any:
         """Return the record, or the list of records.
 
         Raises:
             InterpretationError: the bytes do not fit the layout.
         """
-        return self.layout.parse(reader.data, reader.context.byte_order)
+        return self.layout.parse(data, byte_order)

@@ -4,27 +4,35 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from smartcam.interpreters.base import Interpreter
+from smartcam.interpreters.base import PlainInterpreter
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
-    from smartcam.interpreters.base import Reader
     from smartcam.layout import Layout
+    from smartcam.models import ByteOrder
 
 __all__ = ["Table"]
 
 
-class Table(Interpreter):
+class Table(PlainInterpreter):
     """Gives what :meth:`smartcam.Layout.parse_table` gives; needs a layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
     layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
-    def interpret(self, reader: Reader) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    def read(self, data: bytes, byte_order: ByteOrder) -> np.ndarray[tuple[int], np.dtype[np.void]]:
         """Return the records as a structured array of one dimension, read-only.
 
         Raises:
             InterpretationError: the bytes do not fit the layout.
         """
-        return self.layout.parse_table(reader.data, reader.context.byte_order)
+        return self.layout.parse_table(data, byte_order)
+
+    def read_all(
+        self, containers: Sequence[bytes], byte_order: ByteOrder
+    ) -> list[np.ndarray[tuple[int], np.dtype[np.void]]]:
+        """Return a table for each container."""
+        return self.layout.parse_tables(containers, byte_order)

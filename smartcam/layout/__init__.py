@@ -15,6 +15,7 @@ heavy ones are imported where they are first used.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     import numpy as np
     from pydantic import BaseModel
 
+    from smartcam.layout.codec import Rows
+    from smartcam.layout.tables import TableCodec
     from smartcam.models import ByteOrder
 
 __all__ = ["Field", "Layout", "Record"]
@@ -45,7 +48,11 @@ class Layout:
         LayoutError: a mistake in the text, with its position.
     """
 
-    __slots__ = ("_codecs", "_dtype", "_lenient", "_model", "_spec", "_text")
+    __slots__ = (
+        *("_codecs", "_lenient", "_model", "_spec", "_text"),
+        *("_fixed", "_is_list", "_record_word", "_sequence_index", "_to_end"),
+        *("_frombuffer", "_tables", "_views"),
+    )
 
     def __init__(self, text: str, *, lenient: bool = False, start: int = 0) -> None:
         spec = parse_text(text, start)
@@ -60,8 +67,19 @@ class Layout:
             )
             for order in orders
         }
-        self._dtype: np.dtype[np.void] | None = None
+        # what does not depend on a container is worked out here, once
+        repeat = 1 if spec.repeat is None else spec.repeat
+        self._fixed: int | None = repeat if isinstance(repeat, int) else None  # number of records
+        self._to_end = repeat == "*" and not spec.head  # records, and nothing else
+        self._is_list = spec.is_list
+        self._record_word = "" if spec.repeat is None else "record"  # what an error calls one
+        fields = (*spec.head, *spec.fields)
+        self._sequence_index = next((i for i, f in enumerate(fields) if f.sequence), None)
         self._model: type[BaseModel] | None = None
+        self._tables: dict[ByteOrder, TableCodec] = {}
+        # where a table is the payload and nothing else: its dtype, and what makes it
+        self._views: dict[ByteOrder, np.dtype[np.void]] = {}
+        self._frombuffer: Any = None
 
     # -- what it is --------------------------------------------------------------------------
 
@@ -102,12 +120,13 @@ class Layout:
     @property
     def is_list(self) -> bool:
         """Whether :meth:`parse` gives a plain list of records."""
-        return self._spec.is_list
+        return self._is_list
 
     @property
     def sequence_field(self) -> Field | None:
         """The field marked with ``@sequence``, None without one."""
-        return next((f for f in (*self.head, *self.fields) if f.sequence), None)
+        index = self._sequence_index
+        return None if index is None else (*self.head, *self.fields)[index]
 
     @property
     def head_size(self) -> int:
@@ -155,14 +174,15 @@ class Layout:
             InterpretationError: the payload does not fit; field, offset, expected and got.
         """
         head, records = self._codecs[byte_order]
-        count = self._count(payload, byte_order)
         if self._spec.repeat is None:
-            return records.read(payload, 0, 1)[0]
-        values = records.read(payload, head.size, count, what="record")
-        if self._spec.is_list:
+            self._count(payload, head, records)
+            return records.read_one(payload)
+        rows = self.wire_records(payload, byte_order)
+        values = records.read(rows, payload, head.size, what="record")
+        if self._is_list:
             return values
         names = (*(field.name for field in self.head), self._spec.group_field)
-        front = head.read(payload, 0, 1)[0] if self.head else ()
+        front = head.read_one(payload) if self.head else ()
         result: Record = Record.__new__(record_class(names), (*front, values))
         return result
 
@@ -175,8 +195,26 @@ class Layout:
             InterpretationError: as in :meth:`parse`.
         """
         head, records = self._codecs[byte_order]
-        count = self._count(payload, byte_order)
-        return records.read(payload, head.size, count, what=self._record_word)
+        rows = self.wire_records(payload, byte_order)
+        return records.read(rows, payload, head.size, what=self._record_word)
+
+    def wire_records(self, payload: Payload, byte_order: ByteOrder = "little") -> Rows:
+        """Return the values of the same records as they are on the wire, one by one.
+
+        Units are the wire's, texts are bytes as the camera sent them, bools are numbers from 0 to
+        255, which nothing has checked.
+
+        Raises:
+            InterpretationError: the payload's size does not fit.
+        """
+        head, records = self._codecs[byte_order]
+        data = payload if type(payload) is bytes else bytes(payload)
+        if self._to_end:
+            try:
+                return records.unpack_all(data)
+            except struct.error:
+                pass  # no whole records: the checks below say where
+        return records.unpack(data, head.size, self._count(data, head, records))
 
     def parse_table(
         self, payload: Payload, byte_order: ByteOrder = "little"
@@ -191,12 +229,30 @@ class Layout:
         Raises:
             InterpretationError: the payload does not fit, or a byte is no bool.
         """
-        from smartcam.layout.tables import table
-
+        view = self._views.get(byte_order)
+        if view is not None and type(payload) is bytes:  # which numpy makes read-only tables of
+            try:
+                rows: np.ndarray[tuple[int], np.dtype[np.void]] = self._frombuffer(payload, view)
+            except ValueError:
+                pass  # no whole records: the checks below say where
+            else:
+                if self._fixed is None or len(rows) == self._fixed:
+                    return rows
         head, records = self._codecs[byte_order]
-        count = self._count(payload, byte_order)
-        dtype = self.dtype_for(byte_order)
-        return table(payload, dtype, records, head.size, count, what=self._record_word)
+        count = self._count(payload, head, records)
+        return self._table(byte_order).read(payload, head.size, count, what=self._record_word)
+
+    def parse_tables(
+        self, payloads: Sequence[bytes], byte_order: ByteOrder = "little"
+    ) -> list[np.ndarray[tuple[int], np.dtype[np.void]]]:
+        """Return what :meth:`parse_table` gives for each of several payloads."""
+        view, make = self._views.get(byte_order), self._frombuffer
+        if view is not None and self._fixed is None:
+            try:
+                return [make(payload, view) for payload in payloads]
+            except ValueError:
+                pass  # one of them is no whole records, or empty
+        return [self.parse_table(payload, byte_order) for payload in payloads]
 
     def sequence(self, payload: Payload, byte_order: ByteOrder = "little") -> int | None:
         """Return the value of the ``@sequence`` field.
@@ -208,13 +264,14 @@ class Layout:
         Raises:
             InterpretationError: the payload's size does not fit.
         """
-        count = self._count(payload, byte_order)
         head, records = self._codecs[byte_order]
-        for codec, offset, there in ((head, 0, 1), (records, head.size, count)):
-            for index, field in enumerate(codec.fields):
-                if field.sequence and there:
-                    return int(codec.read_field(payload, offset, index))
-        return None
+        count = self._count(payload, head, records)
+        index, front = self._sequence_index, len(head.fields)
+        if index is None:
+            return None
+        if index < front:
+            return int(head.read_field(payload, 0, index))
+        return int(records.read_field(payload, head.size, index - front)) if count else None
 
     def build(
         self,
@@ -261,11 +318,7 @@ class Layout:
 
     def dtype_for(self, byte_order: ByteOrder) -> np.dtype[np.void]:
         """Return the wire's dtype of one record in a byte order."""
-        from smartcam.layout.tables import wire_dtype
-
-        if self._dtype is None:
-            self._dtype = wire_dtype(self.fields)
-        return self._dtype if byte_order == "little" else self._dtype.newbyteorder(">")
+        return self._table(byte_order).dtype
 
     @property
     def model(self) -> type[BaseModel]:
@@ -334,32 +387,32 @@ class Layout:
         loaded = load_yaml(text)
         return cls.from_dict(loaded) if isinstance(loaded, Mapping) else cls(loaded)
 
-    @property
-    def _record_word(self) -> str:
-        """What an error calls a record; nothing where there is only one."""
-        return "" if self._spec.repeat is None else "record"
+    def _table(self, byte_order: ByteOrder) -> TableCodec:
+        """Return what reads tables; made where one is first asked for, because of numpy."""
+        if byte_order not in self._tables:
+            import numpy as np
+
+            from smartcam.layout.tables import TableCodec
+
+            codec = TableCodec(self._codecs[byte_order][1], byte_order)
+            self._frombuffer = np.frombuffer
+            if codec.is_view and not self._spec.head:
+                self._views[byte_order] = codec.dtype
+            self._tables[byte_order] = codec
+        return self._tables[byte_order]
 
     # -- sizes -------------------------------------------------------------------------------
 
-    def _count(self, payload: Payload, byte_order: ByteOrder) -> int:
+    def _count(self, payload: Payload, head: RecordCodec, codec: RecordCodec) -> int:
         """Return the number of records that are to be read, having checked the size."""
-        head, codec = self._codecs[byte_order]
-        repeat = self._spec.repeat
         got = len(payload)
-        if repeat is None:
-            if got != codec.size:
-                raise self._misfit(codec, got, 0, 1)
-            return 1
+        count, remainder = divmod(got - head.size, codec.size)
+        fixed, repeat = self._fixed, self._spec.repeat
         if got < head.size:
             raise self._misfit(head, got, 0, None)
-        count, remainder = divmod(got - head.size, codec.size)
-        if isinstance(repeat, int):
-            if remainder or count != repeat:
-                raise self._misfit(codec, got, head.size, repeat)
-            return repeat
-        if remainder:
-            raise self._misfit(codec, got, head.size, None)
-        if repeat == "*":
+        if remainder or (fixed is not None and fixed != count):
+            raise self._misfit(codec, got, head.size, fixed)
+        if not isinstance(repeat, str) or repeat == "*":
             return count
         index = next(i for i, field in enumerate(head.fields) if field.name == repeat)
         told = int(head.read_field(payload, 0, index))

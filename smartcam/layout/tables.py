@@ -1,4 +1,8 @@
-"""Layouts as numpy dtypes and tables. Imported where a table is first asked for."""
+"""Layouts as numpy dtypes and tables. Imported where a table is first asked for.
+
+All that depends on the layout alone is worked out when a :class:`TableCodec` is made; what is left
+for a container is a view of it, or one numpy operation for each column.
+"""
 
 from __future__ import annotations
 
@@ -10,58 +14,79 @@ import numpy as np
 from smartcam.layout.text import UNITS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam.layout.codec import Payload, RecordCodec
     from smartcam.layout.text import Field
+    from smartcam.models import ByteOrder
 
-__all__ = ["table", "wire_dtype"]
+__all__ = ["TableCodec"]
 
-
-def wire_dtype(fields: tuple[Field, ...]) -> np.dtype[np.void]:
-    """Return the packed dtype of one record on the wire, little endian."""
-    return np.dtype(
-        [(field.name, f"<{field.wire.numpy}{field.length or ''}") for field in fields], align=False
-    )
+Rows = np.ndarray[tuple[int], np.dtype[np.void]]
 
 
-def table(
-    payload: Payload,
-    dtype: np.dtype[np.void],
-    codec: RecordCodec,
-    offset: int,
-    count: int,
-    *,
-    what: str,
-) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    """Return ``count`` records from ``offset`` on: a view where it can be, read-only.
+class TableCodec:
+    """Reads records into tables.
 
     Args:
-        payload: the container; the caller has checked that the records are there.
-        dtype: one record on the wire.
-        codec: of the same record.
-        offset: where the first record begins.
-        count: number of records.
-        what: tells a record in an error.
+        codec: of the same records.
+        byte_order: order of the bytes of a number.
 
-    Raises:
-        InterpretationError: a byte is no bool.
+    Attributes:
+        dtype: one record on the wire, packed.
+        is_view: whether a table is the payload as it is.
     """
-    # numpy refuses an empty buffer
-    wire: np.ndarray[Any, Any] = (
-        np.frombuffer(payload, dtype, count, offset) if count else np.empty(0, dtype)
+
+    def __init__(self, codec: RecordCodec, byte_order: ByteOrder) -> None:
+        fields = codec.fields
+        self._codec = codec
+        self.dtype: np.dtype[np.void] = _wire_dtype(fields, byte_order)
+        self._native = _table_dtype(fields)
+        self._columns = [(field.name, _converter(field)) for field in fields]
+        self._bools = [field.name for field in fields if field.type == "bool" and not codec.lenient]
+        self._converts = any(field.type == "bool" or field.unit is not None for field in fields)
+        self.is_view: bool = self._native == self.dtype and not self._converts
+
+    def read(self, payload: Payload, offset: int, count: int, *, what: str) -> Rows:
+        """Return ``count`` records from ``offset`` on: a view where it can be, read-only.
+
+        Args:
+            payload: the container; the caller has checked that the records are there.
+            offset: where the first record begins.
+            count: number of records.
+            what: tells a record in an error.
+
+        Raises:
+            InterpretationError: a byte is no bool.
+        """
+        dtype = self.dtype
+        # numpy refuses an empty buffer
+        rows: Rows = np.frombuffer(payload, dtype, count, offset) if count else np.empty(0, dtype)
+        for name in self._bools:
+            if not _all_bools(rows[name]):
+                raise self._codec.locate(payload, offset, what)
+        if self._converts:
+            rows = self._converted(rows)
+        elif not self.is_view:
+            rows = rows.astype(self._native)
+        rows.flags.writeable = False
+        return rows
+
+    def _converted(self, wire: Rows) -> Rows:
+        rows = np.empty(len(wire), self._native)
+        with np.errstate(all="ignore"):  # NaN and infinity pass, as they do one by one
+            for name, convert in self._columns:
+                column = wire[name]
+                rows[name] = column if convert is None else convert(column)
+        return rows
+
+
+def _wire_dtype(fields: tuple[Field, ...], byte_order: ByteOrder) -> np.dtype[np.void]:
+    order = "<" if byte_order == "little" else ">"
+    return np.dtype(
+        [(field.name, f"{order}{field.wire.numpy}{field.length or ''}") for field in fields],
+        align=False,
     )
-    native = _table_dtype(codec.fields)
-    converts = any(field.type == "bool" or field.unit is not None for field in codec.fields)
-    if native == dtype and not converts:
-        rows = wire
-    else:
-        rows = np.empty(count, native)
-        for field in codec.fields:
-            column = wire[field.name]
-            if field.type == "bool" and not codec.lenient and not _all_bools(column):
-                raise codec.locate(payload, offset, count, what)
-            rows[field.name] = _converted(field, column)
-    rows.flags.writeable = False
-    return rows
 
 
 def _table_dtype(fields: tuple[Field, ...]) -> np.dtype[np.void]:
@@ -78,15 +103,18 @@ def _table_dtype(fields: tuple[Field, ...]) -> np.dtype[np.void]:
 
 
 def _all_bools(column: np.ndarray[Any, Any]) -> bool:
-    return bool(np.isin(column, (0x00, 0xFF)).all())
+    return not column.tobytes().translate(None, b"\x00\xff")
 
 
-def _converted(field: Field, column: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    values: Any = column
+def _converter(field: Field) -> Callable[[Any], Any] | None:
+    """Return what makes a column of values of the wire's, None where copying does it."""
     if field.type == "bool":
-        values = column != 0
-    elif field.unit is not None:
-        unit = UNITS[field.unit]
-        with np.errstate(all="ignore"):  # NaN and infinity pass, as they do one by one
-            values = column.astype(np.float64) * unit.multiply / unit.divide
-    return np.asarray(values)
+        return lambda wire: wire != 0
+    if field.unit is None:
+        return None
+    _, _, multiply, divide = UNITS[field.unit]
+    if multiply == divide == 1.0:
+        return None
+    if multiply == 1.0:
+        return lambda wire: wire.astype(np.float64) / divide
+    return lambda wire: wire.astype(np.float64) * multiply / divide

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError, hex_excerpt
-from smartcam.models import Status
-from smartcam.protocols.framing import Frame, HeaderLayout
+from smartcam.models import as_status
+from smartcam.protocols.framing import Buffer, Frame, HeaderLayout
 from smartcam.protocols.messages import (
     Message,
     Request,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from smartcam.exceptions import RemoteProtocolError
 
-__all__ = ["POLICIES", "Dialect", "MessageRow", "Policy", "Protocol", "Role", "Transport"]
+__all__ = ["POLICIES", "Codec", "Dialect", "MessageRow", "Policy", "Protocol", "Role", "Transport"]
 
 
 class Role(enum.Enum):
@@ -97,34 +97,81 @@ class MessageRow(NamedTuple):
     source: str
 
 
-class _Codec:
-    """One message of one dialect, compiled."""
+MAX_KNOWN = 256
+"""Messages kept of each kind; statuses and answers are few, and a peer could send any."""
 
-    __slots__ = ("body", "data_field", "message_id", "names", "status_at", "type")
 
-    def __init__(self, row: MessageRow, word: str) -> None:
+class Codec:
+    """One message of one dialect, compiled.
+
+    Attributes:
+        type: the message.
+        message_id: its id.
+        size: of the fields that have one, bytes.
+        has_data: whether every byte behind them is a field.
+    """
+
+    __slots__ = (
+        *("_body", "_data", "_fields", "_fill", "_header_size", "_known"),
+        *("has_data", "message_id", "size", "type"),
+    )
+
+    def __init__(self, row: MessageRow, word: str, header_size: int) -> None:
         fields = wire_fields(row.type)
         codes = {Wire.WORD: word, Wire.UINT32: "I"}
         self.type = row.type
         self.message_id = row.message_id
-        self.names = tuple(name for name, wire in fields if wire is not Wire.DATA)
-        self.data_field = next((name for name, wire in fields if wire is Wire.DATA), None)
-        self.body = struct.Struct(
+        self._header_size = header_size
+        self._fields = tuple(name for name, wire in fields if wire is not Wire.DATA)
+        self._data = next((name for name, wire in fields if wire is Wire.DATA), None)
+        self._body = struct.Struct(
             "<" + "".join(codes[wire] for _, wire in fields if wire is not Wire.DATA)
         )
+        self.size: int = self._body.size
+        self.has_data: bool = self._data is not None
+        # what fills the slots of a frozen message, in half the time of its own constructor
+        self._known: dict[bytes, Message] = {}  # bodies that came before: messages are immutable
+        self._fill = [vars(row.type)[name].__set__ for name, _ in fields]
 
     def encode(self, message: Message) -> bytes:
-        body = self.body.pack(*[getattr(message, name) for name in self.names])
-        return body + getattr(message, self.data_field) if self.data_field else body
+        """Return a message's body."""
+        body = self._body.pack(*[getattr(message, name) for name in self._fields])
+        return body + getattr(message, self._data) if self._data is not None else body
 
-    def decode(self, payload: bytes) -> Message:
-        size = self.body.size
-        values: dict[str, Any] = dict(zip(self.names, self.body.unpack_from(payload), strict=True))
-        if self.data_field:
-            values[self.data_field] = payload[size:] if size else payload
-        if self.type is StatusReport:
-            values["status"] = Status(values["status"])
-        return self.type(**values)
+    def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
+        """Return the message whose body is at a place; bytes behind it are ignored.
+
+        Raises:
+            MessageError: the body is shorter than its message.
+        """
+        if end - begin < self.size:
+            payload = bytes(buffer[begin:end])
+            raise MessageError(
+                f"{self.type.__name__} ({self.message_id:#04x}) came with {len(payload)} bytes, "
+                f"it needs {self.size}: {hex_excerpt(payload)}",
+                offset=self._header_size,
+                data=payload,
+            )
+        behind = begin + self.size
+        if self.has_data:
+            data = bytes(buffer[behind:end])
+            return self._make((*self._body.unpack_from(buffer, begin), data))
+        body = bytes(buffer[begin:behind])
+        message = self._known.get(body)
+        if message is None:
+            values = self._body.unpack(body)
+            if self.type is StatusReport:
+                values = (as_status(values[0]), *values[1:])
+            message = self._make(values)
+            if len(self._known) < MAX_KNOWN:
+                self._known[body] = message
+        return message
+
+    def _make(self, values: tuple[Any, ...]) -> Message:
+        message = object.__new__(self.type)
+        for fill, value in zip(self._fill, values, strict=True):
+            fill(message, value)
+        return message
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,16 +193,16 @@ class Dialect:
     table: tuple[MessageRow, ...]
     about: str
     source: str
-    _encoders: dict[type[Message], _Codec] = field(
-        init=False, repr=False, default_factory=dict[type[Message], _Codec]
+    _encoders: dict[type[Message], Codec] = field(
+        init=False, repr=False, default_factory=dict[type[Message], Codec]
     )
-    _decoders: dict[tuple[Sender, int], _Codec] = field(
-        init=False, repr=False, default_factory=dict[tuple[Sender, int], _Codec]
+    _decoders: dict[tuple[Sender, int], Codec] = field(
+        init=False, repr=False, default_factory=dict[tuple[Sender, int], Codec]
     )
 
     def __post_init__(self) -> None:
         for row in self.table:
-            codec = _Codec(row, self.word)
+            codec = Codec(row, self.word, self.header.size)
             self._encoders[row.type] = codec
             self._decoders[row.type.sender, row.message_id] = codec
 
@@ -169,6 +216,25 @@ class Dialect:
         """Return the message with this id from this sender, :class:`UnknownMessage` if none."""
         codec = self._decoders.get((sender, message_id))
         return codec.type if codec is not None else UnknownMessage
+
+    def encoder(self, message_type: type[Message]) -> Codec:
+        """Return what encodes a message.
+
+        Raises:
+            LocalProtocolError: the dialect has no such message.
+        """
+        codec = self._encoders.get(message_type)
+        if codec is None:
+            raise LocalProtocolError(f"dialect {self.name} has no message {message_type.__name__}")
+        return codec
+
+    def decoders(self, sender: Sender) -> dict[int, Codec]:
+        """Return what decodes the messages of one sender, by their ids."""
+        return {
+            row.message_id: self._encoders[row.type]
+            for row in self.table
+            if row.type.sender is sender
+        }
 
     def knows(self, sender: Sender, message_id: int) -> bool:
         """Whether there is a message with this id from this sender."""
@@ -206,9 +272,7 @@ class Dialect:
         """
         if isinstance(message, UnknownMessage):
             return Frame(message.message_id, message.payload)
-        codec = self._encoders.get(type(message))
-        if codec is None:
-            raise LocalProtocolError(f"dialect {self.name} has no message {type(message).__name__}")
+        codec = self.encoder(type(message))
         try:
             return Frame(codec.message_id, codec.encode(message))
         except (struct.error, TypeError) as exc:
@@ -221,9 +285,9 @@ class Dialect:
     def surplus(self, sender: Sender, frame: Frame) -> int:
         """Return how many bytes a known message's body is longer than documented."""
         codec = self._decoders.get((sender, frame.message_id))
-        if codec is None or codec.data_field:
+        if codec is None or codec.has_data:
             return 0
-        return len(frame.payload) - codec.body.size
+        return len(frame.payload) - codec.size
 
     def decode(self, sender: Sender, frame: Frame) -> Message:
         """Return a frame's message; a longer body than documented is cut.
@@ -234,14 +298,7 @@ class Dialect:
         codec = self._decoders.get((sender, frame.message_id))
         if codec is None:
             return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
-        if len(frame.payload) < codec.body.size:
-            raise MessageError(
-                f"{codec.type.__name__} ({frame.message_id:#04x}) came with {len(frame.payload)} "
-                f"bytes, it needs {codec.body.size}: {hex_excerpt(frame.payload)}",
-                offset=self.header.size,
-                data=frame.payload,
-            )
-        return codec.decode(frame.payload)
+        return codec.decode(frame.payload, 0, len(frame.payload))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,21 +3,42 @@
 A frame is a header (a magic number in some dialects, a length, a message id) and a payload. What
 the header looks like is data: :class:`HeaderLayout`. A length above the limit is refused as soon as
 the header is there, so no more than one header and one payload of the permitted size is ever kept.
+
+A chunk is not copied: frames are cut out of it by place. The rest of a large frame has a buffer of
+its own, into which the transport may write.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from smartcam.exceptions import FrameError, hex_excerpt
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 __all__ = ["DEFAULT_MAX_LENGTH", "Frame", "Framer", "HeaderLayout"]
 
 DEFAULT_MAX_LENGTH = 1 << 20
 """Bytes of payload accepted by default. The camera sends about 64 kB at most (HALCON script
 manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."""
+
+
+LARGE = 1 << 12
+"""Bytes of a frame from which on its rest is collected in a buffer of its own. Below it an
+unfinished frame is copied in front of the next chunk, which costs less."""
+
+
+Buffer: TypeAlias = bytes | memoryview
+Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
+"""Reads fields at a place of a buffer."""
+
+
+FIRST_READ = 1 << 12
+MOST_READ = 1 << 18
+"""Bytes that one read takes at most: at first, and once it was filled time and again."""
 
 
 class Frame(NamedTuple):
@@ -45,11 +66,13 @@ class HeaderLayout:
     length_includes: int = 0
     size: int = field(init=False)
     max_payload: int = field(init=False)
+    id_first: bool = field(init=False, repr=False)
     _fields: struct.Struct = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         fields = struct.Struct("<" + 2 * self.code)
         object.__setattr__(self, "_fields", fields)
+        object.__setattr__(self, "id_first", self.order == "id, length")
         object.__setattr__(self, "size", len(self.magic) + fields.size)
         largest = (1 << (4 * fields.size)) - 1
         object.__setattr__(self, "max_payload", largest - self.length_includes)
@@ -65,22 +88,16 @@ class HeaderLayout:
             return self.magic + self._fields.pack(length, message_id)
         return self.magic + self._fields.pack(message_id, length)
 
-    def unpack(self, buffer: bytes | bytearray, offset: int) -> tuple[int, int]:
-        """Return message id and payload size of the header at ``offset``.
-
-        The payload size is negative where the length field is less than what it must count.
-        The magic is not looked at.
-        """
-        first, second = self._fields.unpack_from(buffer, offset + len(self.magic))
-        if self.order == "length, id":
-            return second, first - self.length_includes
-        return first, second - self.length_includes
+    def reader(self, more: int = 0) -> Read:
+        """Return what reads a header at a place: magic, the two numbers, ``more`` bytes behind."""
+        behind = f"{more}s" if more else ""
+        return struct.Struct(f"<{len(self.magic)}s{2 * self.code}{behind}").unpack_from
 
 
 class Framer:
     """Bytes in, frames out.
 
-    :meth:`feed` bytes, then call :meth:`next_frame` until it returns None. After a
+    :meth:`feed` bytes, then call :meth:`cut` or :meth:`next_frame` until it returns None. After a
     :exc:`FrameError` the stream has no frame boundary any more: drop the link, or call
     :meth:`resync`, which skips to the next magic number.
 
@@ -89,62 +106,173 @@ class Framer:
         max_length: largest payload accepted, bytes.
     """
 
-    __slots__ = ("_buffer", "_header", "_max_length", "_start")
+    __slots__ = (
+        *("_buffer", "_filled", "_header", "_large", "_max_length", "_read", "_start", "_store"),
+    )
 
     def __init__(self, header: HeaderLayout, max_length: int = DEFAULT_MAX_LENGTH) -> None:
         self._header = header
         self._max_length = max_length
-        # While whole frames come in whole chunks the buffer is the chunk itself, uncopied.
-        self._buffer: bytes | bytearray = b""
+        self._read = header.reader()
+        # A chunk as it came, or one large frame.
+        self._buffer: Buffer = b""
         self._start = 0
+        self._large: memoryview | None = None  # an unfinished large frame, as long as it will be
+        self._filled = 0
+        self._store = memoryview(b"")  # where a transport writes; large frames stay there
 
     @property
     def buffered(self) -> int:
         """Bytes kept for the next frame."""
-        return len(self._buffer) - self._start
+        return self._filled if self._large is not None else len(self._buffer) - self._start
 
     @property
     def pending(self) -> bytes:
         """Copy of the bytes kept, for traces and error texts."""
+        if self._large is not None:
+            return bytes(self._large[: self._filled])
         return bytes(self._buffer[self._start :])
 
-    def feed(self, data: bytes | bytearray | memoryview) -> None:
-        """Take bytes; call :meth:`next_frame` next."""
-        if not self.buffered:
-            self._buffer, self._start = bytes(data), 0
-            return
-        if not isinstance(self._buffer, bytearray):
-            self._buffer = bytearray(self._buffer)
-        del self._buffer[: self._start]  # cut at the front: moves a pointer, not the bytes
-        self._start = 0
-        self._buffer += data
+    @property
+    def buffer(self) -> Buffer:
+        """The bytes that :meth:`cut` tells places of."""
+        return self._buffer
 
-    def next_frame(self) -> Frame | None:
-        """Return the next whole frame, or None for "more bytes".
+    def feed(self, data: bytes | bytearray | memoryview) -> None:
+        """Take bytes; call :meth:`cut` or :meth:`next_frame` until it returns None."""
+        large = self._large
+        if large is None:
+            buffer, start = self._buffer, self._start
+            rest = bytes(buffer[start:]) if start < len(buffer) else b""
+            self._buffer, self._start = rest + data if rest else bytes(data), 0
+            return
+        filled, missing = self._filled, len(large) - self._filled
+        if len(data) <= missing:
+            large[filled : filled + len(data)] = data
+            self._fill(len(data))
+            return
+        self._buffer, self._start, self._large = b"".join((large[:filled], data)), 0, None
+
+    def room(self) -> memoryview:
+        """Return where a transport may write the next bytes; call :meth:`filled` next.
+
+        The rest of a large frame, or a buffer that grows as long as it is filled each time: an
+        idle camera has a small one, a fast one few reads.
+        """
+        if self._large is not None:
+            return self._large[self._filled :]
+        if not self._store:
+            self._store = memoryview(bytearray(FIRST_READ))
+        return self._store
+
+    def filled(self, count: int) -> None:
+        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`feed`."""
+        if self._large is not None:
+            self._fill(count)
+            return
+        store = self._store
+        data = store[:count]
+        if count == len(store) < MOST_READ:
+            self._store = memoryview(bytearray(2 * count))
+        if self._start == len(self._buffer) and self._begins_large(data):
+            self._buffer, self._start = data, 0  # not copied: it is cut before the next bytes come
+        else:
+            self.feed(data)
+
+    def cut(self) -> tuple[int, int, int] | None:
+        """Return the next whole frame as id and place of its payload, or None for "more bytes".
+
+        What is at the place gives :meth:`take`, before the next :meth:`feed`.
 
         Raises:
             FrameError: wrong magic, or a length that is impossible or above the limit. Nothing is
                 consumed.
         """
-        start, header = self._start, self._header
-        available = len(self._buffer) - start
-        if available < header.size:
-            self._check_magic(start, available)
+        if self._large is not None:
             return None
-        self._check_magic(start, available)
-        message_id, size = header.unpack(self._buffer, start)
-        if size < 0 or size > self._max_length:
+        header, buffer, start = self._header, self._buffer, self._start
+        available = len(buffer) - start
+        if available < header.size:
+            if available:
+                self._check_magic(start, available)
+            self._keep(start)
+            return None
+        magic, message_id, length = self._read(buffer, start)
+        if magic != header.magic:
+            self._check_magic(start, available)
+        if not header.id_first:
+            message_id, length = length, message_id
+        size = length - header.length_includes
+        if not 0 <= size <= self._max_length:
             raise FrameError(
                 f"a frame of message {message_id:#04x} announces {size} bytes of payload; "
                 f"0 to {self._max_length} are accepted",
                 offset=len(header.magic),
-                data=self._buffer[start : start + header.size],
+                data=bytes(buffer[start : start + header.size]),
             )
-        end = start + header.size + size
-        if len(self._buffer) < end:
+        begin = start + header.size
+        end = begin + size
+        if end > len(buffer):
+            if header.size + size >= LARGE:
+                self._collect(header.size + size)
+            else:
+                self._keep(start)
             return None
         self._start = end
-        return Frame(message_id, bytes(self._buffer[start + header.size : end]))
+        return message_id, begin, end
+
+    def take(self, begin: int, end: int) -> bytes:
+        """Return the bytes at a place that :meth:`cut` told."""
+        return bytes(self._buffer[begin:end])
+
+    def following(self, read: Read, like: int, size: int) -> list[bytes]:
+        """Return what is in the whole frames that come next and are of the same kind.
+
+        Those with the id and the first ``size`` bytes of payload of the frame that begins at
+        ``like``; their other bytes are returned. The first that differs ends it, errors included.
+
+        Args:
+            read: a header's reader with ``size`` bytes more.
+            like: where the frame begins that they are compared with.
+            size: of what is the same in each of them.
+        """
+        header, buffer, start = self._header, self._buffer, self._start
+        found: list[bytes] = []
+        available, id_first, before = len(buffer), header.id_first, header.size
+        least, last = before + size, available - before - size
+        if start > last or isinstance(buffer, memoryview):
+            return found
+        magic, wanted, other, first = read(buffer, like)
+        if not id_first:
+            wanted = other
+        before -= header.length_includes
+        longest = self._max_length + header.length_includes
+        while start <= last:
+            mark, message_id, length, begins = read(buffer, start)
+            if not id_first:
+                message_id, length = length, message_id
+            end = start + before + length
+            if (
+                message_id != wanted
+                or begins != first
+                or mark != magic
+                or length > longest
+                or end > available
+                or end < start + least
+            ):
+                break
+            found.append(buffer[start + least : end])
+            start = end
+        self._start = start
+        return found
+
+    def next_frame(self) -> Frame | None:
+        """Return the next whole frame, or None for "more bytes"; raises as :meth:`cut`."""
+        found = self.cut()
+        if found is None:
+            return None
+        message_id, begin, end = found
+        return Frame(message_id, self.take(begin, end))
 
     def resync(self) -> int:
         """Skip to the next magic number behind the present place; return the bytes skipped.
@@ -154,10 +282,10 @@ class Framer:
         """
         magic = self._header.magic
         begin = self._start
-        found = self._buffer.find(magic, begin + 1) if magic else -1
+        found = bytes(self._buffer).find(magic, begin + 1) if magic else -1
         if found < 0:
             keep = min(len(magic) - 1, max(self.buffered - 1, 0)) if magic else 0
-            while keep and not magic.startswith(self._buffer[-keep:]):
+            while keep and not magic.startswith(bytes(self._buffer[-keep:])):
                 keep -= 1
             found = len(self._buffer) - keep
         self._start = found
@@ -165,15 +293,47 @@ class Framer:
 
     def clear(self) -> None:
         """Drop everything kept."""
+        self._buffer, self._start, self._large = b"", 0, None
+
+    def _fill(self, count: int) -> None:
+        """``count`` bytes more of a large frame are there."""
+        self._filled += count
+        large = self._large
+        if large is not None and self._filled == len(large):
+            self._buffer, self._start, self._large = large, 0, None
+
+    def _begins_large(self, data: memoryview) -> bool:
+        """Whether the first frame is a large one."""
+        header = self._header
+        if len(data) < LARGE:
+            return False
+        _, first, second = self._read(data, 0)
+        length: int = second if header.id_first else first
+        return length - header.length_includes >= LARGE
+
+    def _keep(self, start: int) -> None:
+        """Keep the rest of a chunk that was a view."""
+        if isinstance(self._buffer, memoryview):
+            self._buffer, self._start = bytes(self._buffer[start:]), 0
+
+    def _collect(self, size: int) -> None:
+        """Collect the rest of a large frame of ``size`` bytes in all where a transport writes."""
+        begun = self._buffer[self._start :]
+        in_place = isinstance(begun, memoryview) and begun.obj is self._store.obj
+        if len(self._store) < size:
+            self._store, in_place = memoryview(bytearray(size)), False
+        if not in_place or self._start:
+            self._store[: len(begun)] = begun
+        self._large, self._filled = self._store[:size], len(begun)
         self._buffer, self._start = b"", 0
 
     def _check_magic(self, start: int, available: int) -> None:
         magic = self._header.magic
         if not magic:
             return
-        seen = self._buffer[start : start + min(available, len(magic))]
+        seen = bytes(self._buffer[start : start + min(available, len(magic))])
         if not magic.startswith(seen):
             raise FrameError(
                 f"wrong magic number: {hex_excerpt(seen)} came, {magic.hex(' ')} was expected",
-                data=self._buffer[start : start + 64],
+                data=bytes(self._buffer[start : start + 64]),
             )

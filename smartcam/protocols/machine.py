@@ -18,7 +18,7 @@ from smartcam.protocols.base import POLICIES, Dialect, Policy, Role, Transport
 from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from smartcam.protocols.messages import Message
 
@@ -29,6 +29,7 @@ __all__ = [
     "LinkEnded",
     "LinkFailed",
     "Machine",
+    "ResultBurst",
     "State",
 ]
 
@@ -104,6 +105,33 @@ TRANSITIONS: Mapping[tuple[State, m.Sender, type[Message]], State] = _transition
 """``{(state, sender, message type): next state}``, for both roles. What is not here is illegal."""
 
 
+_SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
+    (state, sender): {
+        kind: following
+        for (before, who, kind), following in TRANSITIONS.items()
+        if (before, who) == (state, sender)
+    }
+    for state in State
+    for sender in m.Sender
+}
+"""The same by state and sender, for the way of every message."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultBurst:
+    """Two or more result containers of one application, one right after the other.
+
+    The client's machine gives it for containers that came in one delivery, so that a camera that
+    runs free costs no object for each. Iterating gives them one by one.
+    """
+
+    application: int
+    data: list[bytes]
+
+    def __iter__(self) -> Iterator[m.ResultContainer]:
+        return (m.ResultContainer(application=self.application, data=one) for one in self.data)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkFailed:
     """The peer broke the protocol: close the link. Always the last event."""
@@ -118,7 +146,7 @@ class LinkEnded:
     pending: int
 
 
-Event = m.Message | LinkFailed | LinkEnded
+Event = m.Message | ResultBurst | LinkFailed | LinkEnded
 
 
 @dataclass(slots=True)
@@ -164,7 +192,6 @@ class Machine:
         self.dialect = dialect
         self.role = role
         self.transport = transport
-        self.state: State = State.IDLE
         self.error: RemoteProtocolError | None = None
         self.counters: Counters = Counters()
         self._policy = policy or POLICIES[role, transport]
@@ -173,6 +200,25 @@ class Machine:
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
+        self._sender, self._sends = role.receives, role.sends
+        self._decoders = dialect.decoders(role.receives)
+        result = dialect.encoder(m.ResultContainer)
+        self._burst_size = result.size
+        self._burst_reader = dialect.header.reader(result.size)
+        self._takes_bursts = role is Role.CLIENT and trace is None
+        self.state = State.IDLE
+
+    @property
+    def state(self) -> State:
+        """Where the link is."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state = state
+        self._deaf = state is State.FAILED or state is State.CLOSED
+        self._may_come = _SAID[state, self._sender]
+        self._may_go = _SAID[state, self._sends]
 
     # ------------------------------------------------------------------ bytes in
 
@@ -186,31 +232,30 @@ class Machine:
 
         Never raises for what is in the bytes. In state FAILED or CLOSED they are dropped.
         """
-        if self.state in {State.FAILED, State.CLOSED}:
+        if self._deaf:
             return
         self.counters.bytes_received += len(data)
-        framer = self._framer
-        framer.feed(data)
+        self._framer.feed(data)
         if self.transport is Transport.UDP:
             self._receive_datagram()
+        else:
+            self._receive_frames()
+
+    def room(self) -> memoryview:
+        """Return where a stream's next bytes may be written; call :meth:`filled` next."""
+        return self._framer.room()
+
+    def filled(self, count: int) -> None:
+        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`."""
+        if self._deaf:
             return
-        while True:
-            try:
-                frame = framer.next_frame()
-            except RemoteProtocolError as error:
-                if self._reject(error):
-                    return
-                framer.resync()
-                continue
-            if frame is None:
-                return
-            self._receive_frame(frame)
-            if self.error is not None:
-                return
+        self.counters.bytes_received += count
+        self._framer.filled(count)
+        self._receive_frames()
 
     def receive_eof(self) -> None:
         """The peer will send no more; call :meth:`events` next."""
-        if self.state in {State.FAILED, State.CLOSED}:
+        if self._deaf:
             return
         self._events.append(LinkEnded(pending=self._framer.buffered))
         self._framer.clear()
@@ -235,7 +280,7 @@ class Machine:
             LocalProtocolError: this state forbids it, it does not fit its fields, or an answer of
                 the same id is still owed (answers carry no correlation). Nothing has changed.
         """
-        following = TRANSITIONS.get((self.state, self.role.sends, type(message)))
+        following = self._may_go.get(type(message))
         if following is None:
             raise LocalProtocolError(
                 f"{type(message).__name__} cannot be sent by the {self.role.value} "
@@ -251,12 +296,13 @@ class Machine:
         data = self.dialect.encode_frame(frame)
         if owed is not None:
             self._open.add(owed)
-        self.state = following
+        if following is not self._state:
+            self.state = following
         self._outbox.append(data)
         self.counters.frames_sent += 1
         self.counters.bytes_sent += len(data)
         if self._trace is not None:
-            self._trace(self.role.sends, frame)
+            self._trace(self._sends, frame)
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
@@ -271,52 +317,91 @@ class Machine:
         answer_id = self.dialect.answer_id(request_id)
         return request_id if answered else answer_id
 
+    def _receive_frames(self) -> None:
+        framer = self._framer
+        while True:
+            try:
+                found = framer.cut()
+            except RemoteProtocolError as error:
+                if self._reject(error):
+                    return
+                framer.resync()
+                continue
+            if found is None:
+                return
+            self._receive_frame(*found)
+            if self._deaf:
+                return
+
     def _receive_datagram(self) -> None:
+        framer = self._framer
         try:
-            frame = self._framer.next_frame()
-            if frame is None or self._framer.buffered:
+            found = framer.cut()
+            if found is None or framer.buffered:
                 raise MessageError(
-                    f"a datagram is not one whole frame: {hex_excerpt(self._framer.pending)}",
-                    data=self._framer.pending,
+                    f"a datagram is not one whole frame: {hex_excerpt(framer.pending)}",
+                    data=framer.pending,
                 )
         except RemoteProtocolError as error:
             self._reject(error)
         else:
-            self._receive_frame(frame)
-        self._framer.clear()
+            self._receive_frame(*found)
+        framer.clear()
 
-    def _receive_frame(self, frame: Frame) -> None:
-        self.counters.frames_received += 1
-        sender = self.role.receives
+    def _receive_frame(self, message_id: int, begin: int, end: int) -> None:
+        """Make a message of a frame whose payload is at a place of the framer's."""
+        counters, framer = self.counters, self._framer
+        counters.frames_received += 1
         if self._trace is not None:
-            self._trace(sender, frame)
-        surplus = self.dialect.surplus(sender, frame)
+            self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
+        codec = self._decoders.get(message_id)
+        surplus = 0
+        message: Message
         try:
-            if surplus > 0 and self._policy.exact_length:
-                raise MessageError(
-                    f"message {frame.message_id:#04x} is {surplus} bytes too long",
-                    data=frame.payload,
-                )
-            message = self.dialect.decode(sender, frame)
-            following = TRANSITIONS.get((self.state, sender, type(message)))
+            if codec is None:
+                payload = framer.take(begin, end)
+                message = m.UnknownMessage(message_id=message_id, payload=payload)
+            else:
+                if not codec.has_data:
+                    surplus = end - begin - codec.size
+                if surplus > 0 and self._policy.exact_length:
+                    raise MessageError(
+                        f"message {message_id:#04x} is {surplus} bytes too long",
+                        data=framer.take(begin, end),
+                    )
+                message = codec.decode(framer.buffer, begin, end)
+            following = self._may_come.get(type(message))
             if following is None:
                 raise MessageError(
-                    f"{type(message).__name__} ({frame.message_id:#04x}) came in state "
-                    f"{self.state.value}, where it is not expected",
-                    data=frame.payload,
+                    f"{type(message).__name__} ({message_id:#04x}) came in state "
+                    f"{self._state.value}, where it is not expected",
+                    data=framer.take(begin, end),
                 )
         except RemoteProtocolError as error:
             self._reject(error)
             return
         if surplus > 0:
-            self.counters.long_bodies += 1
-        self.state = following
-        if self.role is Role.CAMERA or self._wanted(message, frame.message_id):
+            counters.long_bodies += 1
+        if following is not self._state:
+            self.state = following
+        if self.role is Role.CAMERA or self._wanted(message, message_id):
             self._events.append(message)
+            if self._takes_bursts and type(message) is m.ResultContainer and framer.buffered:
+                self._receive_burst(message, begin)
+
+    def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
+        """Take the result containers of the same application that come next in these bytes."""
+        like = begin - self.dialect.header.size
+        more = self._framer.following(self._burst_reader, like, self._burst_size)
+        if more:
+            self.counters.frames_received += len(more)
+            more.insert(0, first.data)
+            self._events[-1] = ResultBurst(application=first.application, data=more)
 
     def _wanted(self, message: Message, message_id: int) -> bool:
         """Whether the client shall see it: an answer that nothing asked for is counted only."""
-        if isinstance(message, (m.ResultContainer, m.StatusReport)):
+        kind = type(message)
+        if kind is m.ResultContainer or kind is m.StatusReport:
             self._open.discard(message_id)  # asked for, in a dialect or by a raw request
             return True
         unknown = isinstance(message, m.UnknownMessage)
@@ -330,7 +415,7 @@ class Machine:
     def _reject(self, error: RemoteProtocolError) -> bool:
         """Fail the link (True) or drop and count, as the policy says."""
         if self._trace is not None:
-            self._trace(self.role.receives, error)
+            self._trace(self._sender, error)
         if not isinstance(error, self._policy.fatal):
             self.counters.ignored_frames += 1
             return False

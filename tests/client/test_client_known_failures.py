@@ -65,15 +65,15 @@ class Work:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.seconds = 0.0
         self.sizes: list[int] = []
-        receive = Link.data_received
+        receive = Link.buffer_updated
 
-        def measured(link: Link, data: bytes) -> None:
+        def measured(link: Link, nbytes: int) -> None:
             begin = time.thread_time()
-            receive(link, data)
+            receive(link, nbytes)
             self.seconds += time.thread_time() - begin
-            self.sizes.append(len(data))
+            self.sizes.append(nbytes)
 
-        monkeypatch.setattr(Link, "data_received", measured)
+        monkeypatch.setattr(Link, "buffer_updated", measured)
 
 
 async def next_of(results: Any) -> Result:

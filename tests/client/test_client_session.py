@@ -472,7 +472,7 @@ async def test_supervisor_that_fails_tells_everybody(
     async with by_hand() as (box, camera):
         waiting = asyncio.create_task(camera.wait_status(lambda _: False))
         await steps(1)
-        monkeypatch.setattr(camera._inbox, "_on_status", _fail)
+        monkeypatch.setattr(camera._inbox, "dispatch", _fail)
         box.report(RUNNING)
         error = await gone(waiting)
         assert isinstance(error, ConnectionLostError)

@@ -85,6 +85,22 @@ def test_container_without_send_results_is_none() -> None:
     assert Application(id=2).container(**given) is None
 
 
+@pytest.mark.parametrize(
+    ("fields", "period"),
+    [
+        ({"layout": "n: uint8", "constant": [1]}, 1),
+        ({"layout": "n: uint8", "cycle": [[1], [2], [1]]}, 3),
+        ({"layout": "n: uint8 @sequence", "constant": [1]}, None),
+        ({"layout": "n: uint8", "generator": "sequence"}, None),
+        ({}, None),
+    ],
+)
+def test_period_is_known_where_a_run_changes_nothing(
+    fields: dict[str, Any], period: int | None
+) -> None:
+    assert Application(id=2, **fields).period == period
+
+
 def test_container_cycle_goes_round() -> None:
     app = Application(id=2, layout="n: uint8", cycle=[{"n": 1}, [2], {"n": 3}])
     assert b"".join(container(app, turn=turn) for turn in range(7)) == b"\1\2\3\1\2\3\1"

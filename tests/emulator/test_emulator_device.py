@@ -710,6 +710,24 @@ def test_generator_that_fails_gives_no_result_and_is_logged(
     assert "application 2, run 0: no result" in caplog.text
 
 
+def test_containers_that_come_again_follow_turn_byte_order_and_application() -> None:
+    quick: dict[str, Any] = {"layout": "n: uint16", "processing_time": 0, "load_time": 0}
+    cycle = Application(id=1, cycle=[[1], [2]], **quick)
+    device = Device([cycle, Application(id=2, constant=[7], **quick)], running=True)
+    say(device, m.Connect())
+
+    def results(count: int) -> list[str]:
+        return [one for one in say(device, *[m.Trigger()] * count) if one.startswith("result")]
+
+    assert results(3) == ["result 1 0100", "result 1 0200", "result 1 0100"]
+    device.set_endian(1)
+    assert results(3) == ["result 1 0002", "result 1 0001", "result 1 0002"]
+    say(device, m.Stop(), switch(2), m.Start())
+    assert results(2) == ["result 2 0007", "result 2 0007"]
+    device.set_endian(0)
+    assert results(2) == ["result 2 0700", "result 2 0700"]
+
+
 def test_tick_backwards_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="the time goes forwards, got -1"):
         make().tick(-1)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from fuzz_input import Choices
 from fuzz_wire import check_decoding
-from machines import DIALECTS, EXAMPLES
+from machines import DIALECTS, EXAMPLES, one_by_one
 
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError, RemoteProtocolError
 from smartcam.protocols import messages as m
@@ -60,7 +60,7 @@ class Link:
         ended = machine.state in ENDED
         counted = machine.counters.bytes_received, machine.counters.frames_received
         machine.receive_data(data)
-        fresh = machine.events()
+        fresh = one_by_one(machine.events())
         self.events += fresh
         self.follow()
         if machine.role is Role.CLIENT:

@@ -99,6 +99,28 @@ def test_y_down_is_turned_to_y_up() -> None:
     assert math.copysign(1, straight.pose.orientation.z) == 1
 
 
+def test_z_stays_with_its_record_where_others_are_skipped() -> None:
+    record = struct.Struct("<fhff")
+    data = record.pack(0, 0, 0, 0) + record.pack(1, 2, 3, 0.5) + record.pack(4, 5, 6, 0.5)
+    parts = interpret(data, "(z: real32 mm, x: int16, y: real32, theta: real32)*")
+    assert [part.pose.position for part in parts] == [(2.0, 3.0, 0.001), (5.0, 6.0, 0.004)]
+
+
+@pytest.mark.parametrize(("unused", "bad"), [("ok: bool", b"\1"), ("code: string[1]", b"\xff")])
+def test_values_that_are_not_used_are_checked(unused: str, bad: bytes) -> None:
+    layout = f"({unused}, x: int8, y: int8)*"
+    assert len(interpret(b"\0\1\2", layout)) == 1
+    with pytest.raises(InterpretationError, match=f"record 1: field '{unused.split(':')[0]}'"):
+        interpret(b"\0\1\2" + bad + b"\1\2", layout)
+
+
+def test_text_that_is_not_utf8_names_its_place_and_comes_before_nan() -> None:
+    data = PART.pack(b"a", 1, 0, math.nan, 2, 0) + PART.pack(b"b\xff", 1, 0, 1, 2, 0)
+    with pytest.raises(InterpretationError, match="record 1: field 'feature_id'") as caught:
+        interpret(data)
+    assert caught.value.offset == 71
+
+
 @pytest.mark.parametrize(("field", "offset"), [("x", 58), ("y", 62), ("theta", 66)])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_pose_that_is_not_finite_names_field_and_offset(

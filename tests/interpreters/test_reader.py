@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import nullcontext
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
-from smartcam.interpreters import Context, Interpreter, Reader, run
+from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve, run
+from smartcam.interpreters.base import plain, run_plain
+from smartcam.interpreters.table import Table
 from smartcam.layout import Layout
 
 if TYPE_CHECKING:
@@ -150,6 +153,60 @@ def test_run_leaves_interpretation_errors_as_they_are(error: Exception) -> None:
     with pytest.raises(InterpretationError) as caught:
         run(Fails(error), Reader(b""))
     assert caught.value is error
+
+
+class Reversed(PlainInterpreter):
+    def read(self, data: bytes, byte_order: ByteOrder) -> object:
+        return int.from_bytes(data, byte_order) // len(data)
+
+
+def test_plain_interpreter_needs_neither_reader_nor_context() -> None:
+    interpreter = Reversed()
+    assert run(interpreter, Reader(b"\1\2", Context(byte_order="big"))) == 0x81
+    assert plain(interpreter) is interpreter
+    assert run_plain(interpreter, b"\1\2", "big") == 0x81
+    assert interpreter.read_all([b"\1\2", b"\4"], "big") == [0x81, 4]
+
+
+def test_run_plain_turns_any_error_into_an_interpretation_error() -> None:
+    with pytest.raises(InterpretationError, match="failed with ZeroDivisionError") as caught:
+        run_plain(Reversed(), b"", "little")
+    assert "the container has 0 bytes" in str(caught.value)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize("spec", ["raw", "strings50", "a: int16", "table: (a: int16)*"])
+def test_built_in_interpreters_of_bytes_alone_are_plain(spec: str) -> None:
+    interpreter, data = resolve(spec), bytes(50) if spec == "strings50" else b"\1\2"
+    simple = plain(interpreter)
+    assert simple is not None
+    value: Any = run(interpreter, Reader(data, Context(byte_order="big")))
+    assert run_plain(simple, data, "big") == value
+    assert simple.read_all([data, data], "big") == [value, value]
+    with pytest.raises(InterpretationError) if spec != "raw" else nullcontext():
+        run_plain(simple, data[:1], "big")
+
+
+def test_table_that_is_read_otherwise_is_read_so_in_bursts() -> None:
+    class Count(Table):
+        def read(self, data: bytes, byte_order: ByteOrder) -> Any:
+            return len(super().read(data, byte_order))
+
+    layout = Layout("(a: int16)*")
+    assert Count(layout).read_all([bytes(4), bytes(6)], "little") == [2, 3]
+    tables = Table(layout).read_all([bytes(4), b"", b"\1\0"], "little")
+    assert [table.tolist() for table in tables] == [[(0,), (0,)], [], [(1,)]]
+    with pytest.raises(InterpretationError):
+        Table(layout).read_all([bytes(4), bytes(3)], "little")
+
+
+def test_interpreters_of_a_reader_have_no_plain_way() -> None:
+    class Own(Reversed):
+        def interpret(self, reader: Reader) -> object:
+            return reader.context.camera
+
+    for interpreter in (Own(), resolve("localizations"), resolve(len)):
+        assert plain(interpreter) is None
 
 
 def test_run_gives_the_reader_the_interpreters_layout() -> None:

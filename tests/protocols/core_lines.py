@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import pytest
 from core_model import ANSWERED, HEADER, WIRES, CameraEnd, ClientEnd, framed
 from core_words import LIMIT
+from machines import one_by_one
 
 from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import messages as m
@@ -110,7 +111,7 @@ class Line:
     def give_client(self, data: bytes) -> None:
         expected = self.client_end.hear(data)
         self.client.receive_data(delivery(data))
-        events = self.client.events()
+        events = one_by_one(self.client.events())
         assert plain(events) == expected
         for event in events:
             if isinstance(event, m.Message):
@@ -122,7 +123,7 @@ class Line:
     def end_client(self) -> None:
         expected = self.client_end.hear_end()
         self.client.receive_eof()
-        assert plain(self.client.events()) == expected
+        assert plain(one_by_one(self.client.events())) == expected
 
     # ------------------------------------------------------------------ what must hold
 

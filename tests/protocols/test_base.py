@@ -163,7 +163,7 @@ def test_decode_body_cut_at_every_length_is_a_message_error(
     dialect: Dialect, message: m.Message
 ) -> None:
     frame = dialect.to_frame(message)
-    needed = dialect._encoders[type(message)].body.size
+    needed = dialect.encoder(type(message)).size
     for size in range(needed):
         cut = frame._replace(payload=frame.payload[:size])
         with pytest.raises(MessageError) as caught:

@@ -1,0 +1,227 @@
+"""Emulator: triggers that a process with emulated cameras answers in a second of CPU time.
+
+Here the subject serves, so it has a process of its own, which tells its CPU time; the client is a
+blocking socket for each camera, with prepared bytes, that triggers when the last answer is whole.
+The yardstick is served in the same way: a bare Protocol on asyncio that writes prepared bytes. The
+answers of both sides are the same to the last byte, and each is compared.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from itertools import cycle, islice
+from typing import TYPE_CHECKING, NamedTuple
+
+from benchmarks.measure import Comparison, Cost, Goal, Plan, Series, take_turns
+from benchmarks.peers import peer, wire
+from benchmarks.peers.canned import HELLO, RUN, SPARE_FILES
+from benchmarks.peers.control import Control, allow_files
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+__all__ = ["run"]
+
+TRIGGERS = 2000
+"""In a round of each side; fewer where each takes its time."""
+
+CAMERAS = 1000
+
+IDLE = 0.5
+"""Seconds of each look at cameras that do nothing."""
+
+EMULATOR, CANNED = "emulator", "canned, asyncio"
+
+GOAL = Goal("at least", 0.3)
+
+
+class Case(NamedTuple):
+    """One way to answer a trigger.
+
+    Attributes:
+        title: what it is.
+        processing_time: seconds.
+        source: where the values come from: ``constant`` or ``generator``.
+        triggers: in a round of each side.
+        note: what the reader needs to know.
+        goal: None where it is only shown.
+    """
+
+    title: str
+    processing_time: float
+    source: str
+    triggers: int
+    note: str
+    goal: Goal | None = None
+
+
+CASES = (
+    Case(
+        "processing time 0",
+        0.0,
+        "constant",
+        TRIGGERS,
+        "the result comes in the step of its trigger: one write",
+        GOAL,
+    ),
+    Case(
+        "processing time 1 ms",
+        0.001,
+        "constant",
+        TRIGGERS // 5,
+        "the result comes by a timer, on both sides: two writes",
+    ),
+    Case(
+        "values of a generator",
+        0.0,
+        "generator",
+        TRIGGERS,
+        "a layout's values are turned into bytes at each trigger",
+    ),
+)
+
+
+def run(plan: Plan) -> Iterable[Comparison]:
+    """Measure one camera, and many in one process."""
+    for case in CASES:
+        with (
+            _serving(EMULATOR, 1, case.processing_time, case.source) as subject,
+            _serving(CANNED, 1, case.processing_time) as yardstick,
+        ):
+            series = _triggers(plan, subject, yardstick, case.triggers)
+        yield Comparison(
+            "emulator",
+            f"one camera, triggers, 5 localizations, {case.title}",
+            series[EMULATOR],
+            series[CANNED],
+            how="speed",
+            goal=case.goal,
+            note=case.note,
+        )
+    yield from _many(plan)
+
+
+def _many(plan: Plan) -> Iterable[Comparison]:
+    wanted = plan.operations(CAMERAS, least=10)
+    # its process has a port and a connection for each camera, this one a client of each side
+    count = min(wanted, (allow_files(2 * wanted + SPARE_FILES) - SPARE_FILES) // 2)
+    fewer = f"the system allows {count} of {wanted} cameras" if count < wanted else ""
+    with _serving(EMULATOR, count) as subject, _serving(CANNED, count) as yardstick:
+        sides = {EMULATOR: subject, CANNED: yardstick}
+        memory = {
+            name: Series(name, "KiB", [side.memory() for _ in range(plan.rounds)])
+            for name, side in sides.items()
+        }
+        series = _triggers(plan, subject, yardstick, TRIGGERS)
+        seconds = IDLE * plan.scale
+        idle = take_turns(
+            plan,
+            {EMULATOR: lambda: subject.idle(seconds), CANNED: lambda: yardstick.idle(seconds)},
+            unit="% of a core",
+        )
+    case = f"{count} cameras in one process"
+    yield Comparison(
+        "emulator",
+        f"{case}, triggers in turn",
+        series[EMULATOR],
+        series[CANNED],
+        how="speed",
+        goal=GOAL,
+        note=fewer,
+    )
+    yield Comparison(
+        "emulator",
+        f"{case}, memory of one with its client",
+        memory[EMULATOR],
+        memory[CANNED],
+        how="more",
+        note="before the first trigger; the yardstick has one port for all",
+    )
+    yield Comparison(
+        "emulator",
+        f"{case}, idle",
+        idle[EMULATOR],
+        idle[CANNED],
+        how="more",
+        note="what asking for the figure costs is in both",
+    )
+
+
+class Side:
+    """A process that serves cameras, and a client of each.
+
+    Args:
+        control: of that process.
+        links: connected, in a session.
+    """
+
+    def __init__(self, control: Control, links: list[socket.socket]) -> None:
+        self._control = control
+        self._links = links
+        self._turns = cycle(links)
+
+    def trigger(self, count: int) -> Cost:
+        """Trigger the cameras in turn; return the process' CPU time for each, in microseconds."""
+        begin = self._control.usage().cpu
+        for link in islice(self._turns, count):
+            link.sendall(TRIGGER)
+            assert _receive(link, len(RUN)) == RUN
+        return (self._control.usage().cpu - begin) / count * 1e6
+
+    def memory(self) -> Cost:
+        """Return how much memory a camera takes, KiB."""
+        usage = self._control.usage()
+        return (usage.resident - usage.before) / len(self._links)
+
+    def idle(self, seconds: float) -> Cost:
+        """Let it do nothing for a time; return its CPU time, percent of a core."""
+        begin, since = self._control.usage().cpu, time.monotonic()
+        time.sleep(seconds)
+        return (self._control.usage().cpu - begin) / (time.monotonic() - since) * 100
+
+
+def _triggers(plan: Plan, subject: Side, yardstick: Side, full: int) -> dict[str, Series]:
+    count = plan.operations(full, least=20)
+    return take_turns(
+        plan,
+        {EMULATOR: lambda: subject.trigger(count), CANNED: lambda: yardstick.trigger(count)},
+    )
+
+
+@contextlib.contextmanager
+def _serving(
+    name: str, cameras: int, processing_time: float = 0.0, source: str = "constant"
+) -> Iterator[Side]:
+    """Start a process and connect to every camera in it."""
+    module, *more = {EMULATOR: ("emulated", source), CANNED: ("canned",)}[name]
+    with (
+        peer(module, str(cameras), str(processing_time), *more) as port,
+        contextlib.ExitStack() as stack,
+    ):
+        control = Control(port)
+        ports = control.usage().ports
+        assert len(ports) == cameras
+        links = [stack.enter_context(_session(port)) for port in ports]
+        yield Side(control, links)
+
+
+def _session(port: int) -> socket.socket:
+    link = socket.create_connection(("127.0.0.1", port))
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    link.sendall(wire.frame(wire.CONNECT))
+    assert _receive(link, len(HELLO)) == HELLO
+    return link
+
+
+def _receive(link: socket.socket, size: int) -> bytes:
+    data = link.recv(size)
+    while len(data) < size:
+        more = link.recv(size - len(data))
+        assert more, "the camera closed the connection"
+        data += more
+    return data
+
+
+TRIGGER = wire.frame(wire.TRIGGER)

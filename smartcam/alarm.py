@@ -1,0 +1,68 @@
+"""A timer for deadlines that are set all the time and hardly ever reached.
+
+A timer of the event loop costs more than the rest of a wait, and most are cancelled at once. This
+one stays where it is when a later deadline is set, and is set again only when it goes off too soon.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["Alarm"]
+
+
+class Alarm:
+    """Calls back at a deadline; one deadline at a time.
+
+    Args:
+        callback: what is called, in the event loop.
+    """
+
+    __slots__ = ("_at", "_callback", "_deadline", "_timer")
+
+    def __init__(self, callback: Callable[[], None]) -> None:
+        self._callback = callback
+        self._deadline: float | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._at = 0.0  # when the timer goes off
+
+    def set(self, deadline: float) -> None:
+        """Call back at ``deadline`` (loop time), unless it is cleared or set anew before."""
+        self._deadline = deadline
+        if self._timer is not None and self._at <= deadline:
+            return
+        self._stop_timer()
+        self._start_timer(deadline)
+
+    def clear(self) -> None:
+        """Do not call back."""
+        self._deadline = None
+
+    def cancel(self) -> None:
+        """Do not call back, and leave nothing in the event loop."""
+        self.clear()
+        self._stop_timer()
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _start_timer(self, at: float) -> None:
+        self._at = at
+        self._timer = asyncio.get_running_loop().call_at(at, self._go_off)
+
+    def _go_off(self) -> None:
+        at, deadline = self._at, self._deadline
+        self._timer = None
+        if deadline is None:
+            return
+        if deadline > at:
+            self._start_timer(deadline)
+            return
+        self._deadline = None
+        self._callback()
