@@ -1,8 +1,9 @@
 """Decode: from a container's bytes to a table, to localizations, to texts; no socket, no loop.
 
-smartcam decodes as its client does: an interpreter that wants no more than the bytes is given the
-bytes, another one a Reader and a Context, made for each container. Every side is called with the
-container and returns the values, and its values are looked at once before it is measured.
+smartcam decodes as its client does: an interpreter that takes the bytes by itself is given them and
+a Context that is used again, another one a Reader and a Context, made for each container. Every
+side is called with the container and returns the values, and its values are looked at once before
+it is measured.
 """
 
 from __future__ import annotations
@@ -111,8 +112,14 @@ def _side(data: bytes, decode: Decode, count: int) -> Callable[[], Cost]:
 def _as_the_client(interpreter: Interpreter) -> Decode:
     """Return what decodes a container as the client does."""
     simple = base.plain(interpreter)
+    context = Context(CAMERA, wire.APPLICATION, NUMBER, AT)
     if simple is not None:
-        return lambda data: base.run_plain(simple, data, "little")
+
+        def decode_plainly(data: bytes) -> Any:
+            context.number, context.received_at, context.empty_slots = NUMBER, AT, 0
+            return base.run_plain(simple, data, context)
+
+        return decode_plainly
 
     def decode(data: bytes) -> Any:
         context = Context(CAMERA, wire.APPLICATION, NUMBER, AT, "little", False, False)

@@ -342,10 +342,15 @@ class Inbox:
             return None
         if self.expected not in {None, application} or not self._listening():
             return None
-        values = self.interpretation.burst(application, burst.data, self.endian)
-        if values is None:
+        name, first = self.name, self.account.received + 1
+        done = self.interpretation.burst(
+            application, burst.data, self.endian, camera=name, number=first, at=at
+        )
+        if done is None:
             return None
-        name, numbers = self.name, itertools.count(self.account.received + 1)
+        values, empty_slots = done
+        self.account.empty_slots += empty_slots
+        numbers = itertools.count(first)
         return [
             _new_tuple(Result, (name, application, None, number, None, at, None, data, value))
             for number, data, value in zip(numbers, burst.data, values, strict=False)

@@ -90,6 +90,8 @@ class Interpretation:
     def __init__(self, spec: Any, *, lenient: bool, y_down: bool) -> None:
         self._lenient = lenient
         self._y_down = y_down
+        self._plain_context = Context(y_down=y_down, lenient=lenient)
+        self._endian = 0
         self._one: _Way | None = None
         self._by_application: dict[int, _Way] = {}
         if hasattr(spec, "items"):
@@ -149,9 +151,11 @@ class Interpretation:
             WrongApplicationError: the mapping does not know its application.
         """
         interpreter, simple, sequenced, _ = self._known(container.application)
-        order = byte_order(endian)
         if simple is not None and not sequenced:
-            return Interpreted(run_plain(simple, container.data, order), None, 0)
+            context = self._context(container.application, endian, camera, number, at)
+            value = run_plain(simple, container.data, context)
+            return Interpreted(value, None, context.empty_slots)
+        order = byte_order(endian)
         context = Context(
             camera, container.application, number, at, order, self._y_down, self._lenient
         )
@@ -160,20 +164,42 @@ class Interpretation:
         sequence = run_sequence(interpreter, reader) if sequenced else None
         return Interpreted(value, sequence, context.empty_slots)
 
-    def burst(self, application: int, payloads: list[bytes], endian: int) -> Sequence[Any] | None:
-        """Return the values of several containers that came together.
+    def _context(
+        self, application: int, endian: int, camera: str, number: int, at: datetime
+    ) -> Context:
+        """Return the context for a plain interpreter, which does not keep it: always the same."""
+        context = self._plain_context
+        if endian != self._endian:
+            context.byte_order, self._endian = byte_order(endian), endian
+        context.camera, context.application = camera, application
+        context.number, context.received_at = number, at
+        context.empty_slots = 0
+        return context
 
-        None where they are to be interpreted one by one: what an interpreter does with them takes
-        more than their bytes, or one of them does not fit.
+    def burst(
+        self,
+        application: int,
+        payloads: list[bytes],
+        endian: int,
+        *,
+        camera: str,
+        number: int,
+        at: datetime,
+    ) -> tuple[Sequence[Any], int] | None:
+        """Return the values of several containers that came together, and their empty slots.
+
+        None where they are to be interpreted one by one: the interpreter wants a Reader, a
+        sequence number is to be read, or one of them does not fit.
         """
         way = self._way(application)
         if way is None or way.simple is None or way.sequenced or endian not in _BYTE_ORDERS:
             return None
+        context = self._context(application, endian, camera, number, at)
         try:
-            values = way.simple.read_all(payloads, _BYTE_ORDERS[endian])
-            return values if len(values) == len(payloads) else None
+            values = way.simple.read_all(payloads, context)
         except Exception:  # noqa: BLE001 - one by one it shows, with its place
             return None
+        return (values, context.empty_slots) if len(values) == len(payloads) else None
 
 
 class _Way(NamedTuple):

@@ -265,10 +265,9 @@ class Interpreter(ABC):
 
 
 class PlainInterpreter(Interpreter):
-    """An interpreter that looks at nothing but the bytes and their order.
+    """An interpreter that takes the bytes by itself and keeps neither them nor the context.
 
-    The client makes neither a :class:`Context` nor a :class:`Reader` for it, which would cost more
-    than a small container's value.
+    The client makes no :class:`Reader` for it, and uses one context for all containers.
     """
 
     def __init_subclass__(cls) -> None:
@@ -277,24 +276,28 @@ class PlainInterpreter(Interpreter):
             cls.read_all = PlainInterpreter.read_all  # type: ignore[method-assign]
 
     @abstractmethod
-    def read(self, data: bytes, byte_order: ByteOrder) -> object:
+    def read(self, data: bytes, context: Context) -> object:
         """Return the value of a container.
 
         Raises:
             InterpretationError: the bytes do not fit.
         """
 
-    def read_all(self, containers: Sequence[bytes], byte_order: ByteOrder) -> Sequence[object]:
+    def read_all(self, containers: Sequence[bytes], context: Context) -> Sequence[object]:
         """Return the values of several containers that came together; as :meth:`read` for each.
 
         It is there to be overridden where that is quicker. Where it raises they are read again,
         one by one.
         """
-        return [self.read(data, byte_order) for data in containers]
+        values: list[object] = []
+        for data in containers:
+            values.append(self.read(data, context))
+            context.number += 1
+        return values
 
     def interpret(self, reader: Reader) -> object:
         """Return what :meth:`read` returns."""
-        return self.read(reader.data, reader.context.byte_order)
+        return self.read(reader.data, reader.context)
 
 
 Function: TypeAlias = Callable[[Reader], object]
@@ -357,10 +360,10 @@ def plain(interpreter: Interpreter) -> PlainInterpreter | None:
     return None if overridden else interpreter
 
 
-def run_plain(interpreter: PlainInterpreter, data: bytes, byte_order: ByteOrder) -> object:
+def run_plain(interpreter: PlainInterpreter, data: bytes, context: Context) -> object:
     """Return what :func:`run` returns; raises as :func:`run`."""
     try:
-        return interpreter.read(data, byte_order)
+        return interpreter.read(data, context)
     except InterpretationError:
         raise
     except Exception as exc:

@@ -8,14 +8,14 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 from smartcam.exceptions import ConfigurationError, InterpretationError
-from smartcam.interpreters.base import Interpreter
+from smartcam.interpreters.base import PlainInterpreter
 from smartcam.layout.text import UNITS
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from smartcam.interpreters.base import Reader
+    from smartcam.interpreters.base import Context
     from smartcam.layout import Field, Layout
 
 __all__ = ["Localizations"]
@@ -49,7 +49,7 @@ _POSE = ("x", "y", "z", "theta")
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
-class Localizations(Interpreter):
+class Localizations(PlainInterpreter):
     """Gives a list of :class:`~smartcam.Localization`.
 
     Args:
@@ -97,16 +97,15 @@ class Localizations(Interpreter):
         )
         self._empty = bytes(self.layout.size)
 
-    def interpret(self, reader: Reader) -> list[Localization]:
+    def read(self, data: bytes, context: Context) -> list[Localization]:
         """Return the parts in the camera's order.
 
         A record of zero bytes is an unused slot of the camera's array (HALCON script manual p. 11,
-        published): it is skipped and counted in ``reader.context.empty_slots``.
+        published): it is skipped and counted in ``context.empty_slots``.
 
         Raises:
             InterpretationError: the bytes do not fit the layout, or a pose has NaN or infinity.
         """
-        context, data = reader.context, reader.data
         header = _new_tuple(Header, (context.number, context.received_at, context.camera))
         sin, cos, new = math.sin, math.cos, _new_tuple
         scales, y_down = self._scales, context.y_down
@@ -115,7 +114,7 @@ class Localizations(Interpreter):
             rows = map(operator.concat, rows, self._missing)
         if self._pick is not None:
             rows = map(self._pick, rows)
-        heights = self._heights(reader) if self._z is not None else None
+        heights = self._heights(data, context) if self._z is not None else None
         total, skipped, z = 0.0, 0, 0.0
         found: list[Localization] = []
         try:
@@ -136,29 +135,29 @@ class Localizations(Interpreter):
                 feature_id = text.partition(b"\0")[0].decode()
                 found.append(new(Localization, (feature_id, quality, photo_index, pose)))
         except ValueError:  # a text that is not UTF-8, the sine of infinity
-            self._check_finite(reader)
+            self._check_finite(data, context)
             raise
         if not math.isfinite(total):  # large numbers may sum up to infinity
-            self._check_finite(reader)
+            self._check_finite(data, context)
         elif self._checks:
             self.layout.parse_records(data, context.byte_order)
         if skipped:
             context.empty_slots += skipped
         return found
 
-    def _heights(self, reader: Reader) -> Iterator[float]:
+    def _heights(self, data: bytes, context: Context) -> Iterator[float]:
         """Return the values of ``z`` as they are on the wire."""
-        rows = self.layout.wire_records(reader.data, reader.context.byte_order)
+        rows = self.layout.wire_records(data, context.byte_order)
         return map(operator.itemgetter(self._z), rows)
 
     def _is_empty(self, data: bytes, number: int) -> bool:
         begin = self.layout.head_size + number * self.layout.size
         return data[begin : begin + self.layout.size] == self._empty
 
-    def _check_finite(self, reader: Reader) -> None:
+    def _check_finite(self, data: bytes, context: Context) -> None:
         """Raise for the first NaN or infinity of a pose; for a bad text or bool before that."""
         offset = self.layout.head_size
-        for record in self.layout.parse_records(reader.data, reader.context.byte_order):
+        for record in self.layout.parse_records(data, context.byte_order):
             for field, value in zip(self.layout.fields, record, strict=True):
                 if field.name in _POSE and not math.isfinite(value):
                     raise InterpretationError(

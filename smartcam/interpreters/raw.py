@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from smartcam.interpreters.base import PlainInterpreter
 
 if TYPE_CHECKING:
-    from smartcam.models import ByteOrder
+    from smartcam.interpreters.base import Context
 
 __all__ = ["Raw"]
 
@@ -17,6 +17,6 @@ class Raw(PlainInterpreter):
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
-    def read(self, data: bytes, byte_order: ByteOrder) -> bytes:
+    def read(self, data: bytes, context: Context) -> bytes:
         """Return the bytes behind the application id."""
         return data

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from smartcam.interpreters.base import PlainInterpreter
 
 if TYPE_CHECKING:
+    from smartcam.interpreters.base import Context
     from smartcam.layout import Layout
-    from smartcam.models import ByteOrder
 
 __all__ = ["Record"]
 
@@ -19,10 +19,10 @@ class Record(PlainInterpreter):
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
     layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
-    def read(self, data: bytes, byte_order: ByteOrder) -> Any:
+    def read(self, data: bytes, context: Context) -> Any:
         """Return the record, or the list of records.
 
         Raises:
             InterpretationError: the bytes do not fit the layout.
         """
-        return self.layout.parse(data, byte_order)
+        return self.layout.parse(data, context.byte_order)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from smartcam.interpreters.base import PlainInterpreter, Reader
 
 if TYPE_CHECKING:
-    from smartcam.models import ByteOrder
+    from smartcam.interpreters.base import Context
 
 __all__ = ["Strings50"]
 
@@ -21,7 +21,7 @@ class Strings50(PlainInterpreter):
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
-    def read(self, data: bytes, byte_order: ByteOrder) -> list[str]:
+    def read(self, data: bytes, context: Context) -> list[str]:
         """Return the texts in order; empty ones are kept, so places stay what they are.
 
         Raises:

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from smartcam.interpreters.base import Context
     from smartcam.layout import Layout
-    from smartcam.models import ByteOrder
 
 __all__ = ["Table"]
 
@@ -23,16 +23,16 @@ class Table(PlainInterpreter):
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
     layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
 
-    def read(self, data: bytes, byte_order: ByteOrder) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    def read(self, data: bytes, context: Context) -> np.ndarray[tuple[int], np.dtype[np.void]]:
         """Return the records as a structured array of one dimension, read-only.
 
         Raises:
             InterpretationError: the bytes do not fit the layout.
         """
-        return self.layout.parse_table(data, byte_order)
+        return self.layout.parse_table(data, context.byte_order)
 
     def read_all(
-        self, containers: Sequence[bytes], byte_order: ByteOrder
+        self, containers: Sequence[bytes], context: Context
     ) -> list[np.ndarray[tuple[int], np.dtype[np.void]]]:
         """Return a table for each container."""
-        return self.layout.parse_tables(containers, byte_order)
+        return self.layout.parse_tables(containers, context.byte_order)
