@@ -10,15 +10,15 @@ import time
 from pathlib import Path
 
 from benchmarks.measure import Comparison, Curve, Plan
-from benchmarks.report import as_json, table
+from benchmarks.report import as_json, markdown, table
 
 BENCHMARKS = {
     "trigger": "await trigger() against a bare Protocol and pymodbus",
-    "stream": "results as fast as the link gives them, item by item and in batches",
+    "stream": "results as fast as the link gives them, one by one and in batches",
     "decode": "from a container's bytes to a table, localizations, texts",
     "large": "containers of 1 kB to 1 MB",
     "fleet": "10, 100 and 1,000 cameras in one process",
-    "emulator": "triggers an emulated camera answers, and 1,000 of them",
+    "emulator": "triggers that emulated cameras answer, one and 1,000 of them",
     "startup": "import smartcam, and the first connect",
     "scaling": "cost of a message over 10^3 to 10^6 of them",
 }
@@ -27,21 +27,13 @@ BENCHMARKS = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Run what is asked for; return 1 where a goal of a full run is missed."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks",
-        description=__doc__,
-        epilog="benchmarks: " + "; ".join(f"{name}: {about}" for name, about in BENCHMARKS.items()),
-    )
-    parser.add_argument("names", nargs="*", metavar="NAME", help="which ones; default: all")
-    parser.add_argument("--quick", action="store_true", help="only see that all of it works")
-    parser.add_argument("--rounds", type=int, default=9, help="of each side; default: %(default)s")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to FILE")
+    parser = _parser()
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in BENCHMARKS]
-    if unknown or options.rounds < 1:
-        parser.error(
-            f"no benchmark is called {', '.join(unknown)}" if unknown else "--rounds: 1 or more"
-        )
+    if unknown:
+        parser.error(f"no benchmark is called {', '.join(unknown)}")
+    if options.rounds < 1:
+        parser.error("--rounds: 1 or more")
     plan = Plan(rounds=2, scale=0.02) if options.quick else Plan(options.rounds, 1.0)
     comparisons: list[Comparison] = []
     curves: list[Curve] = []
@@ -52,9 +44,36 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{name}: {time.monotonic() - begin:.0f} s", file=sys.stderr)
     print(table(comparisons))
     if options.json is not None:
-        options.json.write_text(json.dumps(as_json(comparisons, curves), indent=1) + "\n")
+        _write(options.json, json.dumps(as_json(comparisons, curves), indent=1))
+    if options.docs is not None:
+        from benchmarks import plots
+
+        _write(options.docs / "results.json", json.dumps(as_json(comparisons, curves), indent=1))
+        pictures = plots.write(curves, comparisons, options.docs)
+        _write(options.docs / "results.md", markdown(comparisons, pictures))
     missed = [one for one in comparisons if one.met is False]
     return 1 if missed and not plan.quick else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description="Measure smartcam and its yardsticks side by side. Exit code 1: a goal missed.",
+        epilog="; ".join(f"{name}: {about}" for name, about in BENCHMARKS.items()),
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="which ones; default: all")
+    parser.add_argument("--quick", action="store_true", help="only see that all of it works")
+    parser.add_argument("--rounds", type=int, default=9, help="of each side; default: %(default)s")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to FILE")
+    parser.add_argument(
+        "--docs", type=Path, metavar="DIR", help="write figures, tables and plots for the page"
+    )
+    return parser
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -49,12 +49,16 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 
+GOALS = "Times the goal: 1 is the goal, left of it is better"
+
 WIDE = 50.0
 """Values from the smallest to the largest beyond which an axis is logarithmic."""
 
 
-def write(curves: Iterable[Curve], comparisons: Iterable[Comparison], folder: Path) -> list[Path]:
-    """Draw each curve, and the overview, into files of ``folder``; return their paths.
+def write(
+    curves: Iterable[Curve], comparisons: Iterable[Comparison], folder: Path
+) -> dict[str, Path]:
+    """Draw each curve, and the overview, into files of ``folder``; return these by their titles.
 
     Args:
         curves: each gives a file named after its benchmark and title.
@@ -63,13 +67,16 @@ def write(curves: Iterable[Curve], comparisons: Iterable[Comparison], folder: Pa
     """
     folder.mkdir(parents=True, exist_ok=True)
     with rc_context(STYLE):
-        figures = {f"{one.benchmark}-{_slug(one.title)}": _curve(one) for one in curves}
+        figures = {
+            one.title: (f"{one.benchmark}-{_slug(one.title)}", _curve(one)) for one in curves
+        }
         judged = [one for one in comparisons if one.goal is not None]
         if judged:
-            figures["goals"] = _goals(judged)
-        paths = [folder / f"{name}.svg" for name in figures]
-        for path, figure in zip(paths, figures.values(), strict=True):
-            figure.savefig(path, format="svg", transparent=True, metadata={"Date": None})
+            figures[GOALS] = ("goals", _goals(judged))
+        paths: dict[str, Path] = {}
+        for title, (name, figure) in figures.items():
+            paths[title] = folder / f"{name}.svg"
+            figure.savefig(paths[title], format="svg", transparent=True, metadata={"Date": None})
     return paths
 
 
@@ -122,7 +129,7 @@ def _goals(comparisons: Sequence[Comparison]) -> Figure:
     axes.set_ylim(-0.5, len(rows) - 0.1)
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
-    axes.set_title("Times the goal: 1 is the goal, left of it is better", loc="left")
+    axes.set_title(GOALS, loc="left")
     axes.xaxis.set_major_formatter(FuncFormatter(_number))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(visible=True, axis="x")

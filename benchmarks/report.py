@@ -9,22 +9,51 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from benchmarks.measure import Comparison, Curve
 
-__all__ = ["as_json", "table"]
+__all__ = ["as_json", "markdown", "table"]
 
 HEADINGS = ("benchmark", "case", "smartcam", "yardstick", "measured", "middle half", "goal", "")
 
 
-def table(comparisons: Iterable[Comparison]) -> str:
-    """Return a table for a terminal; Markdown takes it as well."""
+def table(comparisons: Iterable[Comparison], *, without: str = "") -> str:
+    """Return a table for a terminal, which Markdown takes as well; one column may be left out."""
     rows = [HEADINGS, *map(_row, comparisons)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADINGS))]
+    if without:
+        column = HEADINGS.index(without)
+        rows = [(*row[:column], *row[column + 1 :]) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [_line(row, widths) for row in rows]
     lines.insert(1, _line(["-" * width for width in widths], widths))
     return "\n".join(lines)
+
+
+def markdown(comparisons: Sequence[Comparison], pictures: Mapping[str, Path]) -> str:
+    """Return what a run shows as a part of a page: when and where, a table each, the plots.
+
+    Args:
+        comparisons: the tables' lines.
+        pictures: files by what they show; a benchmark's own begin with its name.
+    """
+    facts = as_json((), ())
+    lines = [
+        f"Measured on {facts['at'][:10]} with Python {facts['python']}, {facts['processors']}.",
+        "",
+    ]
+    lines += _images(pictures, "goals")
+    for name in dict.fromkeys(one.benchmark for one in comparisons):
+        rows = [one for one in comparisons if one.benchmark == name]
+        lines += [f"### {name.capitalize()}", "", table(rows, without="benchmark"), ""]
+        lines += _images(pictures, f"{name}-")
+    return "\n".join(lines).rstrip()
+
+
+def _images(pictures: Mapping[str, Path], begins: str) -> list[str]:
+    named = [(title, path.name) for title, path in pictures.items()]
+    return [f"![{title}]({name})\n" for title, name in named if name.startswith(begins)]
 
 
 def as_json(comparisons: Iterable[Comparison], curves: Iterable[Curve]) -> dict[str, Any]:

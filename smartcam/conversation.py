@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -54,7 +55,7 @@ TIMER_RESOLUTION = 0.02
 MAX_APPLICATION_ID = 0xFFFFFFFF
 """The id is a UINT32 on the wire (SC manual p. 34, published)."""
 
-_WAITING = int(Status.WAITING_FOR_TRIGGER)
+_WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
 _SPEAKS_AGAINST = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
 )  # of these Waiting alone is to be set before a trigger
@@ -116,19 +117,21 @@ class Conversation:
         self._patience = patience
         self.name: str = inbox.name
         self.link: Link | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
         self.wants_running: bool | None = None  # None: neither was asked for
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
         self._halted = False  # stopped by a trigger's fence that has not started it again yet
-        self._unconfirmed = False  # a Start or Stop was sent, its status has not come
+        self.unconfirmed: bool = False  # a Start or Stop was sent, its status has not come
         self._status_in_doubt = False  # over UDP: it may have been lost
         self._alarm = Alarm(self._expire)
 
     def begin(self, link: Link) -> None:
         """A new session: nothing is owed on it, its status is heard."""
         self.link = link
+        self._loop = asyncio.get_running_loop()
         self._due.clear()
-        self._unconfirmed = self._status_in_doubt = False
+        self.unconfirmed = self._status_in_doubt = False
 
     def end(self) -> None:
         """There will be no session any more."""
@@ -162,9 +165,10 @@ class Conversation:
         Raises:
             ConfigurationError: it is no finite number of seconds, 0 or more.
         """
-        if not 0 <= timeout < float("inf"):
+        if not 0 <= timeout < math.inf:
             raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
-        return asyncio.get_running_loop().time() + timeout
+        loop = self._loop or asyncio.get_running_loop()  # which is a system call in CPython 3.11
+        return loop.time() + timeout
 
     # ------------------------------------------------------------------ say and wait
 
@@ -343,19 +347,18 @@ class Conversation:
     async def _confirm(
         self, command: m.Message, predicate: Callable[[Status], bool], deadline: float, what: str
     ) -> None:
-        self._unconfirmed = True  # and it stays so where the wait is interrupted
+        self.unconfirmed = True  # and it stays so where the wait is interrupted
         await self.tell(command, deadline)
         await self.until(predicate, deadline, what)
-        self._unconfirmed = False
+        self.unconfirmed = False
 
     async def catch_up(self, deadline: float) -> None:
         """Know the status again where a start or stop was interrupted.
 
         What these two have caused comes before the answer to a Query that was sent after them.
         """
-        if self._unconfirmed:
-            await self._fence(deadline)
-            self._unconfirmed = False
+        await self._fence(deadline)
+        self.unconfirmed = False
 
     async def _fence(self, deadline: float) -> None:
         """Have heard everything that the camera said before now.
@@ -452,7 +455,7 @@ class Conversation:
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
-        attribution, loop = self.inbox.attribution, asyncio.get_running_loop()
+        attribution, loop = self.inbox.attribution, self._loop or asyncio.get_running_loop()
         self._raise_fault()
         if request.input_data is not None and self.inbox.input_in_doubt:
             raise InputContainerError(
@@ -473,7 +476,7 @@ class Conversation:
             await self._settle_debt(deadline)
         if int(self.status) & _SPEAKS_AGAINST != _WAITING:
             await self._wait_for_trigger(deadline, wait=request.wait)
-        if Status.OVERTRIGGERED in self.status:
+        if int(self.status) & _OVERTRIGGERED:
             await self._see_overtriggered_fall(deadline)
             await self._wait_for_trigger(deadline, wait=request.wait)
         while attribution.unsettled and not decided and self._ordered:

@@ -266,8 +266,8 @@ class Inbox:
     @property
     def _is_watched(self) -> bool:
         """Whether anybody would see an event."""
-        debug = logger.isEnabledFor(logging.DEBUG)
-        return bool(self.event_streams) or bool(self._observers) or debug
+        watched = bool(self.event_streams) or bool(self._observers)
+        return watched or logger.isEnabledFor(logging.DEBUG)
 
     def _note_loading(self, was: int | None, bits: int) -> None:
         """Doubt which application is active when somebody else's switch has ended."""

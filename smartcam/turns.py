@@ -54,8 +54,8 @@ class Turn:
         self._turns = turns
         self._timeout = timeout
 
-    async def __aenter__(self) -> float:
-        return await self._turns.take(self._timeout)
+    def __aenter__(self) -> Coroutine[Any, Any, float]:
+        return self._turns.take(self._timeout)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
@@ -147,7 +147,8 @@ class Turns:
         try:
             talk.require_link()  # it may have been lost meanwhile
             self._raise_failed()
-            await talk.catch_up(deadline)
+            if talk.unconfirmed:
+                await talk.catch_up(deadline)
         except BaseException:
             self._lock.release()
             raise

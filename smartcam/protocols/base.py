@@ -200,11 +200,25 @@ class Dialect:
         init=False, repr=False, default_factory=dict[tuple[Sender, int], Codec]
     )
 
+    _answers: dict[int, int | None] = field(
+        init=False, repr=False, default_factory=dict[int, int | None]
+    )
+    # whole frames of the messages that have no body
+    _constant: dict[type[Message], bytes] = field(
+        init=False, repr=False, default_factory=dict[type[Message], bytes]
+    )
+
     def __post_init__(self) -> None:
         for row in self.table:
             codec = Codec(row, self.word, self.header.size)
             self._encoders[row.type] = codec
             self._decoders[row.type.sender, row.message_id] = codec
+            if not wire_fields(row.type):
+                self._constant[row.type] = self.encode(row.type())
+        for row in self.table:
+            if issubclass(row.type, Request):
+                answer = row.type.answer
+                self._answers[row.message_id] = None if answer is None else self.message_id(answer)
 
     def message_id(self, message: Message | type[Message]) -> int:
         """Return the id of a message in this dialect."""
@@ -245,10 +259,7 @@ class Dialect:
 
         An unknown request is expected to be answered under its own id.
         """
-        request = self.message_type(Sender.CLIENT, request_id)
-        if not issubclass(request, Request):
-            return request_id
-        return self.message_id(request.answer) if request.answer is not None else None
+        return self._answers.get(request_id, request_id)
 
     def encode_frame(self, frame: Frame) -> bytes:
         """Return a frame's bytes.
@@ -280,7 +291,8 @@ class Dialect:
 
     def encode(self, message: Message) -> bytes:
         """Return a message's bytes on the wire; raises as :meth:`to_frame`."""
-        return self.encode_frame(self.to_frame(message))
+        constant = self._constant.get(type(message))
+        return self.encode_frame(self.to_frame(message)) if constant is None else constant
 
     def surplus(self, sender: Sender, frame: Frame) -> int:
         """Return how many bytes a known message's body is longer than documented."""

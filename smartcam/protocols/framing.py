@@ -174,10 +174,12 @@ class Framer:
         data = store[:count]
         if count == len(store) < MOST_READ:
             self._store = memoryview(bytearray(2 * count))
-        if self._start == len(self._buffer) and self._begins_large(data):
+        if self._start < len(self._buffer):
+            self.feed(data)
+        elif count >= LARGE and self._begins_large(data):
             self._buffer, self._start = data, 0  # not copied: it is cut before the next bytes come
         else:
-            self.feed(data)
+            self._buffer, self._start = bytes(data), 0
 
     def cut(self) -> tuple[int, int, int] | None:
         """Return the next whole frame as id and place of its payload, or None for "more bytes".
@@ -305,8 +307,6 @@ class Framer:
     def _begins_large(self, data: memoryview) -> bool:
         """Whether the first frame is a large one."""
         header = self._header
-        if len(data) < LARGE:
-            return False
         _, first, second = self._read(data, 0)
         length: int = second if header.id_first else first
         return length - header.length_includes >= LARGE

@@ -72,6 +72,9 @@ _SESSION_REPORTS = (
 )
 
 
+_BY_ITSELF = frozenset((m.StatusReport, m.ResultContainer))  # what the camera sends unasked
+
+
 def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
     client, camera = m.Sender.CLIENT, m.Sender.CAMERA
     idle, connecting, connected = State.IDLE, State.CONNECTING, State.CONNECTED
@@ -286,14 +289,14 @@ class Machine:
                 f"{type(message).__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        frame = self.dialect.to_frame(message)
-        owed = self._answer_id(frame.message_id, answered)
+        data = self.dialect.encode(message)
+        message_id = self.dialect.message_id(message)
+        owed = self._answer_id(message_id, answered)
         if owed in self._open:
             raise LocalProtocolError(
-                f"an answer to message {frame.message_id:#04x} is still owed; one request of an id "
+                f"an answer to message {message_id:#04x} is still owed; one request of an id "
                 "can be open"
             )
-        data = self.dialect.encode_frame(frame)
         if owed is not None:
             self._open.add(owed)
         if following is not self._state:
@@ -302,7 +305,7 @@ class Machine:
         self.counters.frames_sent += 1
         self.counters.bytes_sent += len(data)
         if self._trace is not None:
-            self._trace(self._sends, frame)
+            self._trace(self._sends, Frame(message_id, data[self.dialect.header.size :]))
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
@@ -370,7 +373,8 @@ class Machine:
                         data=framer.take(begin, end),
                     )
                 message = codec.decode(framer.buffer, begin, end)
-            following = self._may_come.get(type(message))
+            kind = type(message)
+            following = self._may_come.get(kind)
             if following is None:
                 raise MessageError(
                     f"{type(message).__name__} ({message_id:#04x}) came in state "
@@ -384,10 +388,13 @@ class Machine:
             counters.long_bodies += 1
         if following is not self._state:
             self.state = following
-        if self.role is Role.CAMERA or self._wanted(message, message_id):
-            self._events.append(message)
-            if self._takes_bursts and type(message) is m.ResultContainer and framer.buffered:
-                self._receive_burst(message, begin)
+        if kind in _BY_ITSELF:
+            self._open.discard(message_id)  # asked for, in a dialect or by a raw request
+        elif self.role is Role.CLIENT and not self._wanted(message_id, known=codec is not None):
+            return
+        self._events.append(message)
+        if self._takes_bursts and isinstance(message, m.ResultContainer) and framer.buffered:
+            self._receive_burst(message, begin)
 
     def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
         """Take the result containers of the same application that come next in these bytes."""
@@ -398,19 +405,14 @@ class Machine:
             more.insert(0, first.data)
             self._events[-1] = ResultBurst(application=first.application, data=more)
 
-    def _wanted(self, message: Message, message_id: int) -> bool:
+    def _wanted(self, message_id: int, *, known: bool) -> bool:
         """Whether the client shall see it: an answer that nothing asked for is counted only."""
-        kind = type(message)
-        if kind is m.ResultContainer or kind is m.StatusReport:
-            self._open.discard(message_id)  # asked for, in a dialect or by a raw request
-            return True
-        unknown = isinstance(message, m.UnknownMessage)
-        self.counters.unknown_ids += unknown
+        self.counters.unknown_ids += not known
         if message_id in self._open:
             self._open.remove(message_id)
             return True
-        self.counters.unexpected_messages += not unknown
-        return unknown
+        self.counters.unexpected_messages += known
+        return not known
 
     def _reject(self, error: RemoteProtocolError) -> bool:
         """Fail the link (True) or drop and count, as the policy says."""
