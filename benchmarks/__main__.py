@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from benchmarks.measure import Comparison, Curve, Plan
-from benchmarks.report import as_json, markdown, table
+from benchmarks.report import as_json, markdown, notes, table
 
 BENCHMARKS = {
     "trigger": "await trigger() against a bare Protocol and pymodbus",
@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
         for found in importlib.import_module(f"benchmarks.{name}").run(plan):
             (curves if isinstance(found, Curve) else comparisons).append(found)
         print(f"{name}: {time.monotonic() - begin:.0f} s", file=sys.stderr)
-    print(table(comparisons))
+    print(table(comparisons), notes(comparisons), sep="\n\n")
     if options.json is not None:
         _write(options.json, json.dumps(as_json(comparisons, curves), indent=1))
     if options.docs is not None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from benchmarks.measure import Comparison, Curve
 
-__all__ = ["as_json", "markdown", "table"]
+__all__ = ["as_json", "markdown", "notes", "table"]
 
 HEADINGS = ("benchmark", "case", "smartcam", "yardstick", "measured", "middle half", "goal", "")
 
@@ -29,6 +29,15 @@ def table(comparisons: Iterable[Comparison], *, without: str = "") -> str:
     lines = [_line(row, widths) for row in rows]
     lines.insert(1, _line(["-" * width for width in widths], widths))
     return "\n".join(lines)
+
+
+def notes(comparisons: Iterable[Comparison]) -> str:
+    """Return what is to be known of some lines, each note once, with the first line it is of."""
+    first: dict[str, str] = {}
+    for one in comparisons:
+        if one.note:
+            first.setdefault(one.note, one.case)
+    return "".join(f"- {case}: {note}\n" for note, case in first.items())
 
 
 def markdown(comparisons: Sequence[Comparison], pictures: Mapping[str, Path]) -> str:
@@ -47,6 +56,7 @@ def markdown(comparisons: Sequence[Comparison], pictures: Mapping[str, Path]) ->
     for name in dict.fromkeys(one.benchmark for one in comparisons):
         rows = [one for one in comparisons if one.benchmark == name]
         lines += [f"### {name.capitalize()}", "", table(rows, without="benchmark"), ""]
+        lines += [notes(rows)] if notes(rows) else []
         lines += _images(pictures, f"{name}-")
     return "\n".join(lines).rstrip()
 

@@ -31,8 +31,6 @@ LAYOUT = (
 )
 ITEMS, BATCHES = "smartcam", "smartcam, batch=True"
 BARE, READER = "bare Protocol", "StreamReader.readexactly"
-MAX_QUEUE = 20_000
-"""A read of the event loop is 256 KiB at most, which is 3,000 results: none is to be dropped."""
 
 
 def run(plan: Plan) -> Iterable[Comparison]:
@@ -57,7 +55,7 @@ async def _measure(plan: Plan, port: int) -> dict[str, Series]:
     url = f"bvs://127.0.0.1:{port}?dialect=handbook"
 
     async def items_side() -> Cost:
-        results = camera.results(max_queue=MAX_QUEUE)
+        results = camera.results()
         begin = time.process_time()
         await camera.request(wire.TRIGGER, go, answered=False)
         missing = count
@@ -70,7 +68,7 @@ async def _measure(plan: Plan, port: int) -> dict[str, Series]:
         return cost
 
     async def batches_side() -> Cost:
-        results = camera.results(batch=True, max_queue=MAX_QUEUE)
+        results = camera.results(batch=True)
         begin = time.process_time()
         await camera.request(wire.TRIGGER, go, answered=False)
         missing = count

@@ -59,8 +59,13 @@ TYPES = {
 
 LIMITS = (
     "protocols.framing.DEFAULT_MAX_LENGTH",
+    "protocols.framing.LARGE",
+    "protocols.framing.FIRST_READ",
+    "protocols.framing.MOST_READ",
+    "protocols.base.MAX_KNOWN",
     "connection.MAX_CHUNKS",
     "client.DEFAULT_MAX_QUEUE",
+    "client.MAX_INTERPRETATIONS",
     "client.DEFAULT_TRIGGER_TIMEOUT",
     "handshake.DETECTION_SHARE",
     "conversation.MAX_APPLICATION_ID",

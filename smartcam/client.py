@@ -49,6 +49,9 @@ QueueT = TypeVar("QueueT", bound=Queue[Any])
 DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
 
+MAX_INTERPRETATIONS = 32
+"""Texts given as ``interpret_as`` whose interpreters a client keeps."""
+
 DEFAULT_TRIGGER_TIMEOUT = 5.0
 """Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
 
@@ -101,6 +104,7 @@ class SmartCamera:
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
         self.settings = settings
         self._observers = Observers(observers)
+        self._interpretations: dict[str, Interpretation] = {}  # by their text
         self._inbox = Inbox(
             settings.name, self._interpretation(settings.interpret_as), self._observers
         )
@@ -258,7 +262,7 @@ class SmartCamera:
             batch: give lists of what is there, one result at least, instead of single results:
                 for a camera that sends thousands a second. ``max_queue`` counts results.
             min_interval: seconds; results that come sooner after the last one are dropped.
-            max_queue: results kept for a slow reader. One read of the link brings up to 256 KiB.
+            max_queue: results kept for a slow reader. One read of the link brings up to 32 KiB.
             overflow: what happens beyond that.
         """
         kind = BatchSubscription[Result] if batch else Subscription[Result]
@@ -660,7 +664,14 @@ class SmartCamera:
         await self._talk.tell(message, self._talk.deadline(self.settings.request_timeout))
 
     def _interpretation(self, spec: object) -> Interpretation:
-        return Interpretation(spec, lenient=self.settings.lenient, y_down=self.settings.y_down)
+        known = self._interpretations.get(spec) if isinstance(spec, str) else None
+        if known is not None:
+            return known
+        lenient, y_down = self.settings.lenient, self.settings.y_down
+        made = Interpretation(spec, lenient=lenient, y_down=y_down)
+        if isinstance(spec, str) and len(self._interpretations) < MAX_INTERPRETATIONS:
+            self._interpretations[spec] = made
+        return made
 
     def _subscribed(self, subscribers: Subscribers[Any], queue: QueueT) -> QueueT:
         """Have a queue offered what comes; it has ended already where nothing will."""

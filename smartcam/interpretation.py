@@ -197,9 +197,10 @@ class Interpretation:
         context = self._context(application, endian, camera, number, at)
         try:
             values = way.simple.read_all(payloads, context)
+            complete = len(values) == len(payloads)
         except Exception:  # noqa: BLE001 - one by one it shows, with its place
             return None
-        return (values, context.empty_slots) if len(values) == len(payloads) else None
+        return (values, context.empty_slots) if complete else None
 
 
 class _Way(NamedTuple):

@@ -290,7 +290,8 @@ class Supervisor:
                 self._talk.ask_what_is_active()
         except Exception as exc:  # noqa: BLE001 - a fault of ours: the task raises it
             self._failure = exc
-            self._talk.require_link().abort(exc)
+            if self.session is not None:
+                self.session.link.abort(exc)
 
     async def _reconnect(self, loss: ConnectionLostError) -> Session:
         """Make a new session, as often as the policy says.

@@ -25,6 +25,7 @@ from handmade import (
     refusing,
     until,
 )
+from machines import one_by_one
 
 from smartcam import connection
 from smartcam.connection import Chunk, Link, TraceEntry, open_link
@@ -33,7 +34,7 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
 from smartcam.protocols.bvs import HANDBOOK
-from smartcam.protocols.machine import LinkEnded, LinkFailed, Machine, State
+from smartcam.protocols.machine import LinkEnded, LinkFailed, Machine, ResultBurst, State
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -163,6 +164,89 @@ async def test_receive_cancelled_loses_nothing(server: Listener) -> None:
     await asyncio.wait({reading})
     peer.write(STATUS)
     assert await take(link, 1) == [RUNNING]
+    link.abort()
+
+
+# ---------------------------------------------------------------------- a receiver
+
+
+async def test_deliver_to_hands_over_what_waits_then_every_chunk_as_it_comes(
+    server: Listener,
+) -> None:
+    link, peer = await session(server)
+    await deliver(link, peer, STATUS + RESULT)
+    await deliver(link, peer, BUSY)
+    heard: list[Chunk] = []
+    link.deliver_to(heard.append)
+    assert [chunk.events for chunk in heard] == [[RUNNING, HELLO], [BUSY_REPORT]]
+    await deliver(link, peer, RESULT * 3 + RESULT[:-1])
+    await deliver(link, peer, RESULT[-1:] + b"noise")
+    burst = ResultBurst(application=21, data=[b"Hello"] * 3)
+    assert [chunk.events for chunk in heard[2:3]] == [[burst]]
+    hello, failed = heard[3].events
+    assert hello == HELLO
+    assert isinstance(failed, LinkFailed)
+    error = await link.wait_lost()
+    assert error.__cause__ is failed.error
+    assert [chunk.received_at for chunk in heard] == sorted(chunk.received_at for chunk in heard)
+    assert len(link._chunks) == 0
+
+
+async def test_deliver_to_after_the_queue_was_full_reads_on(
+    server: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "MAX_CHUNKS", 2)
+    link, peer = await session(server)
+    for _ in range(2):
+        await deliver(link, peer, STATUS)
+    assert not link._transport.is_reading()
+    heard: list[Chunk] = []
+    link.deliver_to(heard.append)
+    for _ in range(5):
+        await deliver(link, peer, BUSY)
+    assert [chunk.events for chunk in heard] == [[RUNNING]] * 2 + [[BUSY_REPORT]] * 5
+    assert link._transport.is_reading()
+    link.abort()
+
+
+async def test_wait_lost_tells_everything_that_came_before_and_may_be_cancelled(
+    server: Listener,
+) -> None:
+    link, peer = await session(server)
+    waiting = asyncio.create_task(link.wait_lost())
+    await asyncio.sleep(0)
+    await deliver(link, peer, BUSY)
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    heard: list[Event] = []
+    link.deliver_to(lambda chunk: heard.extend(chunk.events))
+    waiting.cancel()
+    await asyncio.wait({waiting})
+    assert waiting.cancelled()
+    peer.write(STATUS + RESULT[:5])
+    peer.close()
+    async with asyncio.timeout(LIMIT):
+        error = await link.wait_lost()
+    assert isinstance(error.__cause__, ConnectionResetError)
+    assert heard == [BUSY_REPORT, RUNNING, LinkEnded(pending=5)]
+
+
+async def test_frames_of_any_size_come_whole_through_the_transports_reads(
+    server: Listener,
+) -> None:
+    link, peer = await session(server)
+    heard: list[Event] = []
+    link.deliver_to(lambda chunk: heard.extend(one_by_one(chunk.events)))
+    sizes = [0, 4083, 4084, 4085, 300_000, 1, *[70] * 20_000, (1 << 20) - 4, 5_000, 7]
+    said = [
+        m.ResultContainer(application=size % 2, data=size.to_bytes(4, "big") * (size // 4))
+        for size in sizes
+    ]
+    stream = b"".join(map(HANDBOOK.encode, said))
+    peer.write(stream)
+    await until(lambda: link.machine.counters.frames_received == 1 + len(said))
+    assert heard == said
+    assert link.machine.counters.bytes_received == 16 + len(stream)
     link.abort()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import collections
 import gc
 import weakref
 from typing import Any
@@ -20,7 +19,7 @@ from smartcam.exceptions import (
     SubscriberOverflowError,
 )
 from smartcam.models import SubscriberStatistics
-from smartcam.streams import Overflow, Subscription
+from smartcam.streams import BatchSubscription, Overflow, Queue, Subscribers, Subscription
 
 
 def subscription(
@@ -31,7 +30,15 @@ def subscription(
     )
 
 
-def account(stream: Subscription[int]) -> tuple[int, int, int, int]:
+def batches(
+    max_queue: int = 9, overflow: str = "drop_oldest", min_interval: float = 0.0
+) -> BatchSubscription[int]:
+    return BatchSubscription(
+        "results", max_queue=max_queue, overflow=overflow, min_interval=min_interval
+    )
+
+
+def account(stream: Queue[int]) -> tuple[int, int, int, int]:
     """Return offered, taken, dropped, queued."""
     seen = stream.statistics()
     assert seen.offered == seen.taken + seen.dropped + seen.queued
@@ -261,7 +268,134 @@ async def test_subscription_nobody_refers_to_is_collected() -> None:
     assert not known
 
 
+# ---------------------------------------------------------------------- batches
+
+
+async def test_batch_is_everything_that_is_there() -> None:
+    stream = batches()
+    task = asyncio.create_task(anext(stream))
+    await asyncio.sleep(0)
+    stream.offer_all([1, 2, 3], 0.0)
+    assert await task == [1, 2, 3]
+    stream.offer(4, 0.0)
+    stream.offer_all([5, 6], 0.0)
+    stream.offer_all([], 0.0)
+    assert await anext(stream) == [4, 5, 6]
+    assert account(stream) == (6, 6, 0, 0)
+    stream.offer(7, 0.0)
+    stream.end(None)
+    assert [batch async for batch in stream] == [[7]]
+
+
+async def test_batch_errors_are_raised_in_their_place_and_the_rest_comes() -> None:
+    stream, errors = batches(), [InterpretationError(str(number)) for number in range(3)]
+    stream.offer_all([1, 2], 0.0)
+    for error in errors[:2]:
+        stream.offer(error, 0.0)
+    stream.offer(3, 0.0)
+    stream.offer(errors[2], 0.0)
+    seen: list[object] = []
+    while account(stream)[3]:
+        try:
+            seen.append(await anext(stream))
+        except InterpretationError as error:
+            seen.append(error)
+    assert seen == [[1, 2], errors[0], errors[1], [3], errors[2]]
+    stream.offer_all([4, 5], 0.0)
+    assert await anext(stream) == [4, 5]
+    assert account(stream) == (8, 8, 0, 0)
+
+
+async def test_batch_error_that_was_dropped_leaves_the_others_whole() -> None:
+    stream = batches(max_queue=3)
+    for item in (0, InterpretationError("old"), InterpretationError("older"), 1, 2, 3):
+        stream.offer(item, 0.0)
+    assert await anext(stream) == [1, 2, 3]
+    stream.offer_all([4, 5], 0.0)
+    assert await anext(stream) == [4, 5]
+    assert account(stream) == (8, 5, 3, 0)
+
+
+async def test_batch_overflow_error_ends_after_what_is_queued() -> None:
+    stream = batches(max_queue=3, overflow="error")
+    stream.offer_all([1, 2], 0.0)
+    stream.offer_all([3, 4, 5], 0.0)
+    assert account(stream) == (4, 0, 1, 3)
+    assert await anext(stream) == [1, 2, 3]
+    for _ in range(2):
+        with pytest.raises(SubscriberOverflowError, match="more than 3 items were waiting"):
+            await anext(stream)
+
+
+async def test_offer_all_keeps_the_min_interval() -> None:
+    stream = batches(min_interval=1.0)
+    for now in (10.0, 10.5, 11.0):
+        stream.offer_all([int(10 * now), 0], now)
+    assert await anext(stream) == [100, 110]
+    assert account(stream) == (6, 2, 4, 0)
+
+
+async def test_batch_cancelled_loses_nothing() -> None:
+    stream = batches()
+    for items in ([], [1, 2]):
+        task = asyncio.create_task(anext(stream))
+        await asyncio.sleep(0)
+        stream.offer_all(items, 0.0)
+        task.cancel()
+        await asyncio.wait({task})
+        assert task.cancelled()
+    assert account(stream) == (2, 0, 0, 2)
+    assert await anext(stream) == [1, 2]
+
+
+@pytest.mark.parametrize("error", [None, ConnectionLostError("gone")])
+async def test_batch_end_wakes_a_waiting_reader(error: SmartCamError | None) -> None:
+    stream = batches()
+    task = asyncio.create_task(anext(stream))
+    await asyncio.sleep(0)
+    stream.end(error)
+    with pytest.raises(type(error) if error else StopAsyncIteration):
+        await task
+
+
+# ---------------------------------------------------------------------- who is subscribed
+
+
+def test_subscribers_come_in_order_and_one_that_nobody_has_is_gone_at_once() -> None:
+    subscribers = Subscribers[int]()
+    assert not subscribers
+    first, second, third = subscription(), batches(), subscription()
+    for one in (first, second, third):
+        subscribers.add(one)
+    assert [*subscribers] == [first, second, third]
+    del one, second
+    assert [*subscribers] == [first, third]
+    del first, third
+    assert not subscribers
+
+
+def test_subscribers_may_go_and_come_while_they_are_offered_something() -> None:
+    subscribers = Subscribers[int]()
+    streams = [subscription() for _ in range(4)]
+    for one in streams:
+        subscribers.add(one)
+    late = subscription()
+    offered: list[int] = []
+    for turn, stream in enumerate(subscribers):
+        stream.offer(turn, 0.0)
+        offered.append(id(stream))
+        if turn == 0:
+            del streams[1], one
+            subscribers.add(late)
+    assert offered == [id(one) for one in streams]
+    assert [*subscribers] == [*streams, late]
+    assert account(late) == (0, 0, 0, 0)
+
+
 # ---------------------------------------------------------------------- the account, by a model
+
+
+Item = int | SmartCamError
 
 
 class AccountMachine(RuleBasedStateMachine):
@@ -271,33 +405,50 @@ class AccountMachine(RuleBasedStateMachine):
         super().__init__()
         self.now = 0.0
         self.last = float("-inf")
-        self.model: collections.deque[int] = collections.deque()
+        self.model: list[Item] = []
         self.offered = self.taken = self.dropped = 0
         self.ended = False
-        self.overflow = "drop_oldest"
-        self.interval = 0.0
-        self.stream = subscription()
+        self.choose(kind=Subscription, overflow="drop_oldest", interval=0.0, most=3)
 
     @precondition(lambda self: self.offered == 0 and not self.ended)
-    @rule(overflow=st.sampled_from(["drop_oldest", "error"]), interval=st.sampled_from([0.0, 1.0]))
-    def choose(self, overflow: str, interval: float) -> None:
-        self.overflow, self.interval = overflow, interval
-        self.stream = subscription(overflow=overflow, min_interval=interval)
+    @rule(
+        kind=st.sampled_from([Subscription, BatchSubscription]),
+        overflow=st.sampled_from(["drop_oldest", "error"]),
+        interval=st.sampled_from([0.0, 0.0, 1.0]),
+        most=st.integers(1, 6),
+    )
+    def choose(self, kind: Any, overflow: str, interval: float, most: int) -> None:
+        self.overflow, self.interval, self.most = overflow, interval, most
+        self.stream: Subscription[int] | BatchSubscription[int] = kind(
+            "results", max_queue=most, overflow=overflow, min_interval=interval
+        )
 
-    @rule(step=st.sampled_from([0.0, 0.5, 1.0]))
-    def offer(self, step: float) -> None:
+    @rule(step=st.sampled_from([0.0, 0.5, 1.0]), fits=st.booleans())
+    def offer(self, step: float, fits: bool) -> None:
         self.now += step
-        self.stream.offer(self.offered, self.now)
+        item: Item = self.offered if fits else InterpretationError(str(self.offered))
+        self.stream.offer(item, self.now)
+        self.expect(item)
+
+    @rule(step=st.sampled_from([0.0, 0.5, 1.0]), count=st.integers(0, 8))
+    def offer_all(self, step: float, count: int) -> None:
+        self.now += step
+        items = list(range(self.offered, self.offered + count))
+        self.stream.offer_all(items, self.now)
+        for item in items:
+            self.expect(item)
+
+    def expect(self, item: Item) -> None:
         if self.ended:
             return
-        number, self.offered = self.offered, self.offered + 1
+        self.offered += 1
         if self.now - self.last < self.interval:
             self.dropped += 1
-        elif len(self.model) < 3 or self.overflow == "drop_oldest":
+        elif len(self.model) < self.most or self.overflow == "drop_oldest":
             self.last = self.now
-            self.model.append(number)
-            if len(self.model) > 3:
-                self.model.popleft()
+            self.model.append(item)
+            if len(self.model) > self.most:
+                del self.model[0]
                 self.dropped += 1
         else:
             self.dropped += 1
@@ -307,14 +458,26 @@ class AccountMachine(RuleBasedStateMachine):
     @rule()
     def take(self) -> None:
         step = self.stream.__anext__()
-        with pytest.raises((StopIteration, StopAsyncIteration, SubscriberOverflowError)) as caught:
+        with pytest.raises((StopIteration, StopAsyncIteration, SmartCamError)) as caught:
             step.send(None)
-        if self.model:
+        if not self.model:
+            assert isinstance(caught.value, (StopAsyncIteration, SubscriberOverflowError))
+            return
+        errors = [place for place, item in enumerate(self.model) if not isinstance(item, int)]
+        before = errors[0] if errors else len(self.model)
+        if before == 0:
+            assert caught.value is self.model[0]
+            count = 1
+        elif isinstance(self.stream, BatchSubscription):
             assert isinstance(caught.value, StopIteration)
-            assert caught.value.value == self.model.popleft()
-            self.taken += 1
+            assert caught.value.value == self.model[:before]
+            count = before
         else:
-            assert not isinstance(caught.value, StopIteration)
+            assert isinstance(caught.value, StopIteration)
+            assert caught.value.value == self.model[0]
+            count = 1
+        del self.model[:count]
+        self.taken += count
 
     @rule()
     def end(self) -> None:
@@ -333,6 +496,8 @@ class AccountMachine(RuleBasedStateMachine):
         expected = (self.offered, self.taken, self.dropped, len(self.model))
         assert account(self.stream) == expected
         assert self.stream.ended == self.ended
+        errors = [item for item in self.model if not isinstance(item, int)]
+        assert self.stream._errors == len(errors)  # where none is, a batch is taken at once
 
 
 TestAccount = AccountMachine.TestCase

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import socket
 import struct
-import threading
+from typing import TYPE_CHECKING
+
+from benchmarks.peers.serving import listen
+
+if TYPE_CHECKING:
+    import socket
 
 HEADER = struct.Struct(">HHHB")  # transaction, protocol, length of what follows, unit
 
 
 def serve(client: socket.socket) -> None:
     """Answer one client until it goes."""
-    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     buffer = b""
     while data := client.recv(4096):
         buffer += data
@@ -24,14 +27,5 @@ def serve(client: socket.socket) -> None:
     client.close()
 
 
-def main() -> None:
-    """Print the port and serve."""
-    server = socket.create_server(("127.0.0.1", 0), backlog=64)
-    print(server.getsockname()[1], flush=True)
-    while True:
-        client, _ = server.accept()
-        threading.Thread(target=serve, args=(client,), daemon=True).start()
-
-
 if __name__ == "__main__":
-    main()
+    listen(serve)

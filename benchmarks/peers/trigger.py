@@ -1,17 +1,20 @@
 """A canned camera that answers triggers: status without Waiting, result, status with Waiting.
 
 With ``apart`` they come one by one, as a real camera's do: the next after a moment, each a delivery
-of its own. With ``together`` they are one write. Blocking sockets, a thread for each client.
+of its own. With ``together`` they are one write.
 """
 
 from __future__ import annotations
 
-import socket
 import sys
-import threading
 import time
+from typing import TYPE_CHECKING
 
 from benchmarks.peers import wire
+from benchmarks.peers.serving import frames, listen
+
+if TYPE_CHECKING:
+    import socket
 
 PAUSE = 0.0004
 """Seconds between two messages that come apart; a real camera takes longer."""
@@ -24,32 +27,20 @@ ANSWERS = {
 }
 
 
-def serve(client: socket.socket, answers: dict[int, list[bytes]]) -> None:
-    """Answer one client until it goes."""
-    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    buffer = b""
-    while data := client.recv(4096):
-        buffer += data
-        while len(buffer) >= wire.HEADER.size:
-            _, length, message_id = wire.HEADER.unpack_from(buffer)
-            buffer = buffer[wire.HEADER.size + length :]
+def main() -> None:
+    """Answer triggers."""
+    answers = ANSWERS
+    if sys.argv[1:] == ["together"]:
+        answers = {message_id: [b"".join(parts)] for message_id, parts in ANSWERS.items()}
+
+    def serve(client: socket.socket) -> None:
+        for message_id, _ in frames(client):
             for number, answer in enumerate(answers.get(message_id, ())):
                 if number:
                     time.sleep(PAUSE)
                 client.sendall(answer)
-    client.close()
 
-
-def main() -> None:
-    """Print the port and serve."""
-    answers = ANSWERS
-    if sys.argv[1:] == ["together"]:
-        answers = {message_id: [b"".join(parts)] for message_id, parts in ANSWERS.items()}
-    server = socket.create_server(("127.0.0.1", 0), backlog=64)
-    print(server.getsockname()[1], flush=True)
-    while True:
-        client, _ = server.accept()
-        threading.Thread(target=serve, args=(client, answers), daemon=True).start()
+    listen(serve)
 
 
 if __name__ == "__main__":

@@ -37,8 +37,11 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 
 
 FIRST_READ = 1 << 12
-MOST_READ = 1 << 18
-"""Bytes that one read takes at most: at first, and once it was filled time and again."""
+"""Bytes that one read takes at most, at first. It doubles each time that a read took so many."""
+
+MOST_READ = 1 << 15
+"""Bytes that one read takes at most in the end, where frames are not large. What so many bytes hold
+of results of 16 bytes or more fits into a subscriber's queue, so one that keeps up loses nothing."""
 
 
 class Frame(NamedTuple):
@@ -107,7 +110,8 @@ class Framer:
     """
 
     __slots__ = (
-        *("_buffer", "_filled", "_header", "_large", "_max_length", "_read", "_start", "_store"),
+        *("_buffer", "_filled", "_header", "_large", "_max_length", "_read"),
+        *("_start", "_store", "_window"),
     )
 
     def __init__(self, header: HeaderLayout, max_length: int = DEFAULT_MAX_LENGTH) -> None:
@@ -120,6 +124,7 @@ class Framer:
         self._large: memoryview | None = None  # an unfinished large frame, as long as it will be
         self._filled = 0
         self._store = memoryview(b"")  # where a transport writes; large frames stay there
+        self._window = self._store  # what of it the next read may take
 
     @property
     def buffered(self) -> int:
@@ -162,24 +167,26 @@ class Framer:
         if self._large is not None:
             return self._large[self._filled :]
         if not self._store:
-            self._store = memoryview(bytearray(FIRST_READ))
-        return self._store
+            self._window = self._store = memoryview(bytearray(FIRST_READ))
+        return self._window
 
     def filled(self, count: int) -> None:
         """Take ``count`` bytes that were written into :meth:`room`; as :meth:`feed`."""
         if self._large is not None:
             self._fill(count)
             return
-        store = self._store
-        data = store[:count]
-        if count == len(store) < MOST_READ:
-            self._store = memoryview(bytearray(2 * count))
+        data = self._window[:count]
+        if count == len(self._window) < MOST_READ:
+            self._window = self._store = memoryview(bytearray(min(2 * count, MOST_READ)))
         if self._start < len(self._buffer):
             self.feed(data)
         elif count >= LARGE and self._begins_large(data):
             self._buffer, self._start = data, 0  # not copied: it is cut before the next bytes come
+            self._window = self._store
         else:
             self._buffer, self._start = bytes(data), 0
+            if len(self._window) > MOST_READ:
+                self._window = self._store[:MOST_READ]
 
     def cut(self) -> tuple[int, int, int] | None:
         """Return the next whole frame as id and place of its payload, or None for "more bytes".
@@ -283,6 +290,8 @@ class Framer:
         magic number has no such place: everything is dropped.
         """
         magic = self._header.magic
+        if self._large is not None:
+            self._buffer, self._start, self._large = self.pending, 0, None
         begin = self._start
         found = bytes(self._buffer).find(magic, begin + 1) if magic else -1
         if found < 0:
@@ -321,7 +330,8 @@ class Framer:
         begun = self._buffer[self._start :]
         in_place = isinstance(begun, memoryview) and begun.obj is self._store.obj
         if len(self._store) < size:
-            self._store, in_place = memoryview(bytearray(size)), False
+            self._window = self._store = memoryview(bytearray(size))
+            in_place = False
         if not in_place or self._start:
             self._store[: len(begun)] = begun
         self._large, self._filled = self._store[:size], len(begun)

@@ -27,6 +27,7 @@ from smartcam import (
 )
 from smartcam.connection import Chunk
 from smartcam.protocols import messages as m
+from smartcam.streams import BatchSubscription
 
 if TYPE_CHECKING:
     from camera_by_hand import HandmadeCamera
@@ -357,6 +358,8 @@ ACTIONS = st.sampled_from(
         "cancel",
         "result",
         "garbage",
+        "burst",
+        "mixed burst",
         "wrong application",
         "switch",
         "listen",
@@ -364,7 +367,7 @@ ACTIONS = st.sampled_from(
         "read",
     ]
 )
-GOOD, GARBAGE = struct.pack("<i", 5), b"?"
+GOOD, GARBAGE, WRONG = struct.pack("<i", 5), b"?", struct.pack("<i", 6)
 
 
 class Story:
@@ -409,23 +412,37 @@ class Story:
         self.owed = True
 
     async def _result(self) -> None:
-        self._comes(GOOD, "streamed")
+        self._come(GOOD)
 
     async def _garbage(self) -> None:
-        self._comes(GARBAGE, "uninterpretable")
+        self._come(GARBAGE)
 
-    def _comes(self, data: bytes, fate: str) -> None:
-        self.box.send(self.box.result_frame(data))
-        if self.owed:
-            fate = "late"
-        elif not self.streams:
-            fate = "unclaimed"
-        self.fates[fate] += 1
-        self.owed = False
+    async def _burst(self) -> None:
+        self._come(GOOD, GOOD, GOOD)
+
+    async def _mixed_burst(self) -> None:
+        self._come(GOOD, GOOD, GARBAGE, WRONG, GOOD, GOOD)
 
     async def _wrong_application(self) -> None:
-        self.box.send(self.box.result_frame(GOOD, application=99))
-        self.fates["wrong_application"] += 1
+        self._come(WRONG)
+
+    def _come(self, *containers: bytes) -> None:
+        """Send containers in one write."""
+        frames: list[bytes] = []
+        for data in containers:
+            frames.append(self.box.result_frame(data, 99 if data is WRONG else None))
+            self.fates[self._fate(data)] += 1
+        self.box.send(b"".join(frames))
+
+    def _fate(self, data: bytes) -> str:
+        if data is WRONG:
+            return "wrong_application"
+        if self.owed:
+            self.owed = False
+            return "late"
+        if not self.streams:
+            return "unclaimed"
+        return "streamed" if data is GOOD else "uninterpretable"
 
     async def _switch(self) -> None:
         await self.camera.switch_application(3 if self.box.active == 7 else 7)
@@ -434,6 +451,7 @@ class Story:
     async def _listen(self) -> None:
         self.streams.append(self.camera.results(max_queue=2))
         self.streams.append(self.camera.results(min_interval=60))
+        self.streams.append(self.camera.results(max_queue=4, batch=True))
 
     async def _ignore(self) -> None:
         for stream in self.streams:
@@ -442,9 +460,11 @@ class Story:
 
     async def _read(self) -> None:
         for stream in self.streams:
+            batch = isinstance(stream, BatchSubscription)
             if stream.statistics().queued:
                 try:
-                    assert isinstance(await anext(stream), Result)
+                    taken = await anext(stream)
+                    assert {type(one) for one in (taken if batch else [taken])} == {Result}
                 except InterpretationError as error:
                     assert error.field == "n"  # noqa: PT017 - either may be queued
 

@@ -1,33 +1,46 @@
 """Target ``framing``: any bytes in any chunks, against a plain model of what frames are in them.
 
-Input: header, limit, kind of buffer, number of chunk sizes, the sizes, then the stream.
+Input: header, limit, kind of buffer, number of chunk sizes, the sizes, then the stream. The last
+kind is a transport that writes into the framer's own buffer. Buffers are small, so that an input
+fills them.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+from unittest import mock
 
 from fuzz_input import Choices
 from machines import DIALECTS
 
 from smartcam.exceptions import FrameError
+from smartcam.protocols import framing
 from smartcam.protocols.framing import Frame, Framer, HeaderLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-__all__ = ["HEADERS", "check"]
+    from smartcam.protocols.machine import Machine
+
+__all__ = ["HEADERS", "check", "write"]
 
 HEADERS = (
     *(dialect.header for dialect in DIALECTS),
     # a magic number that overlaps itself, and a length that counts the header
     HeaderLayout(magic=b"\x50\x50\x53", code="H", order="id, length", length_includes=7),
 )
-KINDS = (bytes, bytearray, memoryview)
+KINDS = (bytes, bytearray, memoryview, None)
+MOST_READ = 128
 
 
 def check(data: bytes) -> None:
     """Cut a stream into frames by chunks and compare with what :func:`expected` finds in it."""
+    with mock.patch.multiple(framing, LARGE=32, FIRST_READ=16, MOST_READ=MOST_READ):
+        check_framer(data)
+
+
+def check_framer(data: bytes) -> None:
+    """As :func:`check`."""
     choices = Choices(data)
     header, limit, kind = choices.pick(HEADERS), choices.byte(), choices.pick(KINDS)
     sizes = choices.take(choices.byte() % 8)
@@ -37,9 +50,17 @@ def check(data: bytes) -> None:
     framer = Framer(header, limit)
     found: list[Frame] = []
     fed = done = 0
-    for chunk in chunks(stream, sizes):
-        framer.feed(kind(chunk))
-        fed += len(chunk)
+    left = iter(chunks(stream, sizes))
+    chunk = next(left, b"")
+    while chunk:
+        count = len(chunk)
+        if kind is None:
+            count = write(framer, chunk)
+            assert len(framer.room()) <= max(MOST_READ, header.size + limit)
+        else:
+            framer.feed(kind(chunk))
+        fed += count
+        chunk = chunk[count:] or next(left, b"")
         while True:
             try:
                 frame = framer.next_frame()
@@ -70,6 +91,16 @@ def check(data: bytes) -> None:
         assert again.next_frame() == frame
 
 
+def write(taker: Framer | Machine, data: bytes) -> int:
+    """Read as a transport does, over junk; return how many bytes there was room for."""
+    room = taker.room()
+    count = min(len(room), len(data))
+    room[:] = b"\xee" * len(room)
+    room[:count] = data[:count]
+    taker.filled(count)
+    return count
+
+
 def chunks(stream: bytes, sizes: Sequence[int]) -> Iterator[bytes]:
     """Cut ``stream`` into chunks of these sizes, over and over; whole where there are none."""
     if not any(sizes):
@@ -78,7 +109,8 @@ def chunks(stream: bytes, sizes: Sequence[int]) -> Iterator[bytes]:
     at = turn = 0
     while at < len(stream):
         size = sizes[turn % len(sizes)]
-        yield stream[at : at + size]
+        if size:
+            yield stream[at : at + size]
         at, turn = at + size, turn + 1
 
 

@@ -3,19 +3,25 @@
 Input: dialect, role, transport, policy, state and limit; then steps until the bytes end. A step is
 bytes received as they are, a whole frame of a known message with any body, a message that this
 side says, or the peer's end.
+
+Beside it a twin that nobody traces, and into which a transport writes: it may give bursts.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
+from unittest import mock
 
+from fuzz_framing import write
 from fuzz_input import Choices
 from fuzz_wire import check_decoding
 from machines import DIALECTS, EXAMPLES, one_by_one
 
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError, RemoteProtocolError
+from smartcam.protocols import framing
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Dialect, Policy, Role, Transport
 from smartcam.protocols.framing import Frame
@@ -41,6 +47,7 @@ class Link:
     """A machine with everything that went through it."""
 
     machine: Machine
+    twin: Machine
     policy: Policy
     limit: int
     traced: list[tuple[m.Sender, Frame | RemoteProtocolError]]
@@ -74,6 +81,21 @@ class Link:
         assert machine.buffered < (room if machine.transport is Transport.TCP else 1)
         if fresh:
             self.check_end()
+        while data and machine.transport is Transport.TCP:
+            data = data[write(self.twin, data) :]
+        if machine.transport is Transport.UDP:
+            self.twin.receive_data(data)
+        self.check_twin(fresh)
+
+    def check_twin(self, fresh: list[Event]) -> None:
+        """The twin has made the same of it."""
+        machine, twin = self.machine, self.twin
+        assert plain(one_by_one(twin.events())) == plain(fresh)
+        assert (twin.state, twin.buffered) == (machine.state, machine.buffered)
+        counted = dataclasses.replace(twin.counters)
+        if machine.state is State.FAILED:  # nothing is counted behind what broke it
+            counted.bytes_received = machine.counters.bytes_received
+        assert counted == machine.counters
 
     def follow(self) -> None:
         """Take the frames that came through the table of transitions: the machine must agree."""
@@ -123,6 +145,7 @@ class Link:
             assert machine.data_to_send() == []
         else:
             assert machine.data_to_send() == [machine.dialect.encode(message)]
+            self.twin.send(message, answered=answered)
             self.talked = self.talked or bool(self.chunks)
             self.state = TRANSITIONS[self.state, machine.role.sends, type(message)]
             self.looked_at = len(self.traced)
@@ -142,6 +165,8 @@ class Link:
         self.events += fresh
         self.state = self.machine.state
         self.check_end()
+        self.twin.receive_eof()
+        self.check_twin(fresh)
 
     def check_end(self) -> None:
         """An end comes once, last, and agrees with the state."""
@@ -156,6 +181,12 @@ class Link:
 
 def check(data: bytes) -> None:
     """Drive a machine through the steps of ``data``."""
+    with mock.patch.object(framing, "LARGE", 32):
+        check_machine(data)
+
+
+def check_machine(data: bytes) -> None:
+    """As :func:`check`."""
     choices = Choices(data)
     dialect, role, transport = (
         choices.pick(DIALECTS),
@@ -190,8 +221,9 @@ def make(
         policy=policy,
         trace=lambda sender, what: traced.append((sender, what)),
     )
-    machine.state = state
-    return Link(machine, policy or POLICIES[role, transport], limit, traced, state)
+    twin = Machine(dialect, role, transport, max_length=limit, policy=policy)
+    machine.state = twin.state = state
+    return Link(machine, twin, policy or POLICIES[role, transport], limit, traced, state)
 
 
 def answer_to(message: m.Message, answered: bool | None, dialect: Dialect) -> int | None:

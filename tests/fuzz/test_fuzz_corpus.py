@@ -141,7 +141,7 @@ def forget_everything(framer: Framer) -> int:
 MISTAKES: dict[str, tuple[object, str, Any]] = {
     "framing": (Framer, "resync", forget_everything),
     "messages": (Dialect, "surplus", lambda *_: 0),
-    "machine": (Machine, "_wanted", lambda *_: True),
+    "machine": (Machine, "_wanted", lambda *_, **__: True),
     "layout": (Layout, "sequence", lambda *_: None),
     "interpreters": (Localizations, "_check_finite", lambda *_: None),
     "scenario": (scenario_module, "_line", divide_by_zero),

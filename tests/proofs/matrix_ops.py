@@ -157,12 +157,14 @@ async def scout(world: World, name: str) -> list[Heard]:
         begin = await prepare(one, op)
         async with asyncio.timeout(10):
             await op.run(one)
-        end = len(one.ear.frames)
+        asked = len(one.ear.frames)
+        heard = one.ear.frames
         if not op.closes and name != "reboot":
             await one.camera.query_application()  # so that what came last was heard
-            end = len(one.ear.frames) - 2
+            assert (heard[asked].message, heard[-1].message) == ("Query", "QueryAnswer")
+            heard = [*heard[:asked], *heard[asked + 1 : -1]]
         assert one.wrong == [], one.wrong
-        frames = one.ear.frames[begin:end]
+        frames = heard[begin:]
     return [one for one in frames if name != "reboot" or one.message == "Reboot"]
 
 

@@ -10,7 +10,7 @@ from machines import DIALECTS, EXAMPLES, SIXTEEN
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import POLICIES, Dialect, Policy, Role, Transport
+from smartcam.protocols.base import MAX_KNOWN, POLICIES, Dialect, Policy, Role, Transport
 from smartcam.protocols.bvs import HANDBOOK, MESSAGES, THESIS
 from smartcam.protocols.framing import Frame
 
@@ -207,3 +207,29 @@ def test_decode_empty_data_is_empty() -> None:
     assert HANDBOOK.decode(CLIENT, Frame(0x34, b"")) == m.SetInput(data=b"")
     container = HANDBOOK.decode(CAMERA, Frame(0x20, b"\x03\0\0\0"))
     assert container == m.ResultContainer(application=3, data=b"")
+
+
+@each_dialect
+def test_decode_ever_new_bodies_gives_their_messages_and_keeps_a_bounded_number(
+    dialect: Dialect,
+) -> None:
+    fresh = dataclasses.replace(dialect, name="fresh")
+    reports = [m.StatusReport(status=Status(word), endian=1) for word in range(3 * MAX_KNOWN)]
+    for _ in range(2):
+        for report in (*reports, *reports[::-1]):
+            frame = fresh.to_frame(report)
+            assert fresh.decode(CAMERA, frame) == report
+            assert fresh.decode(CAMERA, Frame(frame.message_id, frame.payload + b"more")) == report
+    codec = fresh.encoder(m.StatusReport)
+    assert len(codec._known) == MAX_KNOWN
+    first = fresh.to_frame(reports[0])
+    assert fresh.decode(CAMERA, first) is fresh.decode(CAMERA, first)
+
+
+@each_dialect
+def test_decode_containers_and_unknown_messages_are_not_kept(dialect: Dialect) -> None:
+    fresh = dataclasses.replace(dialect, name="fresh")
+    for message in (m.ResultContainer(application=1, data=b"x"), EXAMPLES[-1]):
+        frame = fresh.to_frame(message)
+        assert fresh.decode(CAMERA, frame) == message
+        assert fresh.decode(CAMERA, frame) is not fresh.decode(CAMERA, frame)

@@ -26,6 +26,7 @@ from smartcam.protocols.machine import (
     LinkEnded,
     LinkFailed,
     Machine,
+    ResultBurst,
     State,
 )
 
@@ -533,3 +534,92 @@ def test_trace_says_nothing_of_what_could_not_be_sent() -> None:
     with pytest.raises(LocalProtocolError):
         made.send(m.Trigger())
     assert seen == []
+
+
+# ---------------------------------------------------------------------- bursts
+
+
+APPLICATION = b"\x15\0\0" + MAGIC[:1]
+"""An id whose first bytes, with the next frame behind them, are read as it."""
+
+
+def result(data: bytes, application: int = 21) -> m.ResultContainer:
+    return m.ResultContainer(application=application, data=data)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS, ids=lambda one: one.name)
+def test_burst_is_of_containers_of_one_application_right_behind_one_another(
+    dialect: Dialect,
+) -> None:
+    said = [*(result(one) for one in (b"a", b"", b"ccc")), STATUS_MESSAGE, result(b"d")]
+    said += [result(b"e", 5), result(b"f", 5), result(b"g")]
+    made = client(dialect)
+    made.receive_data(b"".join(map(dialect.encode, said)) + dialect.encode(said[0])[:-1])
+    assert made.events() == [
+        ResultBurst(application=21, data=[b"a", b"", b"ccc"]),
+        STATUS_MESSAGE,
+        result(b"d"),
+        ResultBurst(application=5, data=[b"e", b"f"]),
+        result(b"g"),
+    ]
+    assert made.counters.frames_received == 1 + len(said)
+    assert made.buffered == len(dialect.encode(said[0])) - 1
+    made.receive_data(dialect.encode(said[0])[-1:])
+    assert made.events() == [result(b"a")]
+
+
+@pytest.mark.parametrize(
+    ("behind", "text"),
+    [
+        (header(105) + APPLICATION + bytes(101), "announces 105 bytes"),
+        (header(3) + APPLICATION[:3], "came with 3 bytes, it needs 4"),
+        (b"PSVX" + header(8)[4:] + APPLICATION, "wrong magic number: 50 53 56 58 came"),
+    ],
+)
+def test_burst_in_front_of_what_breaks_the_protocol_comes_before_the_failure(
+    behind: bytes, text: str
+) -> None:
+    made = client(max_length=104)
+    number = int.from_bytes(APPLICATION, "little")
+    long = result(bytes(100), number)  # as long as may be
+    made.receive_data(HANDBOOK.encode(long) * 2 + behind + HANDBOOK.encode(long))
+    burst, failed = made.events()
+    assert burst == ResultBurst(application=number, data=[bytes(100)] * 2)
+    assert text in str(failure([failed]))
+    assert made.counters.frames_received == 1 + 2 + (text.startswith("came"))
+
+
+def test_burst_ends_at_another_message_of_the_same_application() -> None:
+    made = client()
+    made.send(m.Query())
+    made.receive_data(HANDBOOK.encode(result(b"")) * 2 + QUERY_ANSWER)
+    burst = ResultBurst(application=21, data=[b"", b""])
+    assert made.events() == [burst, m.QueryAnswer(application=21)]
+
+
+def test_burst_pays_for_one_answer_where_containers_were_asked_for() -> None:
+    made = client()
+    request = m.UnknownMessage(message_id=0x20, payload=b"")
+    made.send(request, answered=True)
+    made.receive_data(HANDBOOK.encode(result(b"a")) * 2)
+    made.send(request, answered=True)
+    with pytest.raises(LocalProtocolError, match="still owed"):
+        made.send(request, answered=True)
+
+
+def test_trace_sees_each_container_and_there_is_no_burst() -> None:
+    seen: list[Frame | RemoteProtocolError] = []
+    made = client(trace=lambda sender, frame: seen.append(frame))
+    del seen[:]
+    made.receive_data(HANDBOOK.encode(result(b"a")) * 3)
+    assert made.events() == [result(b"a")] * 3
+    assert seen == [HANDBOOK.to_frame(result(b"a"))] * 3
+
+
+@pytest.mark.parametrize("transport", Transport)
+def test_camera_and_datagrams_give_messages_one_by_one(transport: Transport) -> None:
+    made = camera(transport=transport)
+    frames = [TRIGGER, TRIGGER] if transport is UDP else [TRIGGER * 2]
+    for one in frames:
+        made.receive_data(one)
+    assert made.events() == [m.Trigger(), m.Trigger()]

@@ -1,0 +1,39 @@
+"""What the canned cameras have in common: blocking sockets, a thread for each client."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from typing import TYPE_CHECKING
+
+from benchmarks.peers import wire
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["frames", "listen"]
+
+
+def listen(serve: Callable[[socket.socket], None]) -> None:
+    """Print the port; give each client to ``serve`` in a thread of its own."""
+    server = socket.create_server(("127.0.0.1", 0), backlog=64)
+    print(server.getsockname()[1], flush=True)
+    while True:
+        client, _ = server.accept()
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        threading.Thread(target=serve, args=(client,), daemon=True).start()
+
+
+def frames(client: socket.socket) -> Iterator[tuple[int, bytes]]:
+    """Give message id and body of each frame until the client goes."""
+    buffer = b""
+    while data := client.recv(4096):
+        buffer += data
+        while len(buffer) >= wire.HEADER.size:
+            _, length, message_id = wire.HEADER.unpack_from(buffer)
+            end = wire.HEADER.size + length
+            if len(buffer) < end:
+                break
+            body, buffer = buffer[wire.HEADER.size : end], buffer[end:]
+            yield message_id, body
+    client.close()

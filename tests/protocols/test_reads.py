@@ -1,0 +1,300 @@
+"""Bytes that a transport writes where it is told: whatever it reads, it is as if they were fed.
+
+Most tests make buffers small: where frames are large, where reads begin and where they end to grow
+then lie within what Hypothesis tries. What is written is read over junk, so whatever still looks
+into the transport's memory after its time sees that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
+from unittest import mock
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from machines import DIALECTS, client, one_by_one
+
+from smartcam.exceptions import FrameError, MessageError
+from smartcam.protocols import framing
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import Policy
+from smartcam.protocols.bvs import HANDBOOK, THESIS
+from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer
+from smartcam.protocols.machine import LinkFailed, ResultBurst, State
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framing import HeaderLayout
+    from smartcam.protocols.machine import Machine
+
+LARGE, FIRST_READ, MOST_READ = 32, 32, 128
+SIZES = st.one_of(
+    st.integers(0, 40),
+    st.integers(0, 300),
+    *(st.integers(size - 16, size + 2) for size in (LARGE, 2 * FIRST_READ, MOST_READ)),
+)
+LIMITS = st.sampled_from([0, 24, LARGE, 100, MOST_READ, 300])
+CLEAR = 0
+"""Drop everything kept, instead of a read of no bytes."""
+READS = st.lists(
+    st.one_of(st.integers(1, 9), st.integers(1, 300), st.just(1 << 20)), min_size=1, max_size=6
+)
+PATTERN = bytes(range(1, 252)) * 8_400
+
+each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=lambda one: one.name)
+
+
+@contextlib.contextmanager
+def small_buffers() -> Iterator[None]:
+    with mock.patch.multiple(framing, LARGE=LARGE, FIRST_READ=FIRST_READ, MOST_READ=MOST_READ):
+        yield
+
+
+def payload(size: int) -> bytes:
+    """Return bytes that tell their place, and are no magic number."""
+    return PATTERN[size % 7 :][:size]
+
+
+def read_into(taker: Framer | Machine, data: bytes, most: int) -> int:
+    """Read as a transport does; return how many of the bytes it took."""
+    room = taker.room()
+    count = min(most, len(room), len(data))
+    assert room
+    room[:] = b"\xee" * len(room)
+    room[:count] = data[:count]
+    taker.filled(count)
+    return count
+
+
+# ---------------------------------------------------------------------- the framer
+
+
+def streams(header: HeaderLayout, limit: int) -> st.SearchStrategy[bytes]:
+    """Frames of any size, and now and then what makes none."""
+    ids = st.integers(0, 0x50)
+    frame = st.builds(
+        lambda number, size: header.pack(number, size) + payload(size), ids, SIZES.map(int)
+    )
+    too_long = st.builds(header.pack, ids, st.integers(limit + 1, min(header.max_payload, 9999)))
+    wrong = st.one_of(
+        too_long,
+        st.builds(header.pack, ids, st.integers(-header.length_includes, 0)),
+        st.builds(lambda data, end: data[:end], frame, st.integers(0, 60)),
+        st.binary(max_size=60),
+    )
+    pieces = st.one_of(frame, frame, frame, wrong)
+    return st.lists(pieces, max_size=8).map(b"".join)
+
+
+def taken(framer: Framer) -> list[Any]:
+    """Return everything that comes: frames, and what an error tells and how many bytes it costs."""
+    found: list[Any] = []
+    while True:
+        try:
+            frame = framer.next_frame()
+        except FrameError as error:
+            what = (str(error), error.offset, error.data, framer.pending)
+            found += [what, framer.resync()]
+        else:
+            if frame is None:
+                return found
+            found.append(frame)
+
+
+@each_dialect
+@given(data=st.data(), limit=LIMITS, reads=READS)
+def test_written_bytes_give_the_frames_and_errors_of_fed_ones(
+    dialect: Dialect, limit: int, reads: list[int], data: st.DataObject
+) -> None:
+    header = dialect.header
+    stream = data.draw(streams(header, limit))
+    turns = cycle(data.draw(st.permutations([*reads, *data.draw(st.sampled_from([[], [CLEAR]]))])))
+    most_kept = max(MOST_READ, header.size + limit)
+    with small_buffers():
+        written, fed = Framer(header, limit), Framer(header, limit)
+        all_written: list[Any] = []
+        all_fed: list[Any] = []
+        while stream:
+            size = next(turns)
+            if size == CLEAR:
+                written.clear()
+                fed.clear()
+                size = next(turns)
+            count = read_into(written, stream, size)
+            fed.feed(stream[:count])
+            stream = stream[count:]
+            all_written += taken(written)
+            all_fed += taken(fed)
+            assert all_written == all_fed
+            assert (written.buffered, written.pending) == (fed.buffered, fed.pending)
+            assert written.buffered <= header.size + limit
+            assert len(written._store) <= most_kept
+            assert len(written._buffer) <= most_kept + LARGE
+    for one in all_written:
+        assert not isinstance(one, Frame) or type(one.payload) is bytes
+
+
+@pytest.mark.parametrize("most", [1460, 1 << 16, 1 << 30])
+@pytest.mark.parametrize("dialect", [HANDBOOK, THESIS], ids=lambda one: one.name)
+def test_written_frames_around_every_limit_come_out_whole(dialect: Dialect, most: int) -> None:
+    limits = (framing.LARGE, framing.MOST_READ, DEFAULT_MAX_LENGTH - 1)
+    sizes = [size + more for size in limits for more in (-13, -12, -1, 0, 1)]
+    sizes += [8] * 2000
+    frames = [Frame(0x20, payload(size)) for size in sizes]
+    frames += reversed(frames)
+    stream = b"".join(map(dialect.encode_frame, frames))
+    framer, found, at = Framer(dialect.header), list[Frame](), 0
+    while at < len(stream):
+        at += read_into(framer, stream[at : at + framing.DEFAULT_MAX_LENGTH + 99], most)
+        found += iter(framer.next_frame, None)
+    assert found == frames
+    assert framer.buffered == 0
+    assert len(framer.room()) <= dialect.header.size + DEFAULT_MAX_LENGTH
+
+
+@each_dialect
+@pytest.mark.parametrize("size", [framing.LARGE - 1, framing.LARGE])
+def test_written_large_frame_is_not_copied_and_small_ones_are_at_once(
+    dialect: Dialect, size: int
+) -> None:
+    framer = Framer(dialect.header)
+    for _ in range(2):  # the second read has room for the whole frame
+        read_into(framer, dialect.encode_frame(Frame(0x20, payload(size)))[:4096], 1 << 30)
+        assert type(framer.buffer) is (memoryview if size == framing.LARGE else bytes)
+        assert framer.next_frame() is None
+        framer.clear()
+
+
+def test_written_reads_grow_while_they_are_filled_and_stop() -> None:
+    framer, stream, rooms = Framer(HANDBOOK.header), HANDBOOK.encode(m.Connect()) * 99_999, []
+    while stream:
+        rooms.append(len(framer.room()))
+        stream = stream[read_into(framer, stream, 1 << 30) :]
+        assert taken(framer)
+    doublings = (framing.MOST_READ // framing.FIRST_READ).bit_length()
+    growing = [framing.FIRST_READ << turn for turn in range(doublings)]
+    assert rooms[:doublings] == growing
+    assert {*rooms[doublings:]} == {framing.MOST_READ}
+    read_into(framer, b"P", 1)
+    assert len(framer.room()) == framing.MOST_READ
+
+
+def test_written_reads_never_keep_more_than_the_longest() -> None:
+    limit = framing.MOST_READ - 1000  # a frame leaves that much room, which a read may fill
+    framer = Framer(HANDBOOK.header, limit)
+    stream = HANDBOOK.encode_frame(Frame(0x20, payload(limit)))
+    stream += HANDBOOK.encode(m.Connect()) * limit
+    while stream:
+        stream = stream[read_into(framer, stream, 1 << 30) :]
+        taken(framer)
+        assert len(framer.room()) <= len(framer._store) <= framing.MOST_READ
+
+
+@pytest.mark.parametrize("write", [True, False], ids=["written", "fed"])
+@pytest.mark.parametrize("drop", ["clear", "resync"])
+def test_unfinished_large_frame_is_dropped_and_the_next_comes(drop: str, write: bool) -> None:
+    """Resync looks for a magic number in what is there of it, as in any unfinished frame."""
+    begun = HANDBOOK.header.pack(0x20, 9000) + payload(4000)
+    whole = HANDBOOK.encode(m.QueryAnswer(application=21))
+    framer = Framer(HANDBOOK.header)
+    for data in (begun, whole[:5]):
+        if write:
+            assert read_into(framer, data, len(data)) == len(data)
+        else:
+            framer.feed(data)
+        assert framer.next_frame() is None
+    assert framer.buffered == len(begun) + 5
+    if drop == "clear":
+        framer.clear()
+        framer.feed(whole[:5])
+    else:
+        assert framer.resync() == len(begun)
+    assert framer.pending == whole[:5]
+    framer.feed(whole[5:])
+    assert framer.next_frame() == HANDBOOK.to_frame(m.QueryAnswer(application=21))
+
+
+# ---------------------------------------------------------------------- the machine
+
+
+def words(dialect: Dialect, limit: int) -> st.SearchStrategy[bytes]:
+    """What a camera that runs free says: results of two applications, other things in between."""
+
+    def framed(message_id: int, body: bytes) -> bytes:
+        return dialect.header.pack(message_id, len(body)) + body
+
+    size = dialect.encoder(m.ResultContainer).size
+    last = framed(0x20, b"")[:1]  # what of the next frame stands behind a body that is too short
+    words = [bytes([number]).ljust(size - 1, b"\0") + last for number in (5, 5, 5, 6)]
+    word = st.sampled_from(words)
+    results = st.builds(
+        lambda word, count: framed(0x20, word + payload(count)),
+        word,
+        SIZES.map(lambda count: count % (limit - size + 1)),
+    )
+    other = st.one_of(
+        st.builds(
+            lambda number, word, more: framed(number, word + more),
+            st.sampled_from([0x01, 0x12, 0x30, 0x77]),  # in every state, asked for or not
+            word,
+            st.binary(min_size=4, max_size=9),
+        ),
+        st.builds(lambda word, end: framed(0x20, word[:end]), word, st.integers(0, size)),
+        st.builds(
+            lambda word, more: framed(0x20, word + payload(more)), word, st.integers(limit, 320)
+        ),
+        results.map(lambda frame: b"?" + frame[1:]),
+    )
+    runs = st.lists(results, min_size=1, max_size=6).map(b"".join)
+    return st.lists(st.one_of(runs, runs, other), max_size=6).map(b"".join)
+
+
+def outcome(made: Machine, events: list[Any]) -> tuple[Any, ...]:
+    """Return all that must not depend on how bytes came; an error's text and bytes may."""
+    plain = [type(one.error) if isinstance(one, LinkFailed) else one for one in events]
+    counters = dataclasses.replace(made.counters)
+    if made.state is State.FAILED:
+        counters.bytes_received = 0  # none is counted after the failure
+    return plain, made.state, made.buffered, counters
+
+
+@each_dialect
+@given(data=st.data(), limit=st.sampled_from([24, 100, 300]), reads=READS, strict=st.booleans())
+def test_bursts_are_the_containers_that_come_one_by_one(
+    dialect: Dialect, limit: int, reads: list[int], strict: bool, data: st.DataObject
+) -> None:
+    stream = data.draw(words(dialect, limit))
+    # where frames that are broken are dropped, nothing else may be: how often depends on the cuts
+    fatal = (FrameError, MessageError) if strict else (FrameError,)
+    options: Any = {"max_length": limit, "policy": Policy(fatal=fatal, exact_length=False)}
+    traced: list[Any] = []
+    with small_buffers():
+        alone, fed, written = (client(dialect, **options) for _ in range(3))
+        looked_at = client(dialect, trace=lambda *what: traced.append(what), **options)
+        traced.clear()
+        events: list[list[Any]] = [[], [], [], []]
+        for place in range(len(stream)):
+            alone.receive_data(stream[place : place + 1])
+            events[0] += alone.events()
+        assert not any(isinstance(one, ResultBurst) for one in events[0])
+        turns, at = cycle(reads), 0
+        while at < len(stream):
+            count = read_into(written, stream[at:], next(turns))
+            fed.receive_data(stream[at : at + count])
+            looked_at.receive_data(stream[at : at + count])
+            at += count
+            for made, seen in zip((fed, written, looked_at), events[1:], strict=True):
+                seen += made.events()
+    expected = outcome(alone, events[0])
+    assert outcome(fed, one_by_one(events[1])) == expected
+    assert outcome(written, one_by_one(events[2])) == expected
+    assert outcome(looked_at, events[3]) == expected  # not a burst among them
+    frames = [what for _, what in traced if isinstance(what, Frame)]
+    assert len(frames) == looked_at.counters.frames_received - 1  # and the answer to Connect
+    assert stream.startswith(b"".join(map(dialect.encode_frame, frames)))
