@@ -40,8 +40,9 @@ FIRST_READ = 1 << 12
 """Bytes that one read takes at most, at first. It doubles each time that a read took so many."""
 
 MOST_READ = 1 << 15
-"""Bytes that one read takes at most in the end, where frames are not large. What so many bytes hold
-of results of 16 bytes or more fits into a subscriber's queue, so one that keeps up loses nothing."""
+"""Bytes that one read takes at most in the end; right after a large frame as many as that had. So
+many bytes of results fit into a subscriber's queue where each has 16 bytes or more: then one that
+keeps up loses nothing."""
 
 
 class Frame(NamedTuple):
