@@ -171,11 +171,15 @@ class Framer:
             self._window = self._store = memoryview(bytearray(FIRST_READ))
         return self._window
 
-    def filled(self, count: int) -> None:
-        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`feed`."""
+    def filled(self, count: int) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`feed`.
+
+        Returns:
+            False where a large frame goes on, so that there is nothing to cut yet.
+        """
         if self._large is not None:
             self._fill(count)
-            return
+            return self._large is None
         data = self._window[:count]
         if count == len(self._window) < MOST_READ:
             self._window = self._store = memoryview(bytearray(min(2 * count, MOST_READ)))
@@ -188,6 +192,7 @@ class Framer:
             self._buffer, self._start = bytes(data), 0
             if len(self._window) > MOST_READ:
                 self._window = self._store[:MOST_READ]
+        return True
 
     def cut(self) -> tuple[int, int, int] | None:
         """Return the next whole frame as id and place of its payload, or None for "more bytes".

@@ -253,8 +253,8 @@ class Machine:
         if self._deaf:
             return
         self.counters.bytes_received += count
-        self._framer.filled(count)
-        self._receive_frames()
+        if self._framer.filled(count):
+            self._receive_frames()
 
     def receive_eof(self) -> None:
         """The peer will send no more; call :meth:`events` next."""
