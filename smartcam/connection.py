@@ -252,7 +252,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """asyncio: bytes of a TCP link."""
         self.heard_at = self._loop.time()
         self.machine.filled(nbytes)
-        self._enqueue()
+        self._hand_on()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""
@@ -261,12 +261,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self.machine.counters.ignored_frames += 1
             return
         self.machine.receive_data(data)
-        self._enqueue()
+        self._hand_on()
 
     def eof_received(self) -> None:
         """asyncio: the camera will send no more."""
         self.machine.receive_eof()
-        self._enqueue()
+        self._hand_on()
         self._lose(ConnectionResetError("the camera closed the connection"))
 
     def error_received(self, exc: Exception) -> None:
@@ -305,7 +305,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self.machine.send(Disconnect())
             self._flush()
 
-    def _enqueue(self) -> None:
+    def _hand_on(self) -> None:
         events = self.machine.events()
         if not events or self._closing:
             return

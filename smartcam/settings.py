@@ -68,6 +68,9 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         raise ConfigurationError(f"camera address {url!r}: {exc}") from exc
     if not parts.hostname:
         raise ConfigurationError(f"camera address {url!r} has no host")
+    # urlsplit lets some pass, and which ones differs from Python to Python
+    if "[" in parts.hostname or "]" in parts.hostname or parts.netloc.rfind("[") > 0:
+        raise ConfigurationError(f"camera address {url!r} has a bracket inside its host")
     if port == 0:
         raise ConfigurationError(f"camera address {url!r}: port 0 is no camera's port")
     surplus = [

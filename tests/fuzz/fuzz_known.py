@@ -55,12 +55,6 @@ KNOWN = (
         r"LayoutError: layout: expected at most 20000 characters",
         "a text that is accepted prints as one that is not: no copy, no pickle, no file",
     ),
-    Known(
-        "host-with-a-bracket",
-        "address",
-        r"AssertionError: prints as .*\[",
-        "a bracket in the middle of a host is accepted, and the address prints as none",
-    ),
 )
 
 
