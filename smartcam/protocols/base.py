@@ -119,8 +119,8 @@ class Codec:
     def __init__(self, row: MessageRow, word: str, header_size: int) -> None:
         fields = wire_fields(row.type)
         codes = {Wire.WORD: word, Wire.UINT32: "I"}
-        self.type = row.type
-        self.message_id = row.message_id
+        self.type: type[Message] = row.type
+        self.message_id: int = row.message_id
         self._header_size = header_size
         self._fields = tuple(name for name, wire in fields if wire is not Wire.DATA)
         self._data = next((name for name, wire in fields if wire is Wire.DATA), None)
