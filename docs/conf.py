@@ -38,7 +38,7 @@ project = "smartcam"
 version = release = smartcam.__version__
 copyright = "the smartcam maintainers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["benchmarks/*", "_build"]
 html_theme = "furo"
 html_title = f"smartcam {release}"
 myst_heading_anchors = 4
