@@ -251,8 +251,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         """asyncio: bytes of a TCP link."""
         self.heard_at = self._loop.time()
-        self.machine.filled(nbytes)
-        self._hand_on()
+        if self.machine.filled(nbytes):
+            self._hand_on()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""

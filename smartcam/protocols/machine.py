@@ -248,13 +248,19 @@ class Machine:
         """Return where a stream's next bytes may be written; call :meth:`filled` next."""
         return self._framer.room()
 
-    def filled(self, count: int) -> None:
-        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`."""
+    def filled(self, count: int) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
+
+        Returns:
+            False where a large frame goes on, so that there are no events yet.
+        """
         if self._deaf:
-            return
+            return False
         self.counters.bytes_received += count
-        if self._framer.filled(count):
+        cut = self._framer.filled(count)
+        if cut:
             self._receive_frames()
+        return cut
 
     def receive_eof(self) -> None:
         """The peer will send no more; call :meth:`events` next."""
