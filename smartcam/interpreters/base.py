@@ -271,8 +271,12 @@ class PlainInterpreter(Interpreter):
     """
 
     def __init_subclass__(cls) -> None:
-        """A class with a :meth:`read` of its own does not inherit another's :meth:`read_all`."""
-        if "read" in vars(cls) and "read_all" not in vars(cls):
+        """A class whose :meth:`read` is newer than its :meth:`read_all` does not inherit that."""
+        read, read_all = (
+            next(place for place, base in enumerate(cls.__mro__) if name in vars(base))
+            for name in ("read", "read_all")
+        )
+        if read < read_all:
             cls.read_all = PlainInterpreter.read_all  # type: ignore[method-assign]
 
     @abstractmethod

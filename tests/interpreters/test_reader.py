@@ -196,7 +196,14 @@ def test_table_that_is_read_otherwise_is_read_so_in_bursts() -> None:
         def read(self, data: bytes, context: Context) -> Any:
             return len(super().read(data, context))
 
+    class Fixed:
+        def read(self, data: bytes, context: Context) -> int:
+            return 7
+
+    class Mixed(Fixed, Table): ...  # type: ignore[misc]
+
     layout = Layout("(a: int16)*")
+    assert Mixed(layout).read_all([bytes(4), bytes(6)], Context()) == [7, 7]
     assert Count(layout).read_all([bytes(4), bytes(6)], Context()) == [2, 3]
     tables = Table(layout).read_all([bytes(4), b"", b"\1\0"], Context())
     assert [table.tolist() for table in tables] == [[(0,), (0,)], [], [(1,)]]
