@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from smartcam.models import (
         ApplicationChanged,
         CameraEvent,
+        Capabilities,
         Connected,
         Disconnected,
         Header,
@@ -72,6 +73,7 @@ __all__ = [
     "CameraBusyError",
     "CameraEvent",
     "CameraFaultError",
+    "Capabilities",
     "CommandRejectedError",
     "ConfigurationError",
     "ConnectFailedError",

@@ -18,18 +18,16 @@ from smartcam.exceptions import (
     ConnectionClosedError,
     InterpretationError,
     LocalProtocolError,
-    RemoteProtocolError,
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
 )
 from smartcam.inbox import Inbox
 from smartcam.interpretation import Interpretation
-from smartcam.models import CameraEvent, Result, Statistics, Status
+from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status
 from smartcam.observers import Observer, Observers
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
-from smartcam.protocols.framing import Frame
 from smartcam.settings import CameraOptions, CameraSettings
 from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 from smartcam.supervisor import Supervisor
@@ -40,7 +38,6 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Literal, Self, Unpack
 
-    from smartcam.protocols.base import Dialect
 
 __all__ = ["SmartCamera", "connect"]
 
@@ -215,6 +212,18 @@ class SmartCamera:
         session = self._supervisor.session
         return session.version if session is not None else None
 
+    @property
+    def capabilities(self) -> Capabilities:
+        """What the camera can do in the dialect that it speaks.
+
+        Raises:
+            ConnectionClosedError: there was no session yet, so the dialect is not known.
+        """
+        session = self._supervisor.session
+        if session is None:
+            raise self._supervisor.closed_error()
+        return session.dialect.capabilities
+
     def statistics(self) -> Statistics:
         """Return everything counted so far, over all sessions. The accounts balance at any time."""
         streams = self._inbox.streams()
@@ -310,6 +319,7 @@ class SmartCamera:
         """
         self._talk.require_link()
         deadline = self._talk.deadline(timeout)
+        await self._fresh_status(deadline)
         return await self._talk.until(predicate, deadline, "the status wanted", insist=False)
 
     async def wait_ready(self, timeout: float = 10.0) -> Status:
@@ -321,6 +331,7 @@ class SmartCamera:
         Cancellation: safe.
         """
         self._talk.require_link()
+        await self._fresh_status(self._talk.deadline(timeout))
         predicate = is_ready if self._talk.wants_running else _is_not_busy
         return await self._talk.until(
             predicate, self._talk.deadline(timeout), "the camera to be ready"
@@ -460,7 +471,9 @@ class SmartCamera:
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
 
-    async def switch_application(self, application: int, *, timeout: float | None = None) -> None:
+    async def switch_application(
+        self, application: int | str, *, timeout: float | None = None
+    ) -> None:
         """Load another application; returns when the camera is ready for it.
 
         A running application is stopped first (the camera demands it) and the new one started.
@@ -468,10 +481,11 @@ class SmartCamera:
         runs again, if it ran, before the error is raised.
 
         Args:
-            application: its id.
+            application: its id, or the name of its file where the camera can load by that.
             timeout: seconds for the whole; default ``switch_timeout``.
 
         Raises:
+            UnsupportedError: a name, to a camera that knows ids only.
             CommandRejectedError: unknown id, or 0; tells the id that is active.
             ResponseTimeoutError: the camera did not answer, or stayed BUSY.
 
@@ -504,6 +518,7 @@ class SmartCamera:
         """Enter run mode; returns when the camera reports Running and is not BUSY.
 
         Raises:
+            UnsupportedError: the camera always runs (``bid``).
             ResponseTimeoutError: it did not within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
@@ -517,6 +532,7 @@ class SmartCamera:
         An inspection under way is voided (inferred).
 
         Raises:
+            UnsupportedError: the camera always runs (``bid``).
             ResponseTimeoutError: it did not within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
@@ -536,6 +552,54 @@ class SmartCamera:
         limit = self.settings.request_timeout if timeout is None else timeout
         return await self._talk.query(self._talk.deadline(limit))
 
+    async def query_status(self, *, timeout: float | None = None) -> Status:
+        """Ask the camera for its status.
+
+        Raises:
+            UnsupportedError: the camera cannot be asked; its status comes by itself.
+            ResponseTimeoutError: no answer; the link is given up.
+
+        Cancellation: safe.
+        """
+        limit = self.settings.request_timeout if timeout is None else timeout
+        self._talk.require(m.GetStatus)
+        await self._talk.refresh_status(self._talk.deadline(limit))
+        return self._talk.status
+
+    async def reset_errors(self, *, timeout: float | None = None) -> Status:
+        """Clear the error bits that stay set until then; return the status after it.
+
+        :meth:`trigger` does so by itself where a Trigger Error of before would hide its own.
+
+        Raises:
+            UnsupportedError: the camera's bits fall by themselves.
+            ResponseTimeoutError: no answer; the link is given up.
+
+        Cancellation: safe; the command may have been sent.
+        Source: BVS ID guide p. 227 (published).
+        """
+        limit = self.settings.request_timeout if timeout is None else timeout
+        deadline = self._talk.deadline(limit)
+        await self._talk.command(m.ResetErrors(), deadline)
+        await self._talk.refresh_status(deadline)
+        return self._talk.status
+
+    async def read_image(self, *, timeout: float | None = None) -> bytes:
+        """Return the last picture, as a file's bytes.
+
+        Raises:
+            UnsupportedError: the protocol has no message for it, as BVS.
+            CommandRejectedError: the camera refused.
+            ResponseTimeoutError: no answer; the link is given up.
+
+        Cancellation: safe; the answer is dropped when it comes.
+        """
+        limit = self.settings.request_timeout if timeout is None else timeout
+        self._talk.require(m.ReadImage)
+        image = await self._talk.ask(m.ReadImage(), m.Image, self._talk.deadline(limit))
+        self._talk.check(m.ReadImage, image)
+        return image.data
+
     async def get_clock(self, *, timeout: float | None = None) -> datetime:
         """Return the camera's clock: a naive datetime, since it carries no time zone.
 
@@ -547,6 +611,7 @@ class SmartCamera:
         """
         limit = self.settings.request_timeout if timeout is None else timeout
         clock = await self._talk.ask(m.GetClock(), m.ClockAnswer, self._talk.deadline(limit))
+        self._talk.check(m.GetClock, clock)
         fields = (clock.year, clock.month, clock.day, clock.hour, clock.minute, clock.second)
         try:
             return datetime(*fields)  # noqa: DTZ001 - the camera's clock has no zone
@@ -559,7 +624,10 @@ class SmartCamera:
             ) from exc
 
     async def set_clock(self, when: datetime) -> None:
-        """Set the camera's clock to the fields of ``when``; nothing confirms it.
+        """Set the camera's clock to the fields of ``when``; only result codes confirm it.
+
+        Raises:
+            CommandRejectedError: the camera refused.
 
         Source: mvBlueGEMINI manual p. 29 (published, sibling): invalid values may be dropped.
         """
@@ -575,7 +643,7 @@ class SmartCamera:
         )
 
     async def set_input(self, data: bytes) -> None:
-        """Send input data for the next inspection; nothing confirms it.
+        """Send input data for the next inspection; only result codes confirm it.
 
         ``trigger(input=...)`` binds data to its own trigger. The camera queues containers against
         inspections; the Input Container bit says when they are out of step.
@@ -590,6 +658,7 @@ class SmartCamera:
         would take this number: then leave the numbers to :meth:`trigger`.
 
         Raises:
+            UnsupportedError: the dialect has no such request (``bid``).
             LocalProtocolError: the number does not fit.
         """
         await self._tell(m.SetSequenceNumber(number=number))
@@ -601,9 +670,13 @@ class SmartCamera:
         The camera is away for about 30 seconds then (published for a sibling) and comes back with
         the last application, stopped. :meth:`wait_connected` waits for it.
 
+        Raises:
+            UnsupportedError: the dialect has no such request (``bid``).
+
         Cancellation: the command may have been sent.
         """
         link = self._talk.require_link()
+        self._talk.require(m.Reboot)
         self._supervisor.restarts(link)
         await self._tell(m.Reboot())
         if link.machine.transport is Transport.TCP:
@@ -614,7 +687,7 @@ class SmartCamera:
 
     async def request(
         self,
-        message_id: int,
+        message_id: int | str,
         payload: bytes = b"",
         *,
         answered: bool | None = None,
@@ -623,7 +696,7 @@ class SmartCamera:
         """Send any message; the escape hatch for what has no method here.
 
         Args:
-            message_id: its id.
+            message_id: its id; a command's text where the protocol has commands.
             payload: its body.
             answered: whether to wait for an answer under the same id; by default what the message
                 table says, True for an unknown id.
@@ -634,34 +707,34 @@ class SmartCamera:
 
         Raises:
             LocalProtocolError: Connect and Disconnect (sessions are the client's own).
+            UnsupportedError: an id of another kind than the protocol's.
             ResponseTimeoutError: no answer; the link is given up.
 
         Cancellation: safe; the answer is dropped when it comes.
         """
-        dialect = self._talk.require_link().machine.dialect
-        known = dialect.message_type(m.Sender.CLIENT, message_id)
-        if known in {m.Connect, m.Disconnect}:
-            raise LocalProtocolError(f"{self.name}: the session is the client's own")
-        message = _as_named(dialect, Frame(message_id, bytes(payload)))
-        documented = dialect.answer_id(message_id) is not None
-        answer = dialect.message_type(m.Sender.CAMERA, message_id)
-        key = message_id if answer is m.UnknownMessage else answer
+        dialect = self._talk.dialect
+        raw = dialect.raw_request(message_id, bytes(payload))
         deadline = self._talk.deadline(
             self.settings.request_timeout if timeout is None else timeout
         )
-        if documented if answered is None else answered:
-            return dialect.to_frame(await self._talk.exchange(message, key, deadline)).payload
-        if documented and known is not m.UnknownMessage:
+        if raw.answered if answered is None else answered:
+            return dialect.body(await self._talk.exchange(raw.message, raw.answer, deadline))
+        if raw.answered and raw.known:
             # answered it is nevertheless, and that must not pass for the next one's answer
-            await self._talk.post(message, key, deadline)
+            await self._talk.post(raw.message, raw.answer, deadline)
         else:
-            await self._talk.tell(message, deadline, answered=False)
+            await self._talk.tell(raw.message, deadline, answered=False)
         return None
 
     # ------------------------------------------------------------------ small helpers
 
-    async def _tell(self, message: m.Message) -> None:
-        await self._talk.tell(message, self._talk.deadline(self.settings.request_timeout))
+    async def _tell(self, message: m.Request) -> None:
+        await self._talk.command(message, self._talk.deadline(self.settings.request_timeout))
+
+    async def _fresh_status(self, deadline: float) -> None:
+        """Do not take an old status for the present one, where it does not come by itself."""
+        if not self._talk.dialect.capabilities.status_by_itself:
+            await self._talk.refresh_status(deadline)
 
     def _interpretation(self, spec: object) -> Interpretation:
         known = self._interpretations.get(spec) if isinstance(spec, str) else None
@@ -679,6 +752,7 @@ class SmartCamera:
         if end is not None and self._supervisor.over:  # between two sessions it waits for the next
             queue.end(None if isinstance(end, ConnectionClosedError) else end)
         subscribers.add(queue)
+        self._inbox.want_status()
         return queue
 
     async def _await_next(
@@ -696,15 +770,6 @@ class SmartCamera:
             ) from exc
         finally:
             self._inbox.next_results.discard(future)
-
-
-def _as_named(dialect: Dialect, frame: Frame) -> m.Message:
-    """Return the message that a frame is; one without a name where that would change its bytes."""
-    with contextlib.suppress(RemoteProtocolError):
-        message = dialect.decode(m.Sender.CLIENT, frame)
-        if dialect.to_frame(message) == frame:
-            return message
-    return m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
 
 
 def _is_not_busy(status: Status) -> bool:

@@ -16,14 +16,14 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
-from smartcam.models import jsonable
 from smartcam.protocols.base import Dialect, Role, Transport
-from smartcam.protocols.machine import Event, LinkFailed, Machine, State
-from smartcam.protocols.messages import Disconnect, Message, Sender, wire_fields
+from smartcam.protocols.machine import Event, LinkFailed, LinkMachine, State
+from smartcam.protocols.messages import Disconnect, Message, Sender
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
+    from smartcam.protocols.base import Protocol
     from smartcam.protocols.framing import Frame
 
 __all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
@@ -49,7 +49,7 @@ class TraceEntry(NamedTuple):
         at: when, UTC.
         camera: name of the camera.
         direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol.
-        message_id: id on the wire, None for broken bytes.
+        message_id: id on the wire, None for broken bytes and where there are no such ids.
         message: name of the message, or the error's text for broken bytes.
         fields: decoded body, None where it cannot be decoded.
         hex: the bytes.
@@ -81,7 +81,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def __init__(
         self,
-        machine: Machine,
+        machine: LinkMachine,
         *,
         name: str,
         host: str,
@@ -96,6 +96,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._loop = asyncio.get_running_loop()
         self.heard_at: float = self._loop.time()
         self._transport: Any = None
+        self._replies = machine.replies
         self._chunks: collections.deque[Chunk] = collections.deque()
         self._receiver: Callable[[Chunk], None] | None = None
         self._wakeup: asyncio.Future[None] | None = None
@@ -253,6 +254,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.heard_at = self._loop.time()
         if self.machine.filled(nbytes):
             self._hand_on()
+        if self._replies and self._loss is None:
+            self._flush()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""
@@ -352,7 +355,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
 
 async def open_link(
-    dialect: Dialect,
+    protocol: Protocol,
+    dialects: Sequence[Dialect],
     transport: Transport,
     host: str,
     port: int,
@@ -364,12 +368,38 @@ async def open_link(
 ) -> Link:
     """Open a link; bounded by the caller's deadline.
 
+    Args:
+        protocol: makes the machine.
+        dialects: one, or several that begin a session alike.
+        transport: TCP or UDP.
+        host: the camera's name or address.
+        port: its port.
+        name: of the camera, for logs.
+        max_length: largest payload accepted, bytes.
+        trace: called with every frame.
+        liveness_timeout: see :class:`Link`.
+
     Raises:
         OSError: the name does not resolve, nothing listens, no way to the host.
     """
     loop = asyncio.get_running_loop()
-    tracer = _tracer(name, dialect, trace)
-    machine = Machine(dialect, Role.CLIENT, transport, max_length=max_length, trace=tracer)
+    machine: LinkMachine
+
+    def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
+        entry = _trace_entry(name, machine.dialect, sender, frame)
+        logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
+        if trace is not None:
+            trace(entry)
+
+    traced = trace is not None or logger.isEnabledFor(logging.DEBUG)
+    machine = protocol.machine(
+        dialects[0],
+        Role.CLIENT,
+        transport,
+        max_length=max_length,
+        trace=on_frame if traced else None,
+        kin=tuple(dialects),
+    )
     link = Link(machine, name=name, host=host, port=port, liveness_timeout=liveness_timeout)
     if transport is Transport.TCP:
         await loop.create_connection(lambda: link, host, port)
@@ -394,43 +424,12 @@ def _keep_alive(sock: socket.socket, timeout: float) -> None:
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
-def _tracer(
-    name: str, dialect: Dialect, trace: Callable[[TraceEntry], None] | None
-) -> Callable[[Sender, Frame | RemoteProtocolError], None] | None:
-    debug = logger.isEnabledFor(logging.DEBUG)
-    if trace is None and not debug:
-        return None
-
-    def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
-        if isinstance(frame, RemoteProtocolError):
-            entry = TraceEntry(
-                datetime.now(UTC), name, "!", None, str(frame), None, frame.data.hex()
-            )
-        else:
-            entry = _trace_entry(name, dialect, sender, frame)
-        if debug:
-            logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
-        if trace is not None:
-            trace(entry)
-
-    return on_frame
-
-
-def _trace_entry(name: str, dialect: Dialect, sender: Sender, frame: Frame) -> TraceEntry:
-    fields = None
-    try:
-        message = dialect.decode(sender, frame)
-    except RemoteProtocolError:
-        pass  # its error follows as an entry of its own
-    else:
-        names = [field for field, _ in wire_fields(type(message))]
-        fields = {field: jsonable(getattr(message, field)) for field in names}
-    return TraceEntry(
-        at=datetime.now(UTC),
-        camera=name,
-        direction=">" if sender is Sender.CLIENT else "<",
-        message_id=frame.message_id,
-        message=dialect.message_type(sender, frame.message_id).__name__,
-        fields=fields,
-        hex=dialect.encode_frame(frame).hex(),
-    )
+def _trace_entry(
+    name: str, dialect: Dialect, sender: Sender, frame: Frame | RemoteProtocolError
+) -> TraceEntry:
+    at = datetime.now(UTC)
+    if isinstance(frame, RemoteProtocolError):
+        return TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
+    message_id, message, fields, data = dialect.spell(sender, frame)
+    direction = ">" if sender is Sender.CLIENT else "<"
+    return TraceEntry(at, name, direction, message_id, message, fields, data.hex())

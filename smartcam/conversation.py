@@ -31,11 +31,14 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
+    UnsupportedError,
     WrongApplicationError,
 )
+from smartcam.handshake import code_text
 from smartcam.models import Status
+from smartcam.polling import StatusPoll
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Transport
+from smartcam.protocols.base import Transport, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,6 +47,7 @@ if TYPE_CHECKING:
     from smartcam.inbox import Inbox
     from smartcam.interpretation import Interpretation
     from smartcam.models import Result
+    from smartcam.protocols.base import Dialect
 
 __all__ = ["Conversation", "TriggerRequest"]
 
@@ -52,8 +56,8 @@ AnswerT = TypeVar("AnswerT", bound=m.Message)
 TIMER_RESOLUTION = 0.02
 """Seconds that a timer may be early: Windows' clock ticks every 16 ms."""
 
-MAX_APPLICATION_ID = 0xFFFFFFFF
-"""The id is a UINT32 on the wire (SC manual p. 34, published)."""
+BUSY_PAUSE = 0.02
+"""Seconds until a camera that was too busy for a request is asked again."""
 
 _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
 _SPEAKS_AGAINST = int(
@@ -125,6 +129,8 @@ class Conversation:
         self.unconfirmed: bool = False  # a Start or Stop was sent, its status has not come
         self._status_in_doubt = False  # over UDP: it may have been lost
         self._alarm = Alarm(self._expire)
+        self._poll: StatusPoll | None = None  # where the status does not come by itself
+        self._numbered = self._acknowledged = False  # the dialect's triggers
 
     def begin(self, link: Link) -> None:
         """A new session: nothing is owed on it, its status is heard."""
@@ -132,10 +138,26 @@ class Conversation:
         self._loop = asyncio.get_running_loop()
         self._due.clear()
         self.unconfirmed = self._status_in_doubt = False
+        self.end_polling()
+        dialect = link.machine.dialect
+        self._numbered = dialect.has(m.SetSequenceNumber)
+        self._acknowledged = dialect.has(m.TriggerAnswer)
+        if not dialect.capabilities.status_by_itself:
+            self._poll = StatusPoll(link, self.inbox)
+            self.inbox.on_status_wanted = self._poll.wanted
+            self._poll.wanted()
+
+    def end_polling(self) -> None:
+        """The session is over, or none has begun."""
+        self.inbox.on_status_wanted = None
+        if self._poll is not None:
+            self._poll.stop()
+            self._poll = None
 
     def end(self) -> None:
         """There will be no session any more."""
         self._alarm.cancel()
+        self.end_polling()
 
     def require_link(self) -> Link:
         """Return the link.
@@ -148,6 +170,25 @@ class Conversation:
         if self.link is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         return self.link
+
+    @property
+    def dialect(self) -> Dialect:
+        """What is spoken in this session.
+
+        Raises:
+            LinkError: there is none.
+        """
+        return self.require_link().machine.dialect
+
+    def require(self, message_type: type[m.Message]) -> None:
+        """See to it that the dialect has a message, before anything is done for it.
+
+        Raises:
+            UnsupportedError: it has not.
+            LinkError: there is no session.
+        """
+        if not self.dialect.has(message_type):
+            raise self.dialect.unsupported(message_type)
 
     @property
     def status(self) -> Status:
@@ -198,6 +239,44 @@ class Conversation:
             )
             link.give_up(error)
             raise error from exc
+
+    async def command(self, message: m.Request, deadline: float) -> None:
+        """Send a command; where the dialect acknowledges it, wait for that.
+
+        Raises:
+            UnsupportedError: the dialect, or the camera, does not know it.
+            CommandRejectedError: the camera refused it.
+            ResponseTimeoutError: no answer; the link is given up.
+        """
+        answer = type(message).answer
+        if answer is None or not self.dialect.answers(type(message)):
+            await self.tell(message, deadline)
+            return
+        got = await self.ask(message, answer, deadline)
+        self.check(type(message), got)
+
+    def check(self, request: type[m.Message], answer: m.Message) -> None:
+        """Raise what an answer's code says, where it does not say that all is well.
+
+        Raises:
+            UnsupportedError: the camera does not know the request.
+            CommandRejectedError: it refused, or is too busy.
+        """
+        code = answer.code if isinstance(answer, m.Acknowledgement) else 0
+        verdict = self.dialect.code(code).verdict
+        if verdict is Verdict.DONE:
+            return
+        said = (
+            f"{self.name}: {request.__name__}: the camera answered {code_text(self.dialect, code)}"
+        )
+        if verdict is Verdict.UNKNOWN:
+            raise UnsupportedError(said)
+        raise CommandRejectedError(
+            said,
+            message_id=self.dialect.message_id(request),
+            code=code,
+            active_application=self.inbox.active,
+        )
 
     async def ask(self, message: m.Message, answer: type[AnswerT], deadline: float) -> AnswerT:
         """Send a request and return its answer, which may come among statuses and results.
@@ -300,7 +379,7 @@ class Conversation:
         Raises:
             TimeoutError: at ``deadline``.
         """
-        if not self._ordered:
+        if not self._ordered and self._poll is None:
             now = asyncio.get_running_loop().time()
             with contextlib.suppress(TimeoutError):
                 return await self.inbox.wait_status(predicate, now + 0.5 * (deadline - now))
@@ -308,11 +387,15 @@ class Conversation:
         return await self.inbox.wait_status(predicate, deadline)
 
     async def _ask_for_status(self, deadline: float) -> None:
-        """Have the camera say its status: Connect brings one (SC manual p. 29, published).
+        """Have the camera say its status, by Get status where there is that.
 
-        A Query goes first: who has lost the session must not take it back by this.
+        Elsewhere Connect brings one (SC manual p. 29, published). A Query goes first: who has lost
+        the session must not take it back by this.
         """
         link = self.require_link()
+        if self._poll is not None:
+            link.send(m.GetStatus(), answered=False)
+            return
         try:
             await self._fence(deadline)
             link.send(m.Connect())
@@ -321,15 +404,23 @@ class Conversation:
         except LocalProtocolError as exc:  # the last one's answer never came
             link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 
+    async def refresh_status(self, deadline: float) -> None:
+        """Know the status as it is now, where it can be asked for."""
+        if self.dialect.has(m.GetStatus):
+            self.require_link().send(m.GetStatus(), answered=False)
+            await self._fence(deadline)
+
     # ------------------------------------------------------------------ run state, application
 
     async def start(self, deadline: float) -> None:
         """Enter run mode and wait until the camera reports it."""
+        self.require(m.Start)
         self.wants_running = True
         await self._enter_run_mode(deadline)
 
     async def stop(self, deadline: float) -> None:
         """Leave run mode and wait until the camera reports it."""
+        self.require(m.Stop)
         self.wants_running = False
         await self._leave_run_mode(deadline)
 
@@ -345,10 +436,11 @@ class Conversation:
         await self._confirm(m.Stop(), _is_not_running, deadline, "not Running after Stop")
 
     async def _confirm(
-        self, command: m.Message, predicate: Callable[[Status], bool], deadline: float, what: str
+        self, command: m.Request, predicate: Callable[[Status], bool], deadline: float, what: str
     ) -> None:
         self.unconfirmed = True  # and it stays so where the wait is interrupted
-        await self.tell(command, deadline)
+        await self.command(command, deadline)
+        await self.refresh_status(deadline)
         await self.until(predicate, deadline, what)
         self.unconfirmed = False
 
@@ -373,7 +465,10 @@ class Conversation:
         """Send a Query unless one is open; its answer is owed until ``due`` (loop time)."""
         if m.QueryAnswer in self.inbox.answers:
             return False
-        self.require_link().send(m.Query())
+        link = self.require_link()
+        if self._poll is not None:
+            link.send(m.GetStatus(), answered=False)  # so that it does not grow old
+        link.send(m.Query())
         self._due[m.QueryAnswer] = due
         self.inbox.next_answer(m.QueryAnswer)
         return True
@@ -387,10 +482,36 @@ class Conversation:
     async def query(self, deadline: float) -> int:
         """Return the active application.
 
-        During a switch a Query tells the old id, so an owed switch answer is awaited first.
+        During a switch a Query tells the old id, so an owed switch answer is awaited first; or it
+        is answered as too busy, and asked again.
+
+        Raises:
+            ResponseTimeoutError: no answer, or none but that the camera is busy.
         """
         await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
-        return (await self.ask(m.Query(), m.QueryAnswer, deadline)).application
+        while True:
+            answer = await self.ask(m.Query(), m.QueryAnswer, deadline)
+            if not self._is_busy(answer):
+                self.check(m.Query, answer)
+                return answer.application
+            await self._pause(deadline, "the camera to name its application")
+
+    def _is_busy(self, answer: m.Acknowledgement) -> bool:
+        return self.dialect.code(answer.code).verdict is Verdict.BUSY
+
+    async def _pause(self, deadline: float, what: str) -> None:
+        """Wait a moment before a camera that is too busy is asked again.
+
+        Raises:
+            ResponseTimeoutError: there is no time left.
+        """
+        left = deadline - asyncio.get_running_loop().time()
+        if left <= BUSY_PAUSE:
+            raise ResponseTimeoutError(
+                f"{self.name}: waited for {what} until the time was over, it is busy; "
+                f"status: {self.status}"
+            )
+        await asyncio.sleep(BUSY_PAUSE)
 
     async def query_loaded(self, deadline: float) -> int:
         """Return the active application; while one is being loaded a Query tells the old one."""
@@ -408,54 +529,98 @@ class Conversation:
         self.wants_running = True
         await self.until(is_ready, deadline, "Running and not BUSY")
 
-    async def switch(self, application: int, deadline: float, *, start: bool) -> None:
+    async def switch(self, application: int | str, deadline: float, *, start: bool) -> None:
         """Stop if need be, switch, wait until not BUSY, start if wanted.
 
+        Args:
+            application: its id, or the name of its file.
+            deadline: loop time.
+            start: enter run mode afterwards, where there is one.
+
         Raises:
+            UnsupportedError: the dialect loads no applications, or none by name.
             CommandRejectedError: the camera refused; the old application runs again if it ran.
         """
-        if not 0 <= application <= MAX_APPLICATION_ID:
-            raise ConfigurationError(
-                f"{self.name}: application id {application} is not 0 to {MAX_APPLICATION_ID}"
-            )
-        was_running = self.runs
-        if application == 0:
+        request = self._load_request(application)
+        stops = self.dialect.has(m.Stop)
+        was_running = self.runs and stops
+        if application == 0 and 0 not in self.dialect.application_ids:
             # Never allowed, several applications may carry it (SC manual p. 34, published): so
             # nothing is stopped for it.
             code, active = 1, await self.query(deadline)
         else:
             if was_running:
                 await self._leave_run_mode(deadline)
-            request = m.SwitchApplication(application=application)
             answer = await self.ask(request, m.SwitchAnswer, deadline)
+            while self._is_busy(answer):
+                await self._pause(deadline, f"application {application} to be loaded")
+                answer = await self.ask(request, m.SwitchAnswer, deadline)
             code, active = answer.code, answer.application
-        if code != 0 or active != application:
+        done = self.dialect.code(code).verdict is Verdict.DONE
+        if not done or (isinstance(application, int) and active != application):
             if was_running and Status.RUNNING not in self.status:
                 await self._enter_run_mode(deadline)
-            refusal = f"the camera refused to switch to application {application} (status {code})"
-            if application == 0:
+            refusal = (
+                f"the camera refused to switch to application {application}: "
+                f"{code_text(self.dialect, code, type(request))}"
+            )
+            if application == 0 and 0 not in self.dialect.application_ids:
                 refusal = "no application may have the id 0"
-            elif code == 0:
+            elif done:
                 refusal = f"the camera says it switched, but not to application {application}"
             raise CommandRejectedError(
                 f"{self.name}: {refusal}; application {active} is active",
-                message_id=self.require_link().machine.dialect.message_id(m.SwitchApplication),
+                message_id=self.dialect.message_id(request),
                 code=code,
                 active_application=active,
             )
+        await self.refresh_status(deadline)
         await self.until(lambda status: Status.BUSY not in status, deadline, "not BUSY")
-        if start:
+        if start and stops:
             await self.start(deadline)
+
+    def _load_request(self, application: int | str) -> m.Request:
+        if isinstance(application, str):
+            self.require(m.LoadFile)
+            return m.LoadFile(name=application.encode())
+        self.require(m.SwitchApplication)
+        ids = self.dialect.application_ids
+        if application != 0 and application not in ids:
+            raise ConfigurationError(
+                f"{self.name}: application id {application} is not {ids.start} to {ids.stop - 1}"
+            )
+        return m.SwitchApplication(application=application)
 
     # ------------------------------------------------------------------ trigger
 
     async def trigger(self, request: TriggerRequest, deadline: float) -> list[Result]:
         """Wait until the camera takes a trigger, send it, return its results.
 
+        A camera that says that it was too busy for the trigger gets it again.
+
+        Raises:
+            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
+        """
+        while True:
+            try:
+                return await self._trigger_once(request, deadline)
+            except CameraBusyError as exc:
+                if not request.wait:
+                    raise
+                try:
+                    await self._pause(deadline, "the camera to take a trigger")
+                except ResponseTimeoutError as timeout:
+                    raise TriggerTimeoutError(f"{timeout}; {exc}") from exc
+
+    async def _trigger_once(self, request: TriggerRequest, deadline: float) -> list[Result]:
+        """Send one trigger as soon as the camera takes it, return its results.
+
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
         attribution, loop = self.inbox.attribution, self._loop or asyncio.get_running_loop()
+        if self._poll is not None:
+            await self.refresh_status(deadline)
         self._raise_fault()
         if request.input_data is not None and self.inbox.input_in_doubt:
             raise InputContainerError(
@@ -469,15 +634,16 @@ class Conversation:
             await self._ask_for_status(deadline)
             await self._fence(deadline)  # it has come by then, or is lost again
             self._status_in_doubt = False
-        numbering = request.interpretation.numbering(self.inbox.active)
+        interpretation = request.interpretation
+        numbering = interpretation.numbering(self.inbox.active) if self._numbered else None
         # an older result shows by its number where each container has one
         decided = numbering is not None and numbering.always
         if self._halted or (attribution.debt is not None and not decided):
-            await self._settle_debt(deadline)
+            await self._settle_debt(deadline, wait=request.wait)
         if int(self.status) & _SPEAKS_AGAINST != _WAITING:
             await self._wait_for_trigger(deadline, wait=request.wait)
         if int(self.status) & _OVERTRIGGERED:
-            await self._see_overtriggered_fall(deadline)
+            await self._clear_overtriggered(deadline)
             await self._wait_for_trigger(deadline, wait=request.wait)
         while attribution.unsettled and not decided and self._ordered:
             await self._settle_others(deadline)
@@ -502,13 +668,21 @@ class Conversation:
         words: list[m.Message] = []
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
-        if input_data is not None:
+        if self._acknowledged:
+            await self._await_owed(m.TriggerAnswer, m.Trigger(), deadline)
+        if input_data is not None and link.machine.dialect.answers(m.SetInput):
+            await self.command(m.SetInput(data=input_data), deadline)
+        elif input_data is not None:
             words.append(m.SetInput(data=input_data))
         inbox.attribution.send(pending)
         self._alarm.set(deadline)
         try:
             link.send(*words, m.Trigger())
-            inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
+            if self._acknowledged:
+                self._expect_acknowledgement(pending, deadline)
+            else:
+                inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
+            inbox.want_status()
             if not link.writable:
                 with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
                     async with asyncio.timeout_at(deadline):
@@ -534,6 +708,26 @@ class Conversation:
         finally:
             self._alarm.clear()
             inbox.attribution.pending = None
+
+    def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
+        """Have the trigger end at once where the camera says that it took none."""
+
+        def on_answer(answer: asyncio.Future[m.Message | SmartCamError]) -> None:
+            got = answer.result()
+            if isinstance(got, SmartCamError) or pending.outcome.done():
+                return
+            try:
+                self.check(m.Trigger, got)
+            except (CommandRejectedError, UnsupportedError) as exc:
+                busy = isinstance(got, m.Acknowledgement) and self._is_busy(got)
+                if not self._ordered:  # it may be the answer to an earlier one
+                    self.inbox.attribution.give_up(pending)
+                pending.outcome.set_exception(CameraBusyError(str(exc)) if busy else exc)
+            except SmartCamError as exc:  # the link is over
+                pending.outcome.set_exception(exc)
+
+        self._due[m.TriggerAnswer] = max(deadline, self.deadline(self._patience))
+        self.inbox.next_answer(m.TriggerAnswer).add_done_callback(on_answer)
 
     def _expire(self) -> None:
         """The trigger's deadline: from this moment on its result is late."""
@@ -594,13 +788,19 @@ class Conversation:
     def _ordered(self) -> bool:
         return self.require_link().machine.transport is Transport.TCP
 
-    async def _settle_debt(self, deadline: float) -> None:
+    async def _settle_debt(self, deadline: float, *, wait: bool) -> None:
         """Await the result of an earlier trigger, or make it impossible.
 
         Stop voids the inspection under way, a Query is the fence: what comes before its answer
-        came from before.
+        came from before. Without a Stop the inspection's end is awaited: the camera waits for a
+        trigger again. A camera that does one thing after the other needs the fence only.
         Source: that Stop voids the inspection is inferred.
         """
+        if self.dialect.in_order or not self.dialect.has(m.Stop):
+            await self._wait_for_trigger(deadline, wait=wait)
+            await self._fence(deadline)
+            self.inbox.attribution.settled()
+            return
         attribution, now = self.inbox.attribution, asyncio.get_running_loop().time()
         if not self._halted and Status.RUNNING in self.status:
             grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
@@ -615,11 +815,16 @@ class Conversation:
             await self._enter_run_mode(deadline)
         attribution.settled()
 
-    async def _see_overtriggered_fall(self, deadline: float) -> None:
-        """Wait a moment for Overtriggered to fall: only then can it rise for our trigger.
+    async def _clear_overtriggered(self, deadline: float) -> None:
+        """Reset Overtriggered, or wait a moment for it to fall: only then can it rise for ours.
 
-        Source: it falls by itself (SC manual p. 30, published); when is unknown.
+        Source: it falls by itself (SC manual p. 30, published), when is unknown; on BVS ID it stays
+        until it is reset (BVS ID guide p. 227, published).
         """
+        if self.dialect.has(m.ResetErrors):
+            await self.command(m.ResetErrors(), deadline)
+            await self.refresh_status(deadline)
+            return
         now = asyncio.get_running_loop().time()
         grace = now + min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))
         with contextlib.suppress(TimeoutError):

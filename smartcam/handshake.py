@@ -4,7 +4,8 @@ Each attempt sends Disconnect (harmless without a session; old sessions confuse 
 3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
 Query. Anything unexpected, silence included, ends the attempt: close, fresh link, next attempt. To
 a camera that hangs up without a byte, the next attempt is made without the Disconnect.
-Where no dialect is pinned, attempts take turns through the protocol's dialects.
+Where no dialect is pinned, attempts take turns through the protocol's dialects. Those that begin a
+session alike share an attempt: the answer to Connect, and what follows, tells them apart.
 """
 
 from __future__ import annotations
@@ -19,38 +20,57 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.connection import Chunk, Link, open_link
 from smartcam.exceptions import (
+    CommandRejectedError,
     ConfigurationError,
     ConnectFailedError,
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.protocols.base import Dialect, Protocol, Transport
+from smartcam.protocols.base import Dialect, Protocol, Transport, Verdict
 from smartcam.protocols.machine import LinkEnded, LinkFailed
 from smartcam.protocols.messages import (
     Connect,
     ConnectAnswer,
     Disconnect,
+    GetStatus,
     Query,
     QueryAnswer,
     ResultContainer,
     StatusReport,
+    UnknownMessage,
 )
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from smartcam.connection import TraceEntry
+    from smartcam.protocols.messages import Message
     from smartcam.settings import Address, CameraSettings
 
-__all__ = ["Session", "Try", "attempt", "establish", "load_protocol"]
+__all__ = [
+    "Session",
+    "Try",
+    "attempt",
+    "code_text",
+    "establish",
+    "load_protocol",
+    "names_of",
+    "tries_for",
+]
 
 logger: logging.Logger = logging.getLogger("smartcam.handshake")
 
-DETECTION_SHARE = 1.0
+DETECTION_SHARE = 0.5
 """Seconds that a dialect gets in the first round while others are still untried. A camera answers
 in milliseconds, one that speaks another dialect is silent; later rounds have the rest of the time,
 for slow links."""
+
+TELLING_ROUNDS = 3
+"""Questions for the status that a camera must have answered, each, to be one that answers them."""
+
+BUSY_PAUSE = 0.05
+"""Seconds until a camera that was too busy to name its application is asked again."""
 
 
 OPENING = "opening the link"
@@ -81,7 +101,7 @@ class Try:
     """One attempt: what was tried and how far it came.
 
     Attributes:
-        dialect: that was spoken.
+        dialect: that was spoken; those that begin a session alike until it is known which.
         transport: ``tcp`` or ``udp``.
         step: what was waited for at last.
         outcome: what came of it.
@@ -120,22 +140,31 @@ class _Collector:
     link: Link
     early: list[Chunk] = field(default_factory=list[Chunk])
     version: int | None = None
-    status: StatusReport | None = None
+    statuses: int = 0
+    answers: int = 0  # to Query, whatever they say
     application: int | None = None
 
     async def take(self) -> None:
         chunk = await self.link.receive()
         self.early.append(chunk)
+        dialect = self.link.machine.dialect
         for event in chunk.events:
             match event:
-                case ConnectAnswer(version=version):
+                case ConnectAnswer(code=code, version=version):
+                    if dialect.code(code).verdict is not Verdict.DONE:
+                        raise CommandRejectedError(
+                            f"the camera refused the session: {code_text(dialect, code, Connect)}",
+                            code=code,
+                        )
                     if version < 1:
                         raise RemoteProtocolError(f"the camera speaks protocol version {version}")
                     self.version = version
                 case StatusReport():
-                    self.status = self.status or event
-                case QueryAnswer(application=application):
-                    self.application = application
+                    self.statuses += 1
+                case QueryAnswer(code=code, application=application):
+                    self.answers += 1
+                    done = dialect.code(code).verdict is Verdict.DONE
+                    self.application = application if done else None
                 case ResultContainer():
                     pass
                 case LinkFailed(error=error):
@@ -145,6 +174,47 @@ class _Collector:
                     raise RemoteProtocolError(f"the other side closed the connection{more}")
                 case _:
                     logger.debug("%s ! %s during connect", self.link.name, type(event).__name__)
+
+    async def ask(self, *first: Message) -> None:
+        """Send a Query behind ``first`` and wait for its answer."""
+        before = self.answers
+        self.link.send(*first, answered=False)
+        self.link.send(Query())
+        while self.answers == before:
+            await self.take()
+
+    async def tell_apart(self) -> None:
+        """Find out which of its kin the camera speaks: who answers Get status, or not.
+
+        A status may also come by itself, so it must come to each of several questions.
+        """
+        machine = self.link.machine
+        asking = [dialect for dialect in machine.kin if dialect.has(GetStatus)]
+        others = [dialect for dialect in machine.kin if not dialect.has(GetStatus)]
+        if asking and others:
+            # one that goes on without an answer is certain where no message is lost
+            certain = 1 if machine.transport is Transport.TCP else 2
+            question = UnknownMessage(message_id=asking[0].message_id(GetStatus), payload=b"")
+            answered = unanswered = 0
+            while answered < TELLING_ROUNDS and unanswered < certain:
+                before = self.statuses
+                await self.ask(question)
+                told = self.statuses > before
+                answered, unanswered = answered + told, 0 if told else unanswered + 1
+            machine.adopt((others if unanswered else asking)[0])
+        else:
+            machine.adopt(machine.kin[0])
+        for chunk in self.early:
+            chunk.events[:] = [
+                machine.dialect.restate(event) if isinstance(event, StatusReport) else event
+                for event in chunk.events
+            ]
+
+
+def code_text(dialect: Dialect, code: int, request: type[Message] | None = None) -> str:
+    """Return what a result code says in the answer to a request."""
+    number = f"{code:#04x}" if code >= 0 else str(code)
+    return f"code {number} ({dialect.code(code, request).text})"
 
 
 def load_protocol(name: str) -> Protocol:
@@ -162,7 +232,7 @@ def load_protocol(name: str) -> Protocol:
 
 async def attempt(
     address: Address,
-    dialect: Dialect,
+    dialects: Sequence[Dialect],
     transport: Transport,
     *,
     progress: Try,
@@ -174,12 +244,24 @@ async def attempt(
 ) -> Session:
     """Make a session over one fresh link; bounded by the caller's deadline.
 
+    Args:
+        address: where the camera is.
+        dialects: one, or several that begin a session alike.
+        transport: TCP or UDP.
+        progress: is told how far it came.
+        name: of the camera, for logs.
+        max_length: largest payload accepted, bytes.
+        trace: called with every frame.
+        disconnect_first: send Disconnect before Connect.
+        liveness_timeout: see :class:`~smartcam.connection.Link`.
+
     Raises:
         OSError: no link.
         SmartCamError: the link ended, or what came was no camera's answer.
     """
     link = await open_link(
-        dialect,
+        load_protocol(address.protocol),
+        dialects,
         transport,
         address.host,
         address.port,
@@ -194,13 +276,21 @@ async def attempt(
         progress.step = CONNECTING
         while collector.version is None:
             await collector.take()
+        if len(link.machine.kin) > 1:
+            progress.step = "finding out the dialect"
+            await collector.tell_apart()
+        dialect = link.machine.dialect
+        progress.dialect = dialect.label
         progress.step = "waiting for the first status"
-        while collector.status is None:
+        if not collector.statuses and not dialect.capabilities.status_by_itself:
+            link.send(GetStatus(), answered=False)
+        while not collector.statuses:
             await collector.take()
         progress.step = "waiting for the answer to Query"
-        link.send(Query())
+        await collector.ask()
         while collector.application is None:
-            await collector.take()
+            await asyncio.sleep(BUSY_PAUSE)
+            await collector.ask()
     except BaseException as exc:
         link.give_up(exc)
         raise
@@ -208,8 +298,21 @@ async def attempt(
         progress.received = link.machine.counters.bytes_received
     if collector.version > 1:
         logger.warning("%s ! protocol version %d is newer than 1", name, collector.version)
-    pinned = address._replace(dialect=dialect.name)
+    pinned = address._replace(dialect=dialect.name, quirks=dialect.quirks)
     return Session(link, pinned, dialect, collector.version, collector.early)
+
+
+def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
+    """Return what to try at an address, each on a fresh link."""
+    protocol = load_protocol(address.protocol)
+    return protocol.tries(
+        protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
+    )
+
+
+def names_of(dialects: Sequence[Dialect]) -> str:
+    """Return the names of dialects that begin a session alike."""
+    return " or ".join(dict.fromkeys(dialect.name for dialect in dialects))
 
 
 async def establish(
@@ -225,24 +328,24 @@ async def establish(
     address = settings.address
     protocol = load_protocol(address.protocol)
     transport = protocol.schemes[address.scheme]
-    names = [address.dialect] if address.dialect else list(protocol.dialects)
+    groups = tries_for(address)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + settings.connect_timeout
     tries: list[Try] = []
     cause: BaseException | None = None
     disconnect_first = True
     for left in range(settings.connect_attempts, 0, -1):
-        for position, name in enumerate(names):
-            share = (deadline - loop.time()) / (left * len(names) - position)
-            if len(names) > 1 and left == settings.connect_attempts:
+        for position, dialects in enumerate(groups):
+            share = (deadline - loop.time()) / (left * len(groups) - position)
+            if len(groups) > 1 and left == settings.connect_attempts:
                 share = min(share, DETECTION_SHARE)
-            progress = Try(name, transport.value)
+            progress = Try(names_of(dialects), transport.value)
             tries.append(progress)
             try:
                 async with asyncio.timeout(share):
                     return await attempt(
                         address,
-                        protocol.dialects[name],
+                        dialects,
                         transport,
                         progress=progress,
                         name=settings.name,
@@ -258,10 +361,13 @@ async def establish(
                 # perhaps at the Disconnect: then the next link does without, and so by turns
                 disconnect_first = not disconnect_first
             logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
+            if isinstance(cause, CommandRejectedError):
+                groups = []  # it said no, and would again
+                break
             if progress.step == OPENING:
                 break  # no link, so another dialect would fare no better in this round
             if progress.step != CONNECTING:
-                names = [name]  # it answered the Connect: that is its dialect
+                groups = [dialects]  # it answered the Connect: that is its dialect
                 break
     raise ConnectFailedError(
         f"{settings.name}: no session with {address.url}: {_folded(tries)}",

@@ -11,7 +11,7 @@ import asyncio
 import itertools
 import logging
 import weakref
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, cast
 
@@ -35,6 +35,7 @@ from smartcam.models import (
     StatusChanged,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols.base import Verdict
 from smartcam.protocols.machine import ResultBurst
 from smartcam.streams import Subscribers
 
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from smartcam.connection import Chunk
     from smartcam.interpretation import Interpretation
     from smartcam.observers import Observers
+    from smartcam.protocols.base import Dialect
     from smartcam.protocols.machine import Event
     from smartcam.streams import Queue
 
@@ -99,6 +101,9 @@ class Inbox:
         self.status_streams: Subscribers[Status] = Subscribers()
         self.event_streams: Subscribers[CameraEvent] = Subscribers()
         self.account: Account = Account()
+        self.statuses_heard: int = 0
+        self.on_status_wanted: Callable[[], None] | None = None  # where it has to be asked for
+        self._dialect: Dialect | None = None
         self._observers = observers
         self._status_waiters: list[_StatusWaiter] = []
         self._asked_at: dict[object, float] = {}
@@ -114,11 +119,14 @@ class Inbox:
             m.SwitchAnswer: self._on_switched,
         }
 
-    def begin(self, *, ordered: bool) -> None:
+    def begin(self, dialect: Dialect, *, ordered: bool) -> None:
         """A new session; ``ordered`` where messages come in order and none is lost (TCP)."""
         self.end = None
+        self._dialect = dialect
         self._heard_status = self._warned_extra = self.active_in_doubt = False
-        self.attribution.begin_session(ordered=ordered)
+        # where the status has to be asked for, changes of it are missed
+        complete = ordered and dialect.capabilities.status_by_itself
+        self.attribution.begin_session(ordered=complete)
 
     # ------------------------------------------------------------------ from the receive task
 
@@ -192,12 +200,28 @@ class Inbox:
             return self.status
         waiter = _StatusWaiter(predicate, asyncio.get_running_loop().create_future())
         self._status_waiters.append(waiter)
+        self.want_status()
         try:
             async with asyncio.timeout_at(deadline):
                 return await waiter.outcome
         finally:
             if waiter in self._status_waiters:
                 self._status_waiters.remove(waiter)
+
+    @property
+    def awaits_status(self) -> bool:
+        """Whether somebody waits for a status, or for what it may say of the trigger under way."""
+        return bool(self._status_waiters) or self.attribution.pending is not None
+
+    @property
+    def watches_status(self) -> bool:
+        """Whether somebody subscribed to statuses or events."""
+        return bool(self.status_streams) or bool(self.event_streams)
+
+    def want_status(self) -> None:
+        """Have the status asked for, where it does not come by itself."""
+        if self.on_status_wanted is not None:
+            self.on_status_wanted()
 
     def set_active(self, application: int, at: datetime) -> None:
         """Note which application is active."""
@@ -227,20 +251,27 @@ class Inbox:
                 self.account.round_trip.add(now - asked_at)
             future.set_result(message)
 
+    def _verdict(self, code: int) -> Verdict:
+        return Verdict.DONE if self._dialect is None else self._dialect.code(code).verdict
+
     def _on_active(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
-        self.set_active(answer.application, at)
+        if self._verdict(answer.code) is Verdict.DONE:
+            self.set_active(answer.application, at)
 
     def _on_switched(self, answer: m.SwitchAnswer, now: float, at: datetime) -> None:
-        if answer.code == 0:
+        verdict = self._verdict(answer.code)
+        if verdict is Verdict.DONE:
             self.expected = answer.application
             self.input_in_doubt = False
             self._loaded_by_us = True
             self.attribution.settled()
-        self.set_active(answer.application, at)
+        if verdict is not Verdict.BUSY:  # too busy to say
+            self.set_active(answer.application, at)
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         before, status = self.status, report.status
         bits = int(status)
+        self.statuses_heard += 1
         was = int(before) if self._heard_status and before is not None else None
         self.status, self.endian, self._heard_status = status, report.endian, True
         risen, fallen = bits & ~(was or 0), (was or 0) & ~bits
@@ -359,6 +390,9 @@ class Inbox:
     def _on_result(self, container: m.ResultContainer, now: float, at: datetime) -> None:
         account, attribution = self.account, self.attribution
         account.received += 1
+        if container.application < 0:  # a quirk: it does not say whose it is
+            active = m.UNNAMED_APPLICATION if self.active is None else self.active
+            container = replace(container, application=active)
         pending = attribution.pending
         if pending is not None and pending.outcome.done():
             pending = None

@@ -19,6 +19,7 @@ from smartcam.interpreters.base import (
     run_plain,
     run_sequence,
 )
+from smartcam.layout.texts import pack_texts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -151,15 +152,18 @@ class Interpretation:
             WrongApplicationError: the mapping does not know its application.
         """
         interpreter, simple, sequenced, _ = self._known(container.application)
+        data = container.data
+        if container.cells is not None and interpreter.layout is not None:
+            data = pack_texts(interpreter.layout, container.cells)
         if simple is not None and not sequenced:
             context = self._context(container.application, endian, camera, number, at)
-            value = run_plain(simple, container.data, context)
+            value = run_plain(simple, data, context)
             return Interpreted(value, None, context.empty_slots)
         order = byte_order(endian)
         context = Context(
             camera, container.application, number, at, order, self._y_down, self._lenient
         )
-        reader = Reader(container.data, context, interpreter.layout)
+        reader = Reader(data, context, interpreter.layout)
         value = run(interpreter, reader)
         sequence = run_sequence(interpreter, reader) if sequenced else None
         return Interpreted(value, sequence, context.empty_slots)

@@ -86,5 +86,7 @@ class _Watch:
 
     @property
     def _loading(self) -> bool:
-        """A switch is under way, ours or somebody else's."""
-        return m.SwitchAnswer in self._talk.inbox.answers or self._talk.status.loading
+        """A switch is under way, ours or somebody else's, or a trigger that will be answered."""
+        owed = self._talk.inbox.answers
+        loads = m.SwitchAnswer in owed or m.TriggerAnswer in owed
+        return loads or self._talk.status.loading

@@ -22,6 +22,7 @@ __all__ = [
     "ApplicationChanged",
     "ByteOrder",
     "CameraEvent",
+    "Capabilities",
     "Connected",
     "Disconnected",
     "Header",
@@ -45,8 +46,11 @@ ByteOrder = Literal["little", "big"]
 class Status(enum.IntFlag):
     """The camera's status word. Bits not named here are kept.
 
-    Source: SC manual p. 30 and p. 33 (published) for the seven bits and their values; the bits
-    need not be reset by the client, when a state ends the camera sends a status without it.
+    Source: SC manual p. 30 and p. 33 (published) for the first seven bits and their values; the
+    bits need not be reset by the client, when a state ends the camera sends a status without it.
+    Where a dialect's own word differs, its table says which of its bits is which of these; what has
+    no like here stands 32 bits higher than on the wire. In ``bid`` Overtriggered is the Trigger
+    Error, which stays set until the errors are reset.
     """
 
     OVERHEAT = 0x001
@@ -63,6 +67,8 @@ class Status(enum.IntFlag):
     """A trigger was dropped; transient."""
     WAITING_FOR_TRIGGER = 0x200
     """The camera would take a trigger now."""
+    SIMULATION_MODE = 0x8_0000_0000
+    """``bid``: the images come from files (BVS ID guide p. 210, published)."""
 
     @classmethod
     def _missing_(cls, value: object) -> Any:
@@ -108,7 +114,7 @@ _NAMED_BITS = sum(member.value for member in Status)
 
 def as_status(word: int) -> Status:
     """Return the status of a word; for the receiving path, where ``Status(word)`` is slow."""
-    known = Status._value2member_map_.get(word)  # of named bits only, so at most 128
+    known = Status._value2member_map_.get(word)  # of named bits only, so at most 256
     return Status(word) if known is None else cast("Status", known)
 
 
@@ -204,6 +210,50 @@ class Result(NamedTuple):
     latency: float | None
     raw: bytes
     value: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Capabilities:
+    """What a camera can do in the dialect that it speaks; what it cannot is an UnsupportedError.
+
+    Attributes:
+        dialect: the dialect's name.
+        switch: load another application by its id.
+        load_file: load an application by the name of its file.
+        start_stop: enter and leave run mode; otherwise the camera always runs.
+        reboot: restart.
+        get_clock: tell the time.
+        set_clock: have the clock set.
+        input_data: take input data for an inspection.
+        sequence_number: have the number of the next run set.
+        result_codes: commands are acknowledged, or refused with a code.
+        status_by_itself: the status comes with the session and at every change.
+        get_status: the status can be asked for.
+        reset_errors: error bits stay set until they are reset.
+        unasked_results: results come without a trigger of this client.
+        read_image: the last picture can be read.
+    """
+
+    dialect: str
+    switch: bool = False
+    load_file: bool = False
+    start_stop: bool = False
+    reboot: bool = False
+    get_clock: bool = False
+    set_clock: bool = False
+    input_data: bool = False
+    sequence_number: bool = False
+    result_codes: bool = False
+    status_by_itself: bool = False
+    get_status: bool = False
+    reset_errors: bool = False
+    unasked_results: bool = False
+    read_image: bool = False
+
+    @property
+    def names(self) -> list[str]:
+        """Names of what it can do."""
+        return [f.name for f in dataclasses.fields(self) if getattr(self, f.name) is True]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

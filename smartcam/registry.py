@@ -130,4 +130,7 @@ INTERPRETERS = Registry(
     aliases={"Localizations": "localizations", "50ByteStrings": "strings50"},
 )
 
-PROTOCOLS = Registry("smartcam.protocols", {"bvs": "smartcam.protocols.bvs:BVS"})
+PROTOCOLS = Registry(
+    "smartcam.protocols",
+    {"bvs": "smartcam.protocols.bvs:BVS", "insight": "smartcam.protocols.insight:INSIGHT"},
+)

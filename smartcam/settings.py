@@ -6,7 +6,7 @@ A wrong option is a :exc:`~smartcam.exceptions.ConfigurationError` that names it
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, cast
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError
 
@@ -34,6 +34,9 @@ class Address(NamedTuple):
         host: name or address.
         port: its port.
         dialect: pinned dialect, None to find it out.
+        quirks: pinned deviations from the dialect.
+        parameters: what else the URL says, as the protocol understands it: names and values. They
+            include ``user`` and ``password`` where the protocol has a login.
     """
 
     protocol: str
@@ -41,13 +44,20 @@ class Address(NamedTuple):
     host: str
     port: int
     dialect: str | None = None
+    quirks: tuple[str, ...] = ()
+    parameters: tuple[tuple[str, str], ...] = ()
 
     @property
     def url(self) -> str:
-        """The address as a URL, with everything pinned that is known."""
+        """The address as a URL, with everything pinned that is known; never with a password."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        query = f"?dialect={self.dialect}" if self.dialect else ""
-        return f"{self.scheme}://{host}:{self.port}{query}"
+        user = "".join(quote(value, safe="") + "@" for key, value in self.parameters if key == USER)
+        said = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
+        query = urlencode(
+            [(key, value) for key, value in said if value and key not in {USER, PASSWORD}],
+            safe=",:",
+        )
+        return f"{self.scheme}://{user}{host}:{self.port}{'?' if query else ''}{query}"
 
 
 def parse_address(url: str, *, model: str | None = None) -> Address:
@@ -73,10 +83,11 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         raise ConfigurationError(f"camera address {url!r} has a bracket inside its host")
     if port == 0:
         raise ConfigurationError(f"camera address {url!r}: port 0 is no camera's port")
+    has_login = USER in protocol.parameters
     surplus = [
         name
         for name, value in [
-            ("a user", "@" in parts.netloc),
+            ("a user", "@" in parts.netloc and not has_login),
             ("a path", parts.path.strip("/")),
             ("a fragment", parts.fragment),
         ]
@@ -84,19 +95,61 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     ]
     if surplus:
         raise ConfigurationError(f"camera address {url!r} has {surplus[0]}, which means nothing")
-    dialect = None
-    for key, value in parse_qsl(parts.query, keep_blank_values=True):
-        if key != "dialect":
-            raise ConfigurationError(f"camera address {url!r}: unknown {key!r}; known is 'dialect'")
-        if dialect is not None:
-            raise ConfigurationError(f"camera address {url!r} names two dialects")
-        dialect = value
+    said = _query(url, parts.query, protocol)
+    if has_login and parts.username is not None:
+        said[USER], said[PASSWORD] = unquote(parts.username), unquote(parts.password or "")
+    dialect, quirks = said.pop("dialect", None), said.pop("quirks", "")
     if dialect is not None and dialect not in protocol.dialects:
         raise ConfigurationError(
             f"camera address {url!r}: {protocol.name} has no dialect {dialect!r}; "
             f"it has {', '.join(protocol.dialects)}"
         )
-    return Address(protocol.name, parts.scheme, parts.hostname, port, dialect)
+    address = Address(
+        protocol.name,
+        parts.scheme,
+        parts.hostname,
+        port,
+        dialect,
+        tuple(sorted({name.strip() for name in quirks.split(",") if name.strip()})),
+        tuple(said.items()),
+    )
+    try:
+        if dialect is None and address.quirks:
+            raise ConfigurationError("quirks are a dialect's: name the dialect, too")
+        protocol.tries(protocol.schemes[address.scheme], dialect, address.quirks, said)
+    except ConfigurationError as exc:
+        raise ConfigurationError(f"camera address {_masked(url)!r}: {exc}") from exc
+    return address
+
+
+USER, PASSWORD = "user", "password"
+"""Parameters that stand before the host in a URL."""
+
+
+def _query(url: str, query: str, protocol: Protocol) -> dict[str, str]:
+    """Return what a URL's query says."""
+    known = ["dialect", "quirks", *(key for key in protocol.parameters if key not in _LOGIN)]
+    said: dict[str, str] = {}
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key not in known:
+            raise ConfigurationError(
+                f"camera address {_masked(url)!r}: unknown {key!r}; known are "
+                f"{', '.join(map(repr, known))}"
+            )
+        if key in said:
+            raise ConfigurationError(f"camera address {_masked(url)!r} names two {key}")
+        said[key] = value
+    return said
+
+
+_LOGIN = frozenset({USER, PASSWORD})
+
+
+def _masked(url: str) -> str:
+    """Return a URL without its password, for error texts."""
+    before, at, after = url.rpartition("@")
+    user, colon, _ = before.partition("://")[2].partition(":")
+    return f"{before.partition('://')[0]}://{user}:***@{after}" if at and colon else url
 
 
 def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:

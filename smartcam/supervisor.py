@@ -240,14 +240,16 @@ class Supervisor:
                 self._inbox.fail(error)  # ends the jobs' waits too
         finally:
             self._reading = False
+            self._talk.end_polling()
             link.abort()
         return error
 
     def _adopt(self, session: Session) -> None:
         inbox, again = self._inbox, self.session is not None
         self.session = session
+        ordered = session.link.machine.transport is Transport.TCP
+        inbox.begin(session.dialect, ordered=ordered)
         self._talk.begin(session.link)
-        inbox.begin(ordered=session.link.machine.transport is Transport.TCP)
         inbox.account.begin(session.link.machine.counters)
         logger.info("%s = connected to %s", self._talk.name, session.address.url)
         kind = Reconnected if again else Connected

@@ -1,28 +1,26 @@
-"""Machines in the states that tests need, one message of each kind, and a dialect of 16 bits."""
+"""Machines in the states that tests need, every dialect, and one message of each kind."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Dialect, MessageRow, Role, Transport
-from smartcam.protocols.bvs import BVS, HANDBOOK, MESSAGES
-from smartcam.protocols.framing import HeaderLayout
+from smartcam.protocols.base import Role, Transport
+from smartcam.protocols.bvs import B16, BID, BVS, HANDBOOK, THESIS
+from smartcam.protocols.framed import FramedDialect
 from smartcam.protocols.machine import TRANSITIONS, Event, Machine, ResultBurst, State
 
-SIXTEEN = Dialect(
-    name="sixteen",
-    header=HeaderLayout(code="H", order="id, length"),
-    word="H",
-    table=tuple(MessageRow(*row) for row in MESSAGES),
-    about="16 bit, no magic number, the message id first",
-    source="made for the tests",
+CODE, NO_ID, BIG_ENDIAN_NUMBER = (
+    B16.with_quirks([name]) for name in ("code", "no_id", "big_endian_number")
 )
-"""No dialect of a camera: the framing that a dialect without a magic number has."""
 
-DIALECTS = (*BVS.dialects.values(), SIXTEEN)
-"""Every dialect of ours, and the one made for the tests."""
+DIALECTS: tuple[FramedDialect, ...] = (HANDBOOK, THESIS, B16, BID, CODE, NO_ID, BIG_ENDIAN_NUMBER)
+"""Every dialect of ours, and each with each of its quirks."""
+
+BY_LABEL = {one.label: one for one in DIALECTS}
+assert {*BVS.dialects.values()} <= {*DIALECTS}
 
 CLOCK = {"year": 2016, "month": 6, "day": 25, "hour": 10, "minute": 11, "second": 12}
 
@@ -45,16 +43,50 @@ EXAMPLES: tuple[m.Message, ...] = (
     m.Start(),
     m.Stop(),
     m.Reboot(),
+    m.DisconnectAnswer(),
+    m.GetStatus(),
+    m.ResetErrors(),
+    m.ResetErrorsAnswer(),
+    m.SetClockAnswer(code=0x10),
+    m.SetInputAnswer(),
+    m.TriggerAnswer(code=0x16),
     m.UnknownMessage(message_id=0x77, payload=b"what"),
 )
-"""One of each kind."""
+"""One of each kind; no dialect has them all."""
+
+
+def carried(dialect: FramedDialect, message: m.Message) -> m.Message:
+    """Return a message as it comes out of a dialect: what it leaves out has its default."""
+    names = dialect.fields(type(message))
+    defaults = {one.name: one.default for one in dataclasses.fields(message)}
+    left_out = {
+        name: defaults[name] for name, _ in m.wire_fields(type(message)) if name not in names
+    }
+    return dataclasses.replace(message, **left_out)
+
+
+def examples(dialect: FramedDialect) -> list[m.Message]:
+    """Return one message of each kind that a dialect has, and one of an id that it has not."""
+    return [
+        *(carried(dialect, one) for one in EXAMPLES[:-1] if dialect.has(type(one))),
+        EXAMPLES[-1],
+    ]
+
+
+EVERYTHING = [(dialect, message) for dialect in DIALECTS for message in examples(dialect)]
+"""Every message of every dialect."""
+
+
+def label(value: object) -> str:
+    """Return what a test's parameter is called."""
+    return value.label if isinstance(value, FramedDialect) else type(value).__name__
 
 
 def machine(
     role: Role,
     state: State = State.IDLE,
     *,
-    dialect: Dialect = HANDBOOK,
+    dialect: FramedDialect = HANDBOOK,
     transport: Transport = Transport.TCP,
     **options: Any,
 ) -> Machine:
@@ -65,7 +97,7 @@ def machine(
 
 
 def client(
-    dialect: Dialect = HANDBOOK, transport: Transport = Transport.TCP, **options: Any
+    dialect: FramedDialect = HANDBOOK, transport: Transport = Transport.TCP, **options: Any
 ) -> Machine:
     """Return a client in a session that it made by its own words."""
     made = Machine(dialect, Role.CLIENT, transport, **options)
@@ -78,7 +110,7 @@ def client(
 
 
 def camera(
-    dialect: Dialect = HANDBOOK, transport: Transport = Transport.TCP, **options: Any
+    dialect: FramedDialect = HANDBOOK, transport: Transport = Transport.TCP, **options: Any
 ) -> Machine:
     """Return a camera in a session."""
     made = Machine(dialect, Role.CAMERA, transport, **options)
@@ -90,16 +122,14 @@ def camera(
     return made
 
 
-def request_for(message: m.Message) -> m.Message | None:
+def request_for(message: m.Message, dialect: FramedDialect = HANDBOOK) -> m.Message | None:
     """Return an example of the request that ``message`` answers, None if it is no answer."""
-    return next(
-        (one for one in EXAMPLES if isinstance(one, m.Request) and one.answer is type(message)),
-        None,
-    )
+    requests = (one for one in examples(dialect) if isinstance(one, m.Request))
+    return next((one for one in requests if one.answer is type(message)), None)
 
 
 def receiver_of(
-    message: m.Message, dialect: Dialect = HANDBOOK, transport: Transport = Transport.TCP
+    message: m.Message, dialect: FramedDialect = HANDBOOK, transport: Transport = Transport.TCP
 ) -> Machine:
     """Return a machine on the other side of ``message``, in a state where it may come."""
     sender = m.Sender.CLIENT if isinstance(message, m.Request) else m.Sender.CAMERA
@@ -108,7 +138,7 @@ def receiver_of(
     legal = [state for state in states if (state, sender, type(message)) in TRANSITIONS]
     if role is Role.CAMERA:
         return machine(role, legal[0], dialect=dialect, transport=transport)
-    request = request_for(message)
+    request = request_for(message, dialect)
     if isinstance(request, m.Connect):
         made = machine(role, dialect=dialect, transport=transport)
     else:

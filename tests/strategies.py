@@ -7,22 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 from hypothesis import strategies as st
 
-from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
 
 __all__ = ["bodies", "chunkings", "garbage", "message_types", "messages", "split", "streams"]
 
 
-def message_types(dialect: Dialect, sender: m.Sender) -> list[type[m.Message]]:
+def message_types(dialect: FramedDialect, sender: m.Sender) -> list[type[m.Message]]:
     """Return the messages of a dialect that ``sender`` may send."""
     return [row.type for row in dialect.table if row.type.sender is sender]
 
 
 def bodies(
-    dialect: Dialect, message_type: type[m.Message], max_data: int = 64
+    dialect: FramedDialect, message_type: type[m.Message], max_data: int = 64
 ) -> st.SearchStrategy[m.Message]:
     """Messages of one type, any value that fits each field's place on the wire."""
     word = {"I": 0xFFFFFFFF, "H": 0xFFFF}[dialect.word]
@@ -31,14 +30,15 @@ def bodies(
         m.Wire.UINT32: st.integers(0, 0xFFFFFFFF),
         m.Wire.DATA: st.binary(max_size=max_data),
     }
-    fields = {name: by_wire[wire] for name, wire in m.wire_fields(message_type)}
+    names = dialect.fields(message_type)
+    fields = {name: by_wire[wire] for name, wire in m.wire_fields(message_type) if name in names}
     if message_type is m.StatusReport:
-        fields["status"] = fields["status"].map(Status)
+        fields["status"] = fields["status"].map(dialect.status_bits.read)
     return st.builds(message_type, **fields)
 
 
 def messages(
-    dialect: Dialect, sender: m.Sender, max_data: int = 64
+    dialect: FramedDialect, sender: m.Sender, max_data: int = 64
 ) -> st.SearchStrategy[m.Message]:
     """Every message that ``sender`` may send."""
     return st.one_of(
@@ -46,7 +46,7 @@ def messages(
     )
 
 
-def garbage(dialect: Dialect, max_size: int = 96) -> st.SearchStrategy[bytes]:
+def garbage(dialect: FramedDialect, max_size: int = 96) -> st.SearchStrategy[bytes]:
     """Bytes without a whole magic number of ``dialect`` in them."""
     magic = dialect.header.magic
     pieces = st.one_of(st.binary(max_size=16), st.sampled_from([magic[:n] for n in range(4)]))
@@ -54,7 +54,7 @@ def garbage(dialect: Dialect, max_size: int = 96) -> st.SearchStrategy[bytes]:
     return joined.filter(lambda data: not magic or magic not in data)
 
 
-def streams(dialect: Dialect, sender: m.Sender) -> st.SearchStrategy[bytes]:
+def streams(dialect: FramedDialect, sender: m.Sender) -> st.SearchStrategy[bytes]:
     """Anything a peer could write: frames, halves of them, wrong lengths, noise."""
     header = dialect.header
     number = st.integers(0, header.max_payload)

@@ -33,7 +33,7 @@ from smartcam.exceptions import ConnectionLostError, FrameError, LocalProtocolEr
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.bvs import HANDBOOK
+from smartcam.protocols.bvs import BVS, HANDBOOK
 from smartcam.protocols.machine import LinkEnded, LinkFailed, Machine, ResultBurst, State
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ async def open_to(
     trace: Callable[[TraceEntry], None] | None = None,
 ) -> Link:
     return await open_link(
-        HANDBOOK, transport, HOST, port, name="cell 1", max_length=1 << 20, trace=trace
+        BVS, [HANDBOOK], transport, HOST, port, name="cell 1", max_length=1 << 20, trace=trace
     )
 
 

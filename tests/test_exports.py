@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 PUBLIC = [
     "ApplicationChanged", "Backoff", "CameraBusyError", "CameraEvent", "CameraFaultError",
-    "CommandRejectedError", "ConfigurationError", "ConnectFailedError", "Connected",
+    "Capabilities", "CommandRejectedError", "ConfigurationError", "ConnectFailedError",
+    "Connected",
     "ConnectionClosedError", "ConnectionLostError", "ConnectionTakenError", "Disconnected",
     "FrameError", "Header", "Histogram", "InputContainerError", "InterpretationError", "Layout",
     "LayoutError", "LinkError", "LocalProtocolError", "Localization", "MessageError",

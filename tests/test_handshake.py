@@ -347,9 +347,9 @@ async def test_establish_silence_names_each_attempt_and_keeps_the_timeout() -> N
 
 
 async def test_establish_unpinned_silence_takes_turns_through_the_dialects() -> None:
-    error = await failure_with(silent, query="", connect_timeout=0.2, connect_attempts=2)
-    dialects = [one.split()[2] for one in error.attempts]
-    assert dialects == ["handbook", "thesis", "handbook", "thesis"]
+    error = await failure_with(silent, query="", connect_timeout=0.3, connect_attempts=2)
+    dialects = [one.partition(": ")[2].partition(" over")[0] for one in error.attempts]
+    assert dialects == 2 * ["b16 or bid", "handbook", "thesis"]
 
 
 async def test_establish_unpinned_dialect_that_answered_is_the_only_one_tried_again() -> None:
@@ -359,8 +359,8 @@ async def test_establish_unpinned_dialect_that_answered_is_the_only_one_tried_ag
         await end(peer)
 
     error = await failure_with(talk, query="", connect_timeout=0.4, connect_attempts=3)
-    dialects = [one.split()[2] for one in error.attempts]
-    assert dialects == ["handbook", "thesis", "thesis", "thesis"]
+    dialects = [one.partition(": ")[2].partition(" over")[0] for one in error.attempts]
+    assert dialects == ["b16 or bid", "handbook", "thesis", "thesis", "thesis"]
 
 
 @pytest.mark.parametrize(
@@ -451,7 +451,7 @@ async def test_establish_nothing_listens_fails_at_once_after_one_try_a_round() -
     with refusing(socket.SOCK_STREAM) as port, pytest.raises(ConnectFailedError) as caught:
         await establish(settings(port, "", connect_attempts=2))
     assert len(caught.value.attempts) == 2
-    assert caught.value.attempts[1].startswith("attempt 2: handbook over TCP: opening the link: ")
+    assert caught.value.attempts[1].startswith("attempt 2: b16 or bid over TCP: opening the link: ")
     assert isinstance(caught.value.__cause__, ConnectionRefusedError)
 
 
@@ -507,9 +507,9 @@ async def test_establish_first_round_is_short_and_later_ones_share_the_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(handshake, "DETECTION_SHARE", 0.02)
-    error = await failure_with(silent, query="", connect_timeout=0.4, connect_attempts=2)
+    error = await failure_with(silent, query="", connect_timeout=0.7, connect_attempts=2)
     waited = [text.rpartition(" for ")[2] for text in error.attempts]
-    assert waited == ["0.0 s", "0.0 s", "0.2 s", "0.2 s"]
+    assert waited == ["0.0 s", "0.0 s", "0.0 s", "0.2 s", "0.2 s", "0.2 s"]
 
 
 # ---------------------------------------------------------------------- cancelling
@@ -596,7 +596,7 @@ async def test_establish_udp_thesis_camera_is_found_with_a_fresh_socket(
     async with datagrams(talk) as camera:
         session = await establish(settings(camera.port, "", scheme="bvs+udp"))
         assert session.dialect is THESIS
-        assert len(camera.clients) == 2
+        assert len(camera.clients) == 3
         await session.link.close(LIMIT)
 
 

@@ -64,6 +64,8 @@ ACCOUNT = SubscriberStatistics(
         (0x180, ["RUNNING", "OVERTRIGGERED"], "RUNNING + OVERTRIGGERED"),
         (0x048, ["0x8", "0x40"], "0x8 + 0x40"),
         (0x8000_0001, ["OVERHEAT", "0x80000000"], "OVERHEAT + 0x80000000"),
+        (0x8_0000_0080, ["RUNNING", "SIMULATION_MODE"], "RUNNING + SIMULATION_MODE"),
+        (0x1000_0000_0080, ["RUNNING", "0x100000000000"], "RUNNING + 0x100000000000"),
     ],
 )
 def test_status_names_are_lowest_first_and_unknown_bits_hex(
@@ -84,10 +86,11 @@ def test_status_bits_are_the_manuals() -> None:
         "RUNNING": 0x080,
         "OVERTRIGGERED": 0x100,
         "WAITING_FOR_TRIGGER": 0x200,
+        "SIMULATION_MODE": 0x8_0000_0000,
     }
 
 
-@given(value=st.integers(0, 0xFFFFFFFF))
+@given(value=st.integers(0, 0xFFFF_FFFF_FFFF))
 def test_status_any_word_is_kept_and_named(value: int) -> None:
     names = Status(value).names
     assert len(names) == value.bit_count()

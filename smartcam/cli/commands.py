@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import smartcam
-from smartcam.cli import decoding, demo, probing
+from smartcam.cli import decoding, demo, doctoring, probing
 from smartcam.cli.options import (
     CONNECTS,
+    SECONDS,
     Options,
     camera_options,
     output_options,
@@ -46,12 +47,53 @@ def command() -> None:
     """
 
 
-@command.command(help=f"Find out how a camera speaks; HOST or URL. {CONNECTS}")
+@command.command(
+    help="Find out how a camera speaks; HOST or URL. Tries transports and dialects, the most "
+    f"probable first, until one is answered; --timeout bounds all of it. {CONNECTS}"
+)
 @click.argument("host_or_url")
+@click.option("--all", "go_on", is_flag=True, help="Try the rest too where one is answered.")
 @camera_options
-def probe(host_or_url: str, **shared: Any) -> None:
+def probe(host_or_url: str, go_on: bool, **shared: Any) -> None:
     options = Options(**shared)
-    run(probing.probe(host_or_url, options), program="smartcam", debug=options.debug)
+    run(probing.probe(host_or_url, options, go_on=go_on), program="smartcam", debug=options.debug)
+
+
+@command.command(
+    help="Say what is wrong, in plain words and with the cure: name, session, status, application, "
+    "round trip, run state, results, clock. Changes nothing on the camera and triggers nothing, "
+    f"unless --trigger is given. Exit code: that of the worst finding. {CONNECTS}"
+)
+@click.argument("url")
+@click.option(
+    "--trigger",
+    "with_triggers",
+    is_flag=True,
+    help="Send triggers; load and start --application for them, and go back afterwards.",
+)
+@click.option(
+    "--application",
+    type=click.IntRange(0, 0xFFFFFFFF),
+    help="The application that should be active; only compared, unless --trigger is given.",
+)
+@click.option(
+    "--interpret-as", metavar="SPEC", help="Compare results with this layout or interpreter."
+)
+@click.option("--y-down", is_flag=True, help="The camera's y axis points down.")
+@click.option("--count", type=click.IntRange(1, 10_000), help="How many triggers; 10 by default.")
+@click.option(
+    "--seconds", type=SECONDS, help="How long to watch what comes by itself; 3 by default."
+)
+@camera_options
+def doctor(url: str, with_triggers: bool, **shared: Any) -> None:
+    options = Options(**shared)
+
+    async def main() -> None:
+        code = await doctoring.doctor(url, options, trigger=with_triggers)
+        if code:
+            raise SystemExit(code)
+
+    run(main(), program="smartcam", debug=options.debug)
 
 
 @command.command(help=f"Show a camera's status; changes nothing on it. {CONNECTS}")

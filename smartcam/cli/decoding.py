@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.cli.texts import table_text, value_text
 from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
-from smartcam.handshake import load_protocol
 from smartcam.interpreters.base import Context, Interpreter, Reader, resolve, run
 from smartcam.protocols._layouts import view_fields
+from smartcam.protocols.bvs import BVS
 from smartcam.protocols.framing import Framer
 from smartcam.protocols.messages import ResultContainer, Sender
 
 if TYPE_CHECKING:
     from smartcam.cli.options import Options
     from smartcam.models import ByteOrder
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.framing import Frame
 
 __all__ = ["decode", "from_hex"]
@@ -74,8 +74,8 @@ def _load(data: str) -> bytes:
         return raw  # a binary file
 
 
-def _dialect_of(payload: bytes) -> Dialect | None:
-    for dialect in load_protocol("bvs").dialects.values():
+def _dialect_of(payload: bytes) -> FramedDialect | None:
+    for dialect in BVS.dialects.values():
         if dialect.header.magic and payload.startswith(dialect.header.magic):
             return dialect
     return None
@@ -83,7 +83,7 @@ def _dialect_of(payload: bytes) -> Dialect | None:
 
 def _decode_frames(
     payload: bytes,
-    dialect: Dialect,
+    dialect: FramedDialect,
     interpreter: Interpreter | None,
     byte_order: ByteOrder,
     options: Options,
@@ -106,7 +106,7 @@ def _decode_frames(
 def _show_frame(
     frame: Frame,
     offset: int,
-    dialect: Dialect,
+    dialect: FramedDialect,
     interpreter: Interpreter | None,
     byte_order: ByteOrder,
     options: Options,
@@ -136,7 +136,7 @@ def _show_frame(
         options.show(shown, "\n".join(lines))
 
 
-def _senders(dialect: Dialect, frame: Frame) -> list[Sender]:
+def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
     """Return whose message the frame can be, by id and size; both where neither fits."""
     exact = [
         sender

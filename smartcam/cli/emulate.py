@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Any, Literal
+import importlib
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -12,11 +13,18 @@ import smartcam
 from smartcam.cli.options import Options, output_options
 from smartcam.cli.running import run
 from smartcam.emulator import EmulatedCamera, load_scenario
-from smartcam.handshake import load_protocol
+from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.layout.files import YAML_ALSO_RAISES
+from smartcam.protocols.bvs import BVS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from smartcam.emulator import Scenario
 
 __all__ = ["command"]
 
-DIALECTS = tuple(load_protocol("bvs").dialects)
+DIALECTS = tuple(BVS.dialects)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -38,6 +46,14 @@ DIALECTS = tuple(load_protocol("bvs").dialects)
 @click.option(
     "--cameras", type=click.IntRange(1, 10_000), default=1, show_default=True, help="How many."
 )
+@click.option(
+    "--quirk",
+    "quirks",
+    multiple=True,
+    metavar="NAME[=VALUE]",
+    help="Choose what is not known of real cameras; without a value it is on. Repeatable; goes "
+    "before the scenario's.",
+)
 @output_options
 @click.version_option(smartcam.__version__)
 def command(
@@ -47,6 +63,7 @@ def command(
     dialect: str,
     transport: Literal["tcp", "udp"],
     cameras: int,
+    quirks: tuple[str, ...],
     **shared: Any,
 ) -> None:
     """Emulate smart cameras, over real TCP or UDP, until Ctrl-C or SIGTERM.
@@ -59,6 +76,7 @@ def command(
 
     async def main() -> None:
         loaded = None if scenario is None else load_scenario(scenario)
+        chosen = _quirks(loaded, quirks)
         async with contextlib.AsyncExitStack() as stack:
             for index in range(cameras):
                 emulator = EmulatedCamera(
@@ -67,6 +85,7 @@ def command(
                     port=port + index if port else 0,
                     dialect=dialect,
                     transport=transport,
+                    quirks=chosen,
                     name=f"camera{index + 1}" if cameras > 1 else None,
                 )
                 await stack.enter_async_context(emulator)
@@ -80,6 +99,36 @@ def command(
         interrupted=0,
         terminated=0,
     )
+
+
+def _quirks(scenario: Scenario | None, given: Iterable[str]) -> dict[str, Any] | None:
+    """Return the quirks that were given, with those of the scenario behind them; None for none.
+
+    Raises:
+        ConfigurationError: a value is no YAML.
+        MissingExtraError: PyYAML is not installed.
+    """
+    options = dict(_quirk(text) for text in given)
+    if not options:
+        return None
+    before = {} if scenario is None else scenario.quirks.model_dump(exclude_unset=True)
+    return {**before, **options}
+
+
+def _quirk(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        return name, True
+    try:
+        yaml: Any = importlib.import_module("yaml")
+    except ImportError as exc:
+        raise MissingExtraError(
+            '--quirk NAME=VALUE needs PyYAML: pip install "smartcam[yaml]"', extra="yaml"
+        ) from exc
+    try:
+        return name, yaml.safe_load(value)
+    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
+        raise ConfigurationError(f"--quirk {text}: {exc}") from exc
 
 
 def _announce(emulator: EmulatedCamera, options: Options) -> None:

@@ -2,132 +2,94 @@
 
 from __future__ import annotations
 
-import asyncio
+from contextlib import aclosing
 from typing import TYPE_CHECKING
 
 from smartcam.cli.options import camera_url
-from smartcam.exceptions import ConnectFailedError, SmartCamError
-from smartcam.handshake import Session, Try, attempt, load_protocol
-from smartcam.models import Status
-from smartcam.protocols.framing import DEFAULT_MAX_LENGTH
-from smartcam.protocols.messages import StatusReport
+from smartcam.exceptions import ConnectFailedError
+from smartcam.probing import trials
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from smartcam.cli.options import Options
     from smartcam.connection import TraceEntry
-    from smartcam.settings import Address
+    from smartcam.probing import Answer, Trial
 
-__all__ = ["probe"]
+__all__ = ["frame_text", "probe"]
+
+MAX_HEX = 128
+"""Hex digits of a frame that a line shows; ``--json`` and ``--trace`` have all."""
 
 
-async def probe(host_or_url: str, options: Options) -> None:
-    """Try transports and dialects, one after the other on fresh links, until one answers."""
+async def probe(host_or_url: str, options: Options, *, go_on: bool = False) -> None:
+    """Try transports and dialects, one after the other on fresh links.
+
+    Args:
+        host_or_url: where.
+        options: the shared ones.
+        go_on: try the rest too where one answers.
+
+    Raises:
+        ConnectFailedError: none answered; names each try.
+    """
     address = parse_address(camera_url(host_or_url))
-    candidates = _candidates(address)
-    share = options.step(10.0) / len(candidates)
+    answers: list[Answer] = []
     failed: list[str] = []
-    with options.tracing() as write:
-        for candidate in candidates:
-            progress = Try(candidate.dialect or "", "")
-            frames: list[TraceEntry] = []
-
-            def note(entry: TraceEntry, frames: list[TraceEntry] = frames) -> None:
-                frames.append(entry)
-                if write is not None:
-                    write(entry)
-
-            session = await _try(candidate, progress, share, note)
-            try:
-                _show_try(progress, frames, options)
-                if session is not None:
-                    _show_session(session, options)
-                    return
-            finally:
-                if session is not None:
-                    await session.link.close(1.0)
-            failed.append(str(progress))
-    raise ConnectFailedError(
-        f"no session with {address.host}:{address.port}: " + "; ".join(failed),
-        host=address.host,
-        port=address.port,
-        attempts=tuple(failed),
-    )
+    with options.tracing() as trace:
+        timeout = options.step(10.0)
+        async with aclosing(trials(address, timeout=timeout, trace=trace, go_on=go_on)) as tries:
+            async for trial in tries:
+                _show_trial(trial, options)
+                if trial.answer is not None:
+                    answers.append(trial.answer)
+                else:
+                    failed.append(str(trial))
+    if not answers:
+        raise ConnectFailedError(
+            f"no session with {address.host}:{address.port}: " + "; ".join(failed),
+            host=address.host,
+            port=address.port,
+            attempts=tuple(failed),
+        )
+    _show_answers(answers, options)
 
 
-def _candidates(address: Address) -> list[Address]:
-    """Return every way to speak to it, what the URL says first."""
-    protocol = load_protocol(address.protocol)
-    ways = [
-        address._replace(scheme=scheme, dialect=dialect)
-        for scheme in protocol.schemes
-        for dialect in protocol.dialects
-    ]
-    return sorted(
-        ways,
-        key=lambda way: (
-            way.scheme != address.scheme,
-            way.dialect != (address.dialect or way.dialect),
-        ),
-    )
-
-
-async def _try(
-    candidate: Address, progress: Try, share: float, note: Callable[[TraceEntry], None]
-) -> Session | None:
-    protocol = load_protocol(candidate.protocol)
-    transport = protocol.schemes[candidate.scheme]
-    progress.transport = transport.value
-    try:
-        async with asyncio.timeout(share):
-            session = await attempt(
-                candidate,
-                protocol.dialects[progress.dialect],
-                transport,
-                progress=progress,
-                name=f"{candidate.host}:{candidate.port}",
-                max_length=DEFAULT_MAX_LENGTH,
-                trace=note,
-            )
-    except (OSError, UnicodeError, SmartCamError) as exc:
-        progress.end(exc, share)
-    else:
-        progress.outcome = "session"
-        return session
-    return None
-
-
-def _show_try(progress: Try, frames: list[TraceEntry], options: Options) -> None:
-    value = {
-        "transport": progress.transport,
-        "dialect": progress.dialect,
-        "step": progress.step,
-        "outcome": progress.outcome,
-        "frames": frames,
-    }
-    lines = [f"{progress.transport} {progress.dialect}: {progress.step}: {progress.outcome}"]
-    if progress.outcome == "session":
-        lines = [f"{progress.transport} {progress.dialect}: a camera answers"]
-    for entry in frames:
+def frame_text(entry: TraceEntry) -> str:
+    """Return an entry as a line: what it is, its fields, its bytes; broken bytes as text too."""
+    data = entry.hex[:MAX_HEX] + ("..." if len(entry.hex) > MAX_HEX else "")
+    if entry.direction != "!":
         fields = ", ".join(f"{name}={value}" for name, value in (entry.fields or {}).items())
-        lines.append(f"  {entry.direction} {entry.message}({fields})  {entry.hex[:128]}")
+        return f"{entry.direction} {entry.message}({fields})  {data}"
+    raw = bytes.fromhex(entry.hex)[: MAX_HEX // 2]
+    text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in raw)
+    return f"! {entry.message}" + (f"  {data}  '{text}'" if raw else "")
+
+
+def _show_trial(trial: Trial, options: Options) -> None:
+    value = {
+        "transport": trial.transport,
+        "dialect": trial.dialect,
+        "step": trial.step,
+        "outcome": trial.outcome,
+        "frames": trial.frames,
+        "omitted": trial.omitted,
+    }
+    outcome = f"{trial.step}: {trial.outcome}" if trial.answer is None else "a camera answers"
+    lines = [f"{trial.transport} {trial.dialect}: {outcome}"]
+    lines += [f"  {frame_text(entry)}" for entry in trial.frames]
+    if trial.omitted:
+        lines.append(f"  ... and {trial.omitted} more")
     options.show(value, "\n".join(lines))
 
 
-def _show_session(session: Session, options: Options) -> None:
-    status = Status(0)
-    for chunk in session.early:
-        for event in chunk.events:
-            if isinstance(event, StatusReport):
-                status = event.status
+def _show_answers(answers: list[Answer], options: Options) -> None:
+    first, *more = answers
+    lines = [f"status: {first.status}", *(f"also: {one.url}" for one in more), f"use: {first.url}"]
     value = {
-        "url": session.address.url,
-        "status": status,
-        "protocol_version": session.version,
+        "url": first.url,
+        "status": first.status,
+        "protocol_version": first.protocol_version,
+        "application": first.application,
+        "also": [one.url for one in more],
     }
-    options.show(
-        value,
-        f"status: {status}\nuse: {session.address.url}",
-    )
+    options.show(value, "\n".join(lines))

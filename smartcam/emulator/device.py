@@ -19,12 +19,14 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.emulator.clock import NANOSECONDS
+from smartcam.emulator.manner import SMART_CAMERA, Manner
 from smartcam.emulator.parts import LOST_CLOCK, CalendarClock, InputQueue, RunChange
 from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scene import TableScene
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
+from smartcam.protocols.bvs import ResultCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -102,6 +104,7 @@ class Device:
         quirks: what is not known about real cameras.
         clock_time: what its clock shows at first; a time without a zone is taken as it is.
         scene: the table it looks at.
+        manner: how it behaves in its dialect.
 
     Attributes:
         around: every operator's action (:meth:`start`, :meth:`stop`, :meth:`trigger`,
@@ -122,7 +125,9 @@ class Device:
         quirks: Quirks | None = None,
         clock_time: datetime = LOST_CLOCK,
         scene: TableScene | None = None,
+        manner: Manner = SMART_CAMERA,
     ) -> None:
+        self.manner: Manner = manner
         self._applications = _by_id(applications)
         self.quirks: Quirks = quirks or Quirks()
         self.scene: TableScene = scene or TableScene()
@@ -143,9 +148,11 @@ class Device:
         self._held_busy = False
         self._trigger_drops = 0  # triggers still to be dropped
         self._change = RunChange()  # of the inspection under way, else of the next
-        self._inputs = InputQueue(self.quirks.input_queue_depth)
+        # a reference value is there until the next one, it does not queue
+        depth = 1 if manner.acknowledges else self.quirks.input_queue_depth
+        self._inputs = InputQueue(depth)
         self._clock = CalendarClock(clock_time, self._now)
-        if running:
+        if running or manner.runs_always:
             self._enter_run_mode()
 
     # ------------------------------------------------------------------ what it is
@@ -224,6 +231,8 @@ class Device:
         mode = self._mode
         if mode is Mode.SWITCHING or self._held_busy:
             word |= _BUSY
+        if self.manner.runs_always and (mode is not Mode.RUNNING or self._faulty):
+            word |= _BUSY  # not Ready
         if mode is Mode.RUNNING:
             word |= _RUNNING
             if self._processing:
@@ -244,7 +253,9 @@ class Device:
         if isinstance(message, m.Connect):
             self.connect()
         elif isinstance(message, m.Disconnect):
+            answered = self._session and self.manner.answers_disconnect
             self.disconnect()
+            self._output = [m.DisconnectAnswer()] if answered else []
         elif self._session:
             self._obey(message)
         self._advance(self._now)
@@ -252,12 +263,15 @@ class Device:
     def connect(self) -> None:
         """Begin a session: the answer, then a status, whatever it is.
 
-        Source: SC manual p. 28, 29 (published).
+        Source: SC manual p. 28, 29 (published); that in ``bid`` no status comes: inferred.
         """
         self._session, self._owes_switch = True, False
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
         self._reported = None
-        self._report()
+        if self.manner.status_with_session:
+            self._report()
+        else:
+            self._reported = (self._status_word(), self._endian)
 
     def disconnect(self) -> None:
         """End the session; the camera goes on with what it does, in silence.
@@ -428,17 +442,21 @@ class Device:
     def _obey(self, message: m.Message) -> None:
         match message:
             case m.Trigger():
+                self._acknowledge(message, self._ready_code)
                 self._trigger()
             case m.Query():
-                self._say(m.QueryAnswer(application=self._active.id))
+                self._say(self._name_active())
             case m.SwitchApplication(application=application):
                 self._switch(application)
             case m.GetClock():
-                self._say(self._clock.answer(self._now))
+                code = ResultCode.OK_DATE_TIME if self.manner.coded else 0
+                self._say(self._clock.answer(self._now, code=code))
             case m.SetClock():
-                self._clock.set(message, self._now)
+                done = self._clock.set(message, self._now)
+                self._acknowledge(message, ResultCode.OK if done else ResultCode.ERROR)
             case m.SetInput(data=data):
-                self._take_input(data)
+                done = self._take_input(data)
+                self._acknowledge(message, ResultCode.OK if done else ResultCode.ERROR)
             case m.SetSequenceNumber(number=number):
                 self._next_number = number
             case m.Start():
@@ -447,8 +465,44 @@ class Device:
                 self._leave_run_mode()
             case m.Reboot():
                 self._reboot()
+            case m.GetStatus():
+                self._say_status()
+            case m.ResetErrors():
+                self._reset_errors(message)
+            case m.UnknownMessage(message_id=message_id):
+                self._complain(message_id, ResultCode.INVALID_COMMAND)
+            case m.MalformedMessage(message_id=message_id):
+                self._complain(message_id, ResultCode.ERROR)
             case _:
-                pass  # an unknown message is ignored in silence (SC manual p. 28, published)
+                pass
+
+    def _acknowledge(self, request: m.Request, code: int) -> None:
+        """Answer a request that other cameras do not answer."""
+        answer = request.answer
+        if self.manner.acknowledges and answer and issubclass(answer, m.Acknowledgement):
+            self._say(answer(code=code))
+
+    def _complain(self, message_id: int, code: int) -> None:
+        """Say what is wrong with a message; a smart camera ignores it (SC manual p. 28)."""
+        if self.manner.tells_bad_messages:
+            self._say(m.UnknownMessage(message_id=message_id, payload=code.to_bytes(2, "little")))
+
+    @property
+    def _ready_code(self) -> int:
+        return ResultCode.BUSY if self._status_word() & _BUSY else ResultCode.OK
+
+    def _name_active(self) -> m.QueryAnswer:
+        """Tell the active application; ``bid`` does not while another one is loaded."""
+        if self.manner.acknowledges and self._mode is Mode.SWITCHING:
+            return m.QueryAnswer(code=ResultCode.BUSY, application=0)
+        code = ResultCode.OK_INSPECTION_ID if self.manner.coded else 0
+        return m.QueryAnswer(code=code, application=self._active.id)
+
+    def _reset_errors(self, request: m.ResetErrors) -> None:
+        """Clear the sticky bits; a status follows, whatever was set (BVS ID guide p. 227)."""
+        self._conditions &= ~(_OVERTRIGGERED | _INPUT_CONTAINER)
+        self._acknowledge(request, ResultCode.OK)
+        self._say_status()
 
     def _enter_run_mode(self) -> None:
         if self._mode is not Mode.STOPPED:
@@ -477,21 +531,27 @@ class Device:
         if self._processing or self._trigger_drops:
             self._trigger_drops = max(0, self._trigger_drops - 1)
             self._conditions |= _OVERTRIGGERED
-            self._after(
-                self.quirks.overtriggered_time, _Event.OVERTRIGGER_ENDS, self._end_overtrigger
-            )
+            if not self.manner.sticky_errors:
+                self._after(
+                    self.quirks.overtriggered_time, _Event.OVERTRIGGER_ENDS, self._end_overtrigger
+                )
             self._report()
             return False
         self._begin_run()
         return True
 
     def _switch(self, application: int) -> None:
+        always = self.manner.runs_always
+        if always and self._status_word() & _BUSY:
+            self._say(m.SwitchAnswer(code=ResultCode.BUSY, application=self._active.id))
+            return
         if self._mode is Mode.SWITCHING:
             return  # not answered: inferred
         target = self._applications.get(application)  # 0 is never among them
-        how = self.quirks.switch_while_running if self._mode is Mode.RUNNING else "allow"
+        stopped = always or self._mode is not Mode.RUNNING
+        how = "allow" if stopped else self.quirks.switch_while_running
         if target is None or how == "refuse":
-            self._say(m.SwitchAnswer(code=1, application=self._active.id))
+            self._say(m.SwitchAnswer(code=self.manner.refused, application=self._active.id))
         elif how == "allow":
             self._load(target, answer=True, running=False)
 
@@ -559,7 +619,7 @@ class Device:
         self._report()
         if answer and not before:
             self._say(message)
-        if running:
+        if running or self.manner.runs_always:
             self._enter_run_mode()
 
     def _finish_boot(self) -> None:
@@ -573,6 +633,8 @@ class Device:
         self._conditions &= _OVERHEAT
         self._next_number = self._runs = 0
         self._clock = CalendarClock(LOST_CLOCK, self._now)
+        if self.manner.runs_always:
+            self._enter_run_mode()
 
     # ------------------------------------------------------------------ inspections
 
@@ -669,19 +731,20 @@ class Device:
 
     # ------------------------------------------------------------------ input data
 
-    def _take_input(self, data: bytes) -> None:
-        """Queue a container; one that does not fit the layout is dropped (inferred)."""
+    def _take_input(self, data: bytes) -> bool:
+        """Queue a container; one that does not fit the layout is dropped (inferred): False."""
         layout = self._active.input_layout
         if layout is None or self._mode is Mode.SWITCHING:
-            return
+            return False
         try:
             values: Any = layout.parse(data, self._byte_order)
         except InterpretationError as exc:
             _log.debug("= input data dropped: %s", exc)
-            return
+            return False
         if not self._inputs.put(values._asdict()):
             self._in_step(fits=False)
             self._report()
+        return True
 
     def _next_input(self) -> Mapping[str, Any] | None:
         if self._active.input_layout is None:
@@ -710,9 +773,14 @@ class Device:
     def _report(self) -> None:
         """Send the status if it differs from the one the client has."""
         now = (self._status_word(), self._endian)
-        if now != self._reported:
+        if now != self._reported and self.manner.reports_changes:
             self._reported = now
             self._say(_status_report(*now))
+
+    def _say_status(self) -> None:
+        """Send the status, whatever the client has."""
+        self._reported = now = (self._status_word(), self._endian)
+        self._say(_status_report(*now))
 
     def _known(self, application: int) -> int:
         if application not in self._applications:

@@ -9,13 +9,19 @@ from typing import TYPE_CHECKING, Any
 from smartcam.emulator.faults import (
     MAX_FAULTS,
     MAX_FIRED,
+    MESSAGE_NAMES,
     FiredFault,
     Insert,
     SwitchApplication,
     WireFault,
     make_faults,
 )
-from smartcam.exceptions import ConfigurationError, LocalProtocolError, MessageError
+from smartcam.exceptions import (
+    ConfigurationError,
+    LocalProtocolError,
+    MessageError,
+    UnsupportedError,
+)
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
@@ -23,7 +29,7 @@ if TYPE_CHECKING:
 
     from smartcam.emulator.clock import Clock
     from smartcam.emulator.faults import BaseFault, Fault
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.framing import Frame
 
 __all__ = ["FaultQueue", "Row"]
@@ -75,7 +81,9 @@ class FaultQueue:
         fired: the last faults that have happened, oldest first.
     """
 
-    def __init__(self, dialect: Dialect, clock: Clock, applications: Container[int] = ()) -> None:
+    def __init__(
+        self, dialect: FramedDialect, clock: Clock, applications: Container[int] = ()
+    ) -> None:
         self.said: list[Row] = []
         self.heard: list[Row] = []
         self.device_said: list[Row] = []
@@ -159,11 +167,20 @@ class FaultQueue:
 
     def _check(self, number: int, fault: Fault) -> None:
         """Refuse what this camera cannot do."""
+        if isinstance(fault.on, str) and not self._dialect.has(MESSAGE_NAMES[fault.on]):
+            raise ConfigurationError(
+                f"fault {number}: {fault.kind}.on: dialect {self._dialect.label} has no {fault.on}"
+            )
         if isinstance(fault, Insert) and fault.word is not None:
             try:
                 self._dialect.encode(fault.word)
             except LocalProtocolError as exc:
                 raise ConfigurationError(f"fault {number}: insert.fields: {exc}") from exc
+            except UnsupportedError as exc:
+                raise ConfigurationError(
+                    f"fault {number}: insert.message: dialect {self._dialect.label} has no "
+                    f"{fault.message}"
+                ) from exc
         if isinstance(fault, SwitchApplication) and fault.application not in self._applications:
             raise ConfigurationError(
                 f"fault {number}: switch_application.application: the camera has no application "

@@ -21,6 +21,7 @@ There is no chance in any of it: the same list and the same messages give the sa
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 from pydantic import (
@@ -40,6 +41,7 @@ from pydantic import (
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
+from smartcam.protocols.bvs import BVS
 from smartcam.settings import validation_text
 
 if TYPE_CHECKING:
@@ -92,11 +94,7 @@ MAX_BYTES = 1 << 16
 """Bytes that one fault inserts: about as many as the largest container has."""
 
 MESSAGE_NAMES: Mapping[str, type[m.Message]] = {
-    name: kind
-    for name, kind in vars(m).items()
-    if isinstance(kind, type)
-    and issubclass(kind, m.Message)
-    and kind not in {m.Message, m.Request, m.Report, m.UnknownMessage}
+    row.type.__name__: row.type for dialect in BVS.dialects.values() for row in dialect.table
 }
 """The messages that a fault can name, by the name of their class."""
 
@@ -467,7 +465,8 @@ def _build(name: str, fields: Mapping[str, int | str]) -> m.Message:
     try:
         return kind(**values)
     except TypeError:
-        missing = ", ".join(key for key in wire if key not in values)
+        needed = [f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING]
+        missing = ", ".join(key for key in needed if key not in values)
         raise ValueError(f"{name} needs values for {missing}") from None
 
 

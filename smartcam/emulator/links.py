@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import logging
 import os
 import socket
@@ -25,6 +26,7 @@ from smartcam.protocols.machine import Machine, State
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from smartcam.emulator.device import Device
     from smartcam.emulator.parcels import Parcel
     from smartcam.emulator.quirks import Quirks
     from smartcam.protocols.framing import Frame
@@ -73,12 +75,24 @@ BAD_FRAME: Mapping[str, Policy] = {
 """What the quirk ``bad_frame`` means on TCP; a broken body or an unknown id never matters."""
 
 
+def _policy(station: Station, transport: Transport) -> Policy:
+    """Return what is done with broken input."""
+    tcp = transport is Transport.TCP
+    policy = BAD_FRAME[station.quirks.bad_frame] if tcp else POLICIES[Role.CAMERA, transport]
+    return dataclasses.replace(policy, tells=station.device.manner.tells_bad_messages)
+
+
 class Station(Watch, Protocol):
     """What links want from the emulator behind them."""
 
     @property
     def quirks(self) -> Quirks:
         """The quirks."""
+        ...
+
+    @property
+    def device(self) -> Device:
+        """The camera behind the wire."""
         ...
 
     def received(self, link: Link, message: m.Message) -> None:
@@ -116,7 +130,7 @@ class Link(ABC):
             Role.CAMERA,
             transport,
             max_length=MAX_INPUT,
-            policy=BAD_FRAME[station.quirks.bad_frame] if transport is Transport.TCP else None,
+            policy=_policy(station, transport),
             trace=self._trace,
         )
         self._passage: Passage | None = None  # there while faults act

@@ -13,7 +13,7 @@ from smartcam.protocols.framing import Frame, Framer
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
 
 __all__ = ["Cutter", "Ending", "Parcel", "cut_datagram", "mangle"]
 
@@ -164,7 +164,7 @@ _CHANGES: Mapping[type[object], Callable[[Any, Parcel], None]] = {
 # ---------------------------------------------------------------------- all parcels of a message
 
 
-def _duplicate(fault: f.Duplicate, parcels: list[Parcel], dialect: Dialect) -> list[Parcel]:
+def _duplicate(fault: f.Duplicate, parcels: list[Parcel], dialect: FramedDialect) -> list[Parcel]:
     result: list[Parcel] = []
     for parcel in parcels:
         result.append(parcel)
@@ -174,7 +174,7 @@ def _duplicate(fault: f.Duplicate, parcels: list[Parcel], dialect: Dialect) -> l
     return result
 
 
-def _insert(fault: f.Insert, parcels: list[Parcel], dialect: Dialect) -> list[Parcel]:
+def _insert(fault: f.Insert, parcels: list[Parcel], dialect: FramedDialect) -> list[Parcel]:
     places = [number for number, parcel in enumerate(parcels) if parcel.changeable]
     if not places:
         return parcels
@@ -190,7 +190,7 @@ def _insert(fault: f.Insert, parcels: list[Parcel], dialect: Dialect) -> list[Pa
     return [*parcels[: places[-1] + 1], new, *parcels[places[-1] + 1 :]]
 
 
-def _inserted(fault: f.Insert, dialect: Dialect) -> Parcel:
+def _inserted(fault: f.Insert, dialect: FramedDialect) -> Parcel:
     word = fault.word
     data = dialect.encode(word) if word is not None else fault.data or b""
     parcel = cut_datagram(data, dialect)
@@ -202,7 +202,7 @@ def _inserted(fault: f.Insert, dialect: Dialect) -> Parcel:
 def _end(
     fault: f.HalfOpen | f.Reset | f.Close,
     parcels: list[Parcel],
-    dialect: Dialect,
+    dialect: FramedDialect,
 ) -> list[Parcel]:
     seconds = fault.seconds if isinstance(fault, f.HalfOpen) else None
     if fault.when == "before":
@@ -214,7 +214,7 @@ def _end(
     return parcels
 
 
-_REBUILDS: Mapping[type[object], Callable[[Any, list[Parcel], Dialect], list[Parcel]]] = {
+_REBUILDS: Mapping[type[object], Callable[[Any, list[Parcel], FramedDialect], list[Parcel]]] = {
     f.Duplicate: _duplicate,
     f.Insert: _insert,
     f.HalfOpen: _end,
@@ -224,7 +224,7 @@ _REBUILDS: Mapping[type[object], Callable[[Any, list[Parcel], Dialect], list[Par
 """Faults that act on all parcels of a message together."""
 
 
-def mangle(parcel: Parcel, faults: Sequence[f.Fault], dialect: Dialect) -> list[Parcel]:
+def mangle(parcel: Parcel, faults: Sequence[f.Fault], dialect: FramedDialect) -> list[Parcel]:
     """Return what faults make of a message, in the order in which it passes.
 
     Args:
@@ -253,7 +253,7 @@ class Cutter:
         max_length: largest payload accepted, bytes.
     """
 
-    def __init__(self, dialect: Dialect, max_length: int) -> None:
+    def __init__(self, dialect: FramedDialect, max_length: int) -> None:
         self._framer = Framer(dialect.header, max_length)
         self._dialect = dialect
 
@@ -280,7 +280,7 @@ class Cutter:
             parcels.append(Parcel.of(frame, self._dialect.encode_frame(frame)))
 
 
-def cut_datagram(data: bytes, dialect: Dialect) -> Parcel:
+def cut_datagram(data: bytes, dialect: FramedDialect) -> Parcel:
     """Return a datagram as a parcel, with its frame if it is exactly one."""
     parcels = Cutter(dialect, len(data)).cut(data)
     return parcels[0] if [one.original for one in parcels] == [data] else Parcel.of(data, data)

@@ -38,8 +38,8 @@ class CalendarClock:
         except OverflowError:
             return datetime.max.replace(tzinfo=UTC)
 
-    def set(self, message: m.SetClock, now: int) -> None:
-        """Set it; what is no time is dropped.
+    def set(self, message: m.SetClock, now: int) -> bool:
+        """Set it; what is no time is dropped: False.
 
         Source: mvBlueGEMINI manual p. 30 (published): invalid values may be dropped or converted.
         """
@@ -54,13 +54,15 @@ class CalendarClock:
                 tzinfo=UTC,
             )
         except (ValueError, OverflowError):
-            return
+            return False
         self._time, self._set_at = time, now
+        return True
 
-    def answer(self, now: int) -> m.ClockAnswer:
+    def answer(self, now: int, *, code: int = 0) -> m.ClockAnswer:
         """Return what it shows as a message."""
         time = self.read(now)
         return m.ClockAnswer(
+            code=code,
             year=time.year,
             month=time.month,
             day=time.day,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.fault_queue import FaultQueue
     from smartcam.emulator.faults import Fault
     from smartcam.emulator.parcels import Ending
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.machine import Machine
 
 __all__ = ["Carrier", "Passage", "Watch"]
@@ -35,7 +35,7 @@ class Watch(Protocol):
     """What a passage wants from the emulator."""
 
     @property
-    def spoken(self) -> Dialect:
+    def spoken(self) -> FramedDialect:
         """The dialect."""
         ...
 

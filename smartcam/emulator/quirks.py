@@ -91,3 +91,53 @@ class Quirks(BaseModel):
             "p. 31, published for the sibling)."
         ),
     )
+    code: bool = Field(
+        default=False,
+        description=(
+            "b16: answers begin with a result code, as those of BVS ID do. What BVS SC answers in "
+            "this dialect is unknown (off, the bodies of the 32-bit dialects narrowed: inferred)."
+        ),
+    )
+    no_id: bool = Field(
+        default=False,
+        description=(
+            "b16: result containers do not begin with the program's id. The newest SC manual's "
+            "table and two other documents have the id, its example on p. 43 has none (off: the "
+            "example is probably an old one, inferred)."
+        ),
+    )
+    big_endian_number: bool = Field(
+        default=False,
+        description=(
+            "b16: the number of Set sequence number is big endian, as the bytes of the example in "
+            "the newest SC manual, p. 48, are; the manual's general rule is little endian (off: "
+            "the example is probably a misprint, inferred)."
+        ),
+    )
+    disconnect_answer: Literal["code", "silent"] = Field(
+        default="code",
+        description=(
+            "bid: whether a Disconnect is answered. The German BVS ID guide p. 58 shows an answer, "
+            "the English one p. 227 none, both published (code: every request is answered, p. 52)."
+        ),
+    )
+    bad_message: Literal["code", "ignore"] = Field(
+        default="code",
+        description=(
+            "bid: unknown ids are answered with 0x13 and wrong lengths with 0x10 (BVS ID guide "
+            "p. 52, published), or ignored (p. 206, published) (code: recommended)."
+        ),
+    )
+    push_status: bool = Field(
+        default=False,
+        description=(
+            'bid: the option "Send status information automatically": a status with every change '
+            "(BVS ID guide p. 210, published); off, it comes on request only. Its default on the "
+            "device is unknown (off: recommended)."
+        ),
+    )
+
+    @property
+    def of_the_wire(self) -> list[str]:
+        """Names of the dialect's deviations that are on."""
+        return [name for name in ("code", "no_id", "big_endian_number") if getattr(self, name)]

@@ -19,6 +19,7 @@ from smartcam.emulator.device import Device
 from smartcam.emulator.fault_queue import FaultQueue
 from smartcam.emulator.faults import DeviceFault
 from smartcam.emulator.links import TcpListener, UdpListener
+from smartcam.emulator.manner import manner_of
 from smartcam.emulator.port import Port
 from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scenario import Scenario, load_scenario
@@ -29,7 +30,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
 from smartcam.registry import PROTOCOLS
-from smartcam.settings import validation_text
+from smartcam.settings import Address, validation_text
 
 if TYPE_CHECKING:
     from collections import deque
@@ -46,7 +47,8 @@ if TYPE_CHECKING:
     from smartcam.emulator.parcels import Parcel
     from smartcam.emulator.traffic import Log
     from smartcam.exceptions import RemoteProtocolError
-    from smartcam.protocols.base import Dialect, Protocol
+    from smartcam.protocols.base import Protocol
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.framing import Frame
 
 __all__ = ["EmulatedCamera"]
@@ -113,7 +115,8 @@ class EmulatedCamera:
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         transport: ``"tcp"`` or ``"udp"``.
-        dialect: name of the wire dialect.
+        dialect: name of the wire dialect: ``handbook``, ``thesis``, ``b16`` or ``bid``. ``bid``
+            is a BVS ID: it runs always, and answers every request with a result code.
         clock: its time; a :class:`ManualClock` in tests. Default: real time.
         quirks: what is not known of real cameras: :class:`Quirks` or a mapping of its fields.
         name: for logs.
@@ -175,17 +178,21 @@ class EmulatedCamera:
         self.name: str = plan.name
         self.clock: Clock = clock if clock is not None else RealClock()
         self.seed: int = plan.seed
+        self._protocol = cast("Protocol", PROTOCOLS.load("bvs"))
+        dialects = cast("Mapping[str, FramedDialect]", self._protocol.dialects)
+        spoken: FramedDialect = _known(dialects, "dialect", dialect)
+        self.spoken: FramedDialect = spoken.with_quirks(plan.quirks.of_the_wire)
+        _check_ids(plan.all_applications, spoken)
         self.device: Device = Device(
             plan.all_applications,
             active=plan.active,
             running=plan.running,
             quirks=plan.quirks,
             scene=TableScene(seed=plan.seed),
+            manner=manner_of(self.spoken, plan.quirks),
         )
         self._step = _Step(self._begin_step, self._end_step)
         self.device.around = self.step
-        self._protocol = cast("Protocol", PROTOCOLS.load("bvs"))
-        self.spoken: Dialect = _known(self._protocol.dialects, "dialect", dialect)
         kind = _known({t.value: t for t in Transport}, "transport", transport)
         self._scheme = next(s for s, t in self._protocol.schemes.items() if t is kind)
         self._listener: Listener = _LISTENERS[kind](self)
@@ -215,8 +222,8 @@ class EmulatedCamera:
     @property
     def url(self) -> str:
         """Its address with the dialect pinned."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self._scheme}://{host}:{self.port}?dialect={self.dialect}"
+        quirks = self.spoken.quirks
+        return Address("bvs", self._scheme, self.host, self.port, self.dialect, quirks).url
 
     @property
     def scene(self) -> TableScene:
@@ -423,6 +430,7 @@ class EmulatedCamera:
         elif link is self._active:  # a fault may have given the session to another
             self.device.handle(message)
             if isinstance(message, m.Disconnect):
+                self._collect()
                 self._active = None
         self._collect()
         if faults:
@@ -573,6 +581,16 @@ def _known(table: Any, what: str, name: str) -> Any:
             f"emulator: {what} {name!r} is unknown; known are {', '.join(table)}"
         )
     return table[name]
+
+
+def _check_ids(applications: Iterable[Application], dialect: FramedDialect) -> None:
+    ids = dialect.application_ids
+    for application in applications:
+        if application.id not in ids:
+            raise ConfigurationError(
+                f"emulator: application id {application.id} does not fit dialect {dialect.name}: "
+                f"{ids.start} to {ids.stop - 1}"
+            )
 
 
 def _make_quirks(fields: dict[str, Any]) -> Quirks:

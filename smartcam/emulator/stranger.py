@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.protocols import messages as m
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
 
 __all__ = ["Stranger"]
 
@@ -26,7 +26,7 @@ class Stranger:
 
     peer = "second client"
 
-    def __init__(self, dialect: Dialect, traced: Callable[[Parcel], None]) -> None:
+    def __init__(self, dialect: FramedDialect, traced: Callable[[Parcel], None]) -> None:
         self._dialect = dialect
         self._traced = traced
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from smartcam.emulator.parcels import Parcel
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
 
 __all__ = ["Log", "LogEntry", "TrafficLog"]
 
@@ -78,7 +78,7 @@ class Log(Sequence[LogEntry]):
         maxlen: entries kept.
     """
 
-    def __init__(self, dialect: Dialect, maxlen: int = MAX_ENTRIES) -> None:
+    def __init__(self, dialect: FramedDialect, maxlen: int = MAX_ENTRIES) -> None:
         self.maxlen: int = maxlen
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque(maxlen=maxlen)
@@ -148,7 +148,7 @@ class TrafficLog:
         entries: the last ones.
     """
 
-    def __init__(self, dialect: Dialect) -> None:
+    def __init__(self, dialect: FramedDialect) -> None:
         self.entries: Log = Log(dialect)
         self._dialect = dialect
         self._received: Counter[int | type[Message] | None] = Counter()
@@ -229,13 +229,13 @@ class TrafficLog:
 
 
 @functools.lru_cache(maxsize=256)
-def _kind(dialect: Dialect, message_id: int, size: int) -> type[Message] | None:
+def _kind(dialect: FramedDialect, message_id: int, size: int) -> type[Message] | None:
     """Return which message a client's frame is; id and size of its payload decide that."""
     message = _decode(dialect, Sender.CLIENT, Frame(message_id, bytes(size)))
     return None if message is None else type(message)
 
 
-def _decode(dialect: Dialect, sender: Sender, frame: Frame) -> Message | None:
+def _decode(dialect: FramedDialect, sender: Sender, frame: Frame) -> Message | None:
     """Return what a frame says; None for an unknown id and for a body that does not fit."""
     if dialect.surplus(sender, frame) > 0:
         return None

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import construct as c
 
 from smartcam.exceptions import MessageError, hex_excerpt
-from smartcam.protocols.messages import Wire, wire_fields
+from smartcam.protocols.messages import Wire
 
 if TYPE_CHECKING:
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.messages import Sender
 
 __all__ = ["FieldView", "frame_view", "view_fields"]
@@ -43,13 +43,16 @@ class FieldView(NamedTuple):
 
 
 @functools.cache
-def frame_view(dialect: Dialect, sender: Sender) -> c.Construct:
+def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
     """Return a construct for whole frames from one sender; it parses and builds."""
     integer = {"I": c.Int32ul, "H": c.Int16ul}
-    types = {Wire.WORD: integer[dialect.word], Wire.UINT32: c.Int32ul, Wire.DATA: c.GreedyBytes}
+    types = {
+        "<": {Wire.WORD: integer[dialect.word], Wire.UINT32: c.Int32ul, Wire.DATA: c.GreedyBytes},
+        ">": {Wire.UINT32: c.Int32ub},
+    }
     bodies = {
         row.message_id: c.Struct(
-            *[name / c.RawCopy(types[wire]) for name, wire in wire_fields(row.type)],
+            *[name / c.RawCopy(types[row.byte_order][wire]) for name, wire in row.fields],
             "surplus" / _SURPLUS,
         )
         for row in dialect.table
@@ -74,7 +77,7 @@ def frame_view(dialect: Dialect, sender: Sender) -> c.Construct:
     )
 
 
-def view_fields(dialect: Dialect, sender: Sender, data: bytes) -> list[FieldView]:
+def view_fields(dialect: FramedDialect, sender: Sender, data: bytes) -> list[FieldView]:
     """Return every field of one complete frame, in order; bytes behind them as ``surplus``.
 
     Raises:

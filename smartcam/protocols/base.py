@@ -1,35 +1,43 @@
-"""What a protocol is made of: dialects as data, roles with their policies, the entry point.
+"""What a protocol is made of: dialects, roles with their policies, the entry point.
 
-A :class:`Dialect` joins a header layout and a message table and compiles them to codecs. Who may do
-what with broken input is a :class:`Policy`, chosen by role and transport.
+A :class:`Dialect` is one wire variant as the client knows it, whatever its frames look like;
+``framed.py`` has the one of binary frames. Who may do what with broken input is a :class:`Policy`,
+chosen by role and transport.
 """
 
 from __future__ import annotations
 
 import enum
-import struct
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.exceptions import FrameError, LocalProtocolError, MessageError, hex_excerpt
-from smartcam.models import as_status
-from smartcam.protocols.framing import Buffer, Frame, HeaderLayout
-from smartcam.protocols.messages import (
-    Message,
-    Request,
-    Sender,
-    StatusReport,
-    UnknownMessage,
-    Wire,
-    wire_fields,
-)
+from smartcam.exceptions import ConfigurationError, FrameError, MessageError, UnsupportedError
+from smartcam.protocols.messages import Message, Request, Sender, StatusReport, wire_fields
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from smartcam.exceptions import RemoteProtocolError
+    from smartcam.models import Capabilities
+    from smartcam.protocols.framing import Frame
+    from smartcam.protocols.machine import LinkMachine
 
-__all__ = ["POLICIES", "Codec", "Dialect", "MessageRow", "Policy", "Protocol", "Role", "Transport"]
+    MachineFactory = Callable[..., LinkMachine]
+
+__all__ = [
+    "POLICIES",
+    "UNDOCUMENTED",
+    "Code",
+    "Dialect",
+    "Policy",
+    "Protocol",
+    "RawRequest",
+    "Role",
+    "Spelled",
+    "Transport",
+    "Verdict",
+]
 
 
 class Role(enum.Enum):
@@ -66,10 +74,12 @@ class Policy:
             at the wrong time. Others are dropped and counted.
         exact_length: a known message must have exactly its documented length; otherwise a longer
             body is accepted and counted.
+        tells: a known message of the wrong length is an event instead of being dropped.
     """
 
     fatal: tuple[type[RemoteProtocolError], ...]
     exact_length: bool
+    tells: bool = False
 
 
 POLICIES: Mapping[tuple[Role, Transport], Policy] = {
@@ -81,236 +91,175 @@ POLICIES: Mapping[tuple[Role, Transport], Policy] = {
 }
 
 
-class MessageRow(NamedTuple):
-    """One row of a dialect's message table.
+class Verdict(enum.Enum):
+    """What a result code says of a request."""
+
+    DONE = "done"
+    BUSY = "busy"
+    """Not now; the same request may succeed later."""
+    UNKNOWN = "unknown"
+    """The camera does not know the request."""
+    REFUSED = "refused"
+
+
+class Code(NamedTuple):
+    """What a result code means: in words, and what it says of the request."""
+
+    text: str
+    verdict: Verdict
+
+
+UNDOCUMENTED = Code("not documented", Verdict.REFUSED)
+"""What a result code means that no document has."""
+
+
+class Spelled(NamedTuple):
+    """A frame in words.
 
     Attributes:
-        message_id: id on the wire.
-        type: the message.
-        title: the manual's name.
-        source: where it stands, with its grade.
+        message_id: id on the wire, None where the dialect has no such ids.
+        message: the message's name.
+        fields: its decoded body, None where it cannot be decoded.
+        data: the whole frame's bytes.
     """
 
-    message_id: int
-    type: type[Message]
-    title: str
-    source: str
+    message_id: int | None
+    message: str
+    fields: dict[str, Any] | None
+    data: bytes
 
 
-MAX_KNOWN = 256
-"""Messages kept of each kind; statuses and answers are few, and a peer could send any."""
-
-
-class Codec:
-    """One message of one dialect, compiled.
+class RawRequest(NamedTuple):
+    """A request by its id.
 
     Attributes:
-        type: the message.
-        message_id: its id.
-        size: of the fields that have one, bytes.
-        has_data: whether every byte behind them is a field.
+        message: what to send.
+        answer: what its answer is known by: a message type, or an id.
+        answered: whether the documents say that it is answered; True for an unknown id.
+        known: whether the dialect knows the id.
     """
 
-    __slots__ = (
-        *("_body", "_data", "_fields", "_fill", "_header_size", "_known"),
-        *("has_data", "message_id", "size", "type"),
-    )
-
-    def __init__(self, row: MessageRow, word: str, header_size: int) -> None:
-        fields = wire_fields(row.type)
-        codes = {Wire.WORD: word, Wire.UINT32: "I"}
-        self.type: type[Message] = row.type
-        self.message_id: int = row.message_id
-        self._header_size = header_size
-        self._fields = tuple(name for name, wire in fields if wire is not Wire.DATA)
-        self._data = next((name for name, wire in fields if wire is Wire.DATA), None)
-        self._body = struct.Struct(
-            "<" + "".join(codes[wire] for _, wire in fields if wire is not Wire.DATA)
-        )
-        self.size: int = self._body.size
-        self.has_data: bool = self._data is not None
-        # what fills the slots of a frozen message, in half the time of its own constructor
-        self._known: dict[bytes, Message] = {}  # bodies that came before: messages are immutable
-        self._fill = [vars(row.type)[name].__set__ for name, _ in fields]
-
-    def encode(self, message: Message) -> bytes:
-        """Return a message's body."""
-        body = self._body.pack(*[getattr(message, name) for name in self._fields])
-        return body + getattr(message, self._data) if self._data is not None else body
-
-    def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
-        """Return the message whose body is at a place; bytes behind it are ignored.
-
-        Raises:
-            MessageError: the body is shorter than its message.
-        """
-        if end - begin < self.size:
-            payload = bytes(buffer[begin:end])
-            raise MessageError(
-                f"{self.type.__name__} ({self.message_id:#04x}) came with {len(payload)} bytes, "
-                f"it needs {self.size}: {hex_excerpt(payload)}",
-                offset=self._header_size,
-                data=payload,
-            )
-        behind = begin + self.size
-        if self.has_data:
-            data = bytes(buffer[behind:end])
-            return self._make((*self._body.unpack_from(buffer, begin), data))
-        body = bytes(buffer[begin:behind])
-        message = self._known.get(body)
-        if message is None:
-            values = self._body.unpack(body)
-            if self.type is StatusReport:
-                values = (as_status(values[0]), *values[1:])
-            message = self._make(values)
-            if len(self._known) < MAX_KNOWN:
-                self._known[body] = message
-        return message
-
-    def _make(self, values: tuple[Any, ...]) -> Message:
-        message = object.__new__(self.type)
-        for fill, value in zip(self._fill, values, strict=True):
-            fill(message, value)
-        return message
+    message: Message
+    answer: type[Message] | int
+    answered: bool
+    known: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Dialect:
-    """One wire variant of a protocol, as data.
+class Dialect(ABC):
+    """One wire variant of a protocol: what the client needs to know of it.
 
     Args:
         name: as in ``?dialect=``.
-        header: what a frame's header looks like.
-        word: ``struct`` code of the bodies' ordinary integers: ``I`` or ``H``.
-        table: its messages.
         about: one line for people.
         source: where it is described, with its grade.
     """
 
     name: str
-    header: HeaderLayout
-    word: str
-    table: tuple[MessageRow, ...]
     about: str
     source: str
-    _encoders: dict[type[Message], Codec] = field(
-        init=False, repr=False, default_factory=dict[type[Message], Codec]
-    )
-    _decoders: dict[tuple[Sender, int], Codec] = field(
-        init=False, repr=False, default_factory=dict[tuple[Sender, int], Codec]
-    )
 
-    _answers: dict[int, int | None] = field(
-        init=False, repr=False, default_factory=dict[int, int | None]
-    )
-    # whole frames of the messages that have no body
-    _constant: dict[type[Message], bytes] = field(
-        init=False, repr=False, default_factory=dict[type[Message], bytes]
-    )
+    @property
+    def quirks(self) -> tuple[str, ...]:
+        """Names of the deviations from the dialect that this one has, as in ``?quirks=``."""
+        return ()
 
-    def __post_init__(self) -> None:
-        for row in self.table:
-            codec = Codec(row, self.word, self.header.size)
-            self._encoders[row.type] = codec
-            self._decoders[row.type.sender, row.message_id] = codec
-            if not wire_fields(row.type):
-                self._constant[row.type] = self.encode(row.type())
-        for row in self.table:
-            if issubclass(row.type, Request):
-                answer = row.type.answer
-                self._answers[row.message_id] = None if answer is None else self.message_id(answer)
+    @property
+    def label(self) -> str:
+        """Name and quirks, for people."""
+        return " with quirk ".join((self.name, *([", ".join(self.quirks)] if self.quirks else [])))
 
+    @property
+    @abstractmethod
+    def capabilities(self) -> Capabilities:
+        """What a camera can do in it."""
+
+    @property
+    @abstractmethod
+    def application_ids(self) -> range:
+        """The ids that applications may have."""
+
+    @property
+    def in_order(self) -> bool:
+        """Whether the camera does one thing after the other.
+
+        When a request is answered, all that was asked for before it is over, its result included.
+        """
+        return False
+
+    @abstractmethod
+    def code(self, code: int, request: type[Message] | None = None) -> Code:
+        """Return what a result code means in the answer to a request."""
+
+    @abstractmethod
+    def has(self, message_type: type[Message]) -> bool:
+        """Whether there is such a message."""
+
+    @abstractmethod
     def message_id(self, message: Message | type[Message]) -> int:
-        """Return the id of a message in this dialect."""
-        if isinstance(message, UnknownMessage):
-            return message.message_id
-        return self._encoders[message if isinstance(message, type) else type(message)].message_id
-
-    def message_type(self, sender: Sender, message_id: int) -> type[Message]:
-        """Return the message with this id from this sender, :class:`UnknownMessage` if none."""
-        codec = self._decoders.get((sender, message_id))
-        return codec.type if codec is not None else UnknownMessage
-
-    def encoder(self, message_type: type[Message]) -> Codec:
-        """Return what encodes a message.
+        """Return the id of a message in this dialect.
 
         Raises:
-            LocalProtocolError: the dialect has no such message.
+            UnsupportedError: it has no such message.
         """
-        codec = self._encoders.get(message_type)
-        if codec is None:
-            raise LocalProtocolError(f"dialect {self.name} has no message {message_type.__name__}")
-        return codec
 
-    def decoders(self, sender: Sender) -> dict[int, Codec]:
-        """Return what decodes the messages of one sender, by their ids."""
-        return {
-            row.message_id: self._encoders[row.type]
-            for row in self.table
-            if row.type.sender is sender
-        }
+    def answers(self, request: type[Request]) -> bool:
+        """Whether the camera answers such a request."""
+        return request.answer is not None and self.has(request.answer)
 
-    def knows(self, sender: Sender, message_id: int) -> bool:
-        """Whether there is a message with this id from this sender."""
-        return (sender, message_id) in self._decoders
+    def fields(self, message_type: type[Message]) -> tuple[str, ...]:
+        """Return the names of the fields that a message has on the wire."""
+        return tuple(name for name, _ in wire_fields(message_type))
 
-    def answer_id(self, request_id: int) -> int | None:
-        """Return the id of the answer to a request, None if the camera never answers it.
+    def restate(self, report: StatusReport) -> StatusReport:
+        """Return a status that was read by the first of the dialect's kin as this one reads it."""
+        return report
 
-        An unknown request is expected to be answered under its own id.
-        """
-        return self._answers.get(request_id, request_id)
+    @abstractmethod
+    def spell(self, sender: Sender, frame: Frame) -> Spelled:
+        """Return a frame in words, for a trace; it never raises."""
 
-    def encode_frame(self, frame: Frame) -> bytes:
-        """Return a frame's bytes.
+    @abstractmethod
+    def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
+        """Return any request by its id, for who knows better.
 
         Raises:
-            LocalProtocolError: id or payload do not fit the header.
+            LocalProtocolError: Connect and Disconnect.
+            UnsupportedError: its ids are of another kind.
         """
-        try:
-            return self.header.pack(frame.message_id, len(frame.payload)) + frame.payload
-        except struct.error as exc:
-            raise LocalProtocolError(
-                f"message {frame.message_id:#x} with {len(frame.payload)} bytes of payload does not"
-                f" fit the {self.name} header: {exc}"
-            ) from exc
 
-    def to_frame(self, message: Message) -> Frame:
-        """Return a message as a frame.
+    @abstractmethod
+    def body(self, answer: Message) -> bytes:
+        """Return the bytes of the answer to a raw request.
 
         Raises:
-            LocalProtocolError: the dialect has no such message, or a field does not fit.
+            CommandRejectedError: they say nothing but that the camera refused.
         """
-        if isinstance(message, UnknownMessage):
-            return Frame(message.message_id, message.payload)
-        codec = self.encoder(type(message))
-        try:
-            return Frame(codec.message_id, codec.encode(message))
-        except (struct.error, TypeError) as exc:
-            raise LocalProtocolError(f"{message} does not fit its fields: {exc}") from exc
 
-    def encode(self, message: Message) -> bytes:
-        """Return a message's bytes on the wire; raises as :meth:`to_frame`."""
-        constant = self._constant.get(type(message))
-        return self.encode_frame(self.to_frame(message)) if constant is None else constant
+    def unsupported(self, message_type: type[Message]) -> UnsupportedError:
+        """Return the error of who asks for a message that it does not have."""
+        return UnsupportedError(
+            f"dialect {self.name} has no {message_type.__name__}; "
+            f"it can: {', '.join(self.capabilities.names)}"
+        )
 
-    def surplus(self, sender: Sender, frame: Frame) -> int:
-        """Return how many bytes a known message's body is longer than documented."""
-        codec = self._decoders.get((sender, frame.message_id))
-        if codec is None or codec.has_data:
-            return 0
-        return len(frame.payload) - codec.size
-
-    def decode(self, sender: Sender, frame: Frame) -> Message:
-        """Return a frame's message; a longer body than documented is cut.
+    def with_quirks(self, names: Iterable[str]) -> Dialect:
+        """Return the dialect with these deviations from it.
 
         Raises:
-            MessageError: the body is shorter than its message.
+            ConfigurationError: it knows no such deviation.
         """
-        codec = self._decoders.get((sender, frame.message_id))
-        if codec is None:
-            return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
-        return codec.decode(frame.payload, 0, len(frame.payload))
+        for name in names:
+            raise ConfigurationError(f"dialect {self.name} has no quirk {name!r}; it has none")
+        return self
+
+    def with_parameters(self, parameters: Mapping[str, str]) -> Dialect:
+        """Return the dialect with what a URL says for it; overridden where there is anything.
+
+        Raises:
+            ConfigurationError: a parameter cannot be used.
+        """
+        return self
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,8 +271,13 @@ class Protocol:
         schemes: URL scheme to transport.
         default_port: port where a URL names none.
         models: camera models that speak it.
-        dialects: its dialects by name, the most probable first: the order in which a client that
-            was told none tries them.
+        dialects: its dialects by name.
+        machine: makes the client's machine of a link; of the dialects given, which begin a session
+            alike, it finds out which one the camera speaks.
+        parameters: what else a URL may say, and what it is; ``user`` and ``password`` stand before
+            the host there.
+        detection: what a client tries that was told no dialect, the most probable first, each on a
+            fresh link: dialects that begin a session alike. Default: each dialect by itself.
     """
 
     name: str
@@ -331,3 +285,35 @@ class Protocol:
     default_port: int
     models: tuple[str, ...]
     dialects: Mapping[str, Dialect]
+    machine: MachineFactory
+    parameters: Mapping[str, str] = field(default_factory=dict[str, str])
+    detection: Mapping[Transport, tuple[tuple[Dialect, ...], ...]] = field(
+        default_factory=dict[Transport, "tuple[tuple[Dialect, ...], ...]"]
+    )
+
+    def tries(
+        self,
+        transport: Transport,
+        dialect: str | None = None,
+        quirks: Iterable[str] = (),
+        parameters: Mapping[str, str] | None = None,
+    ) -> list[tuple[Dialect, ...]]:
+        """Return what to try, each on a fresh link: dialects that begin a session alike.
+
+        Args:
+            transport: what carries them.
+            dialect: the one that is pinned; its quirks are found out where none is pinned.
+            quirks: those that are pinned.
+            parameters: what else the URL says.
+
+        Raises:
+            ConfigurationError: the dialect has no such quirk, or cannot use a parameter.
+        """
+        groups = self.detection.get(transport) or tuple((d,) for d in self.dialects.values())
+        if dialect is not None:
+            names = tuple(quirks)
+            found = [d for group in groups for d in group if d.name == dialect and not names]
+            groups = (tuple(found) or (self.dialects[dialect].with_quirks(names),),)
+        if not parameters:
+            return list(groups)
+        return [tuple(d.with_parameters(parameters) for d in group) for group in groups]

@@ -7,12 +7,30 @@ product or a sibling, *derived* from published facts, *inferred*.
 from __future__ import annotations
 
 import enum
+from typing import TYPE_CHECKING
 
+from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Dialect, MessageRow, Protocol, Transport
+from smartcam.protocols.base import Code, Protocol, Transport, Verdict
+from smartcam.protocols.framed import FramedDialect, MessageRow, StatusBits, WireQuirk
 from smartcam.protocols.framing import HeaderLayout
+from smartcam.protocols.machine import Machine
 
-__all__ = ["BVS", "DEFAULT_PORT", "HANDBOOK", "MESSAGES", "THESIS", "MessageId"]
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = [
+    "B16",
+    "BID",
+    "BVS",
+    "CODES",
+    "DEFAULT_PORT",
+    "HANDBOOK",
+    "MESSAGES",
+    "THESIS",
+    "MessageId",
+    "ResultCode",
+]
 
 DEFAULT_PORT = 36701
 """Port of the camera in all documents (SC manual p. 28: published)."""
@@ -24,6 +42,7 @@ class MessageId(enum.IntEnum):
     CONNECT = 0x01
     DISCONNECT = 0x02
     STATUS = 0x12
+    RESET_ERRORS = 0x16
     RESULT_CONTAINER = 0x20
     QUERY_APPLICATION = 0x30
     SWITCH_APPLICATION = 0x31
@@ -41,7 +60,9 @@ _ID = MessageId
 
 MESSAGES = (
     MessageRow(_ID.CONNECT, m.Connect, "Connect", "SC manual p. 29, published"),
-    MessageRow(_ID.CONNECT, m.ConnectAnswer, "Connect response", "SC manual p. 29, published"),
+    MessageRow(
+        _ID.CONNECT, m.ConnectAnswer, "Connect response", "SC manual p. 29, published", ("code",)
+    ),
     MessageRow(_ID.DISCONNECT, m.Disconnect, "Disconnect", "SC manual p. 28, 29, published"),
     MessageRow(_ID.STATUS, m.StatusReport, "Status", "SC manual p. 30, 33, published"),
     MessageRow(
@@ -52,7 +73,11 @@ MESSAGES = (
     ),
     MessageRow(_ID.QUERY_APPLICATION, m.Query, "Query application", "SC manual p. 34, published"),
     MessageRow(
-        _ID.QUERY_APPLICATION, m.QueryAnswer, "Active application", "SC manual p. 34, published"
+        _ID.QUERY_APPLICATION,
+        m.QueryAnswer,
+        "Active application",
+        "SC manual p. 34, published",
+        ("code",),
     ),
     MessageRow(
         _ID.SWITCH_APPLICATION,
@@ -64,7 +89,13 @@ MESSAGES = (
         _ID.SWITCH_APPLICATION, m.SwitchAnswer, "Switch response", "SC manual p. 34, published"
     ),
     MessageRow(_ID.GET_CLOCK, m.GetClock, "Get the time stamp", "SC manual p. 34, published"),
-    MessageRow(_ID.GET_CLOCK, m.ClockAnswer, "Time stamp", "mvBlueGEMINI manual p. 29, published"),
+    MessageRow(
+        _ID.GET_CLOCK,
+        m.ClockAnswer,
+        "Time stamp",
+        "mvBlueGEMINI manual p. 29, published",
+        ("code",),
+    ),
     MessageRow(
         _ID.SET_CLOCK, m.SetClock, "Set time stamp", "mvBlueGEMINI manual p. 29, 30, published"
     ),
@@ -92,7 +123,7 @@ MESSAGES = (
 )
 """Every message of the dialects with a magic number; the one place where ids and bodies stand."""
 
-HANDBOOK = Dialect(
+HANDBOOK = FramedDialect(
     name="handbook",
     header=HeaderLayout(magic=bytes.fromhex("50535642"), code="I", order="length, id"),
     word="I",
@@ -101,7 +132,7 @@ HANDBOOK = Dialect(
     source="SC manual p. 28, 29 and vector A-1 (mvBlueGEMINI manual p. 30), published",
 )
 
-THESIS = Dialect(
+THESIS = FramedDialect(
     name="thesis",
     header=HeaderLayout(
         magic=bytes.fromhex("42565350"), code="I", order="length, id", length_includes=4
@@ -112,13 +143,241 @@ THESIS = Dialect(
     source="thesis section 3.1.1, written with a BVS002C at hand, published",
 )
 
-BVS = Protocol(
+# ---------------------------------------------------------------------- 16 bit
+
+_NARROWED = "the bodies of the dialects with 32 bits in 16 bits: inferred"
+_KB_SEQUENCE = "Balluff knowledge base, sequence of commands, published"
+_KB_STRUCTURE = "Balluff knowledge base, message structure, published"
+
+B16_MESSAGES = (
+    MessageRow(_ID.CONNECT, m.Connect, "Connect", _KB_SEQUENCE),
+    MessageRow(_ID.CONNECT, m.ConnectAnswer, "Connect response", _NARROWED, ("code",)),
+    MessageRow(_ID.DISCONNECT, m.Disconnect, "Disconnect", _KB_SEQUENCE),
+    MessageRow(_ID.STATUS, m.StatusReport, "Status", _NARROWED, ("endian",)),
+    MessageRow(
+        _ID.RESULT_CONTAINER,
+        m.ResultContainer,
+        "Result container",
+        "newest SC manual p. 43; Balluff knowledge base, result container, published",
+    ),
+    MessageRow(_ID.QUERY_APPLICATION, m.Query, "Get inspection program id", _KB_STRUCTURE),
+    MessageRow(_ID.QUERY_APPLICATION, m.QueryAnswer, "Inspection program id", _NARROWED, ("code",)),
+    MessageRow(
+        _ID.SWITCH_APPLICATION, m.SwitchApplication, "Change inspection program", _KB_SEQUENCE
+    ),
+    MessageRow(_ID.SWITCH_APPLICATION, m.SwitchAnswer, "Change response", _NARROWED),
+    MessageRow(_ID.GET_CLOCK, m.GetClock, "Get timestamp", _KB_STRUCTURE),
+    MessageRow(_ID.GET_CLOCK, m.ClockAnswer, "Timestamp", _NARROWED, ("code",)),
+    MessageRow(_ID.SET_CLOCK, m.SetClock, "Set timestamp", _NARROWED),
+    MessageRow(_ID.SET_INPUT_DATA, m.SetInput, "Set input data", _KB_STRUCTURE),
+    MessageRow(
+        _ID.SET_SEQUENCE_NUMBER,
+        m.SetSequenceNumber,
+        "Set sequence number",
+        "newest SC manual p. 48 (four bytes), published; their order: inferred",
+    ),
+    MessageRow(_ID.TRIGGER, m.Trigger, "Trigger", "newest SC manual p. 48; " + _KB_SEQUENCE),
+    MessageRow(_ID.START, m.Start, "Start", _KB_SEQUENCE),
+    MessageRow(_ID.STOP, m.Stop, "Stop", _KB_SEQUENCE),
+    MessageRow(
+        _ID.REBOOT,
+        m.Reboot,
+        "Restart camera",
+        "Balluff knowledge base, message structure (the name), published; the id: inferred",
+    ),
+)
+"""Every message of ``b16``."""
+
+
+class ResultCode(enum.IntEnum):
+    """The first word of BVS ID's answers.
+
+    Source: BVS ID guide p. 52 (published).
+    """
+
+    OK = 0x00
+    OK_INSPECTION_ID = 0x02
+    OK_DATE_TIME = 0x06
+    ERROR = 0x10
+    INVALID_COMMAND = 0x13
+    BUSY = 0x16
+    INSPECTION_ERROR = 0x1A
+
+
+CODES: Mapping[int, Code] = {
+    ResultCode.OK: Code("OK: executed", Verdict.DONE),
+    ResultCode.OK_INSPECTION_ID: Code("OK Inspection ID", Verdict.DONE),
+    ResultCode.OK_DATE_TIME: Code("OK Date Time", Verdict.DONE),
+    ResultCode.ERROR: Code(
+        "NOK Error: transfer or execution failed, e.g. wrong format or length", Verdict.REFUSED
+    ),
+    ResultCode.INVALID_COMMAND: Code("NOK Invalid Command: unknown command code", Verdict.UNKNOWN),
+    ResultCode.BUSY: Code("NOK Busy: Ready status is not set", Verdict.BUSY),
+    ResultCode.INSPECTION_ERROR: Code(
+        "NOK Inspection Error: program change failed", Verdict.REFUSED
+    ),
+}
+"""What BVS ID's result codes mean (BVS ID guide p. 52, published)."""
+
+_16_BIT = HeaderLayout(code="H", order="id, length")
+_CODE_GUESS = "that BVS SC answers as BVS ID does: inferred"
+
+B16 = FramedDialect(
+    name="b16",
+    header=_16_BIT,
+    word="H",
+    table=B16_MESSAGES,
+    about="16 bit, no magic number, the message id first",
+    source="newest SC manual p. 40, 43, 48; Balluff knowledge base, published",
+    wire_quirks={
+        "code": WireQuirk(
+            about="answers begin with a result code, as those of bid do",
+            source=_CODE_GUESS,
+            rows=(
+                MessageRow(_ID.CONNECT, m.ConnectAnswer, "Connect response", _CODE_GUESS),
+                MessageRow(
+                    _ID.QUERY_APPLICATION, m.QueryAnswer, "Inspection program id", _CODE_GUESS
+                ),
+                MessageRow(_ID.GET_CLOCK, m.ClockAnswer, "Timestamp", _CODE_GUESS),
+            ),
+            codes=CODES,
+        ),
+        "no_id": WireQuirk(
+            about="result containers do not begin with the program's id",
+            source="example of the newest SC manual p. 43, against its table, published",
+            rows=(
+                MessageRow(
+                    _ID.RESULT_CONTAINER,
+                    m.ResultContainer,
+                    "Result container",
+                    "newest SC manual p. 43 (its example), published",
+                    ("application",),
+                ),
+            ),
+        ),
+        "big_endian_number": WireQuirk(
+            about="the sequence number is big endian",
+            source="example of the newest SC manual p. 48, against its general rule, published",
+            rows=(
+                MessageRow(
+                    _ID.SET_SEQUENCE_NUMBER,
+                    m.SetSequenceNumber,
+                    "Set sequence number",
+                    "newest SC manual p. 48 (its example), published",
+                    byte_order=">",
+                ),
+            ),
+        ),
+    },
+)
+
+BID_MESSAGES = (
+    MessageRow(_ID.CONNECT, m.Connect, "Connect", "BVS ID guide p. 226, published"),
+    MessageRow(_ID.CONNECT, m.ConnectAnswer, "Connect response", "BVS ID guide p. 226, published"),
+    MessageRow(_ID.DISCONNECT, m.Disconnect, "Disconnect", "BVS ID guide p. 227, published"),
+    MessageRow(
+        _ID.DISCONNECT,
+        m.DisconnectAnswer,
+        "Disconnect response",
+        "BVS ID guide (German) p. 58, published",
+    ),
+    MessageRow(_ID.STATUS, m.GetStatus, "Get status", "BVS ID guide p. 210, published"),
+    MessageRow(_ID.STATUS, m.StatusReport, "Status", "BVS ID guide p. 210, published", ("endian",)),
+    MessageRow(_ID.RESET_ERRORS, m.ResetErrors, "Reset errors", "BVS ID guide p. 227, published"),
+    MessageRow(
+        _ID.RESET_ERRORS,
+        m.ResetErrorsAnswer,
+        "Reset errors response",
+        "BVS ID guide p. 227, published",
+    ),
+    MessageRow(
+        _ID.RESULT_CONTAINER,
+        m.ResultContainer,
+        "Result container",
+        "BVS ID guide p. 213, published",
+    ),
+    MessageRow(
+        _ID.QUERY_APPLICATION, m.Query, "Get inspection id", "BVS ID guide p. 216, published"
+    ),
+    MessageRow(
+        _ID.QUERY_APPLICATION, m.QueryAnswer, "Inspection id", "BVS ID guide p. 216, published"
+    ),
+    MessageRow(
+        _ID.SWITCH_APPLICATION,
+        m.SwitchApplication,
+        "Set inspection id",
+        "BVS ID guide p. 229, published",
+    ),
+    MessageRow(
+        _ID.SWITCH_APPLICATION,
+        m.SwitchAnswer,
+        "Set inspection id response",
+        "BVS ID guide p. 229, published",
+    ),
+    MessageRow(_ID.GET_CLOCK, m.GetClock, "Get date/time", "BVS ID guide p. 218, published"),
+    MessageRow(_ID.GET_CLOCK, m.ClockAnswer, "Date/time", "BVS ID guide p. 218, published"),
+    MessageRow(_ID.SET_CLOCK, m.SetClock, "Set date/time", "BVS ID guide p. 231, published"),
+    MessageRow(
+        _ID.SET_CLOCK, m.SetClockAnswer, "Set date/time response", "BVS ID guide p. 231, published"
+    ),
+    MessageRow(
+        _ID.SET_INPUT_DATA, m.SetInput, "Set reference value", "BVS ID guide p. 220, 232, published"
+    ),
+    MessageRow(
+        _ID.SET_INPUT_DATA,
+        m.SetInputAnswer,
+        "Set reference value response",
+        "BVS ID guide p. 220, 232, published",
+    ),
+    MessageRow(_ID.TRIGGER, m.Trigger, "Trigger inspection", "BVS ID guide p. 221, published"),
+    MessageRow(_ID.TRIGGER, m.TriggerAnswer, "Trigger response", "BVS ID guide p. 221, published"),
+)
+"""Every message of ``bid``."""
+
+BID = FramedDialect(
+    name="bid",
+    header=_16_BIT,
+    word="H",
+    table=BID_MESSAGES,
+    about="BVS ID and BVS VS: as b16, every request is answered with a result code",
+    source="BVS ID guide p. 52, 206 to 232, published",
+    status_bits=StatusBits(
+        # The examples show Ready as bit 5 where p. 216 says "4th bit": the bytes are trusted.
+        # Where the other error bits stand is unknown, so they have no meaning here.
+        named={
+            0x0001: Status.WAITING_FOR_TRIGGER,  # p. 210, published
+            0x0100: Status.OVERTRIGGERED,  # Trigger Error; from the example on p. 227, derived
+        },
+        without={0x0020: Status.BUSY},  # Ready; from the example on p. 227, derived
+        always=Status.RUNNING,  # it has neither start nor stop
+        others=32,
+    ),
+    codes=CODES,
+    status_by_itself=False,
+)
+
+
+class _Bvs(Protocol):
+    """With the dialects as what they are."""
+
+    dialects: Mapping[str, FramedDialect]
+
+
+_16_BIT_KIN = (B16, B16.with_quirks(["code"]), BID)
+
+BVS = _Bvs(
     name="bvs",
     schemes={"bvs": Transport.TCP, "bvs+udp": Transport.UDP},
     default_port=DEFAULT_PORT,
     models=("BVS002C",),
-    # The manuals come first: three documents and a published vector against one description.
-    dialects={dialect.name: dialect for dialect in (HANDBOOK, THESIS)},
+    dialects={dialect.name: dialect for dialect in (HANDBOOK, THESIS, B16, BID)},
+    machine=Machine,
+    detection={
+        # The manuals show the dialects with a magic number over UDP only, and for TCP nothing but
+        # 16 bits. Of the two framings with a magic number three documents and a published vector
+        # stand against one description.
+        Transport.TCP: (_16_BIT_KIN, (HANDBOOK,), (THESIS,)),
+        Transport.UDP: ((HANDBOOK,), _16_BIT_KIN, (THESIS,)),
+    },
 )
-"""What the entry point ``bvs`` gives. ``b16`` and ``bid`` are to be two more rows of ``dialects``:
-a header without magic, ``word="H"``, and a table of their own where bodies differ."""
+"""What the entry point ``bvs`` gives."""

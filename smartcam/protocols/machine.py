@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from smartcam.exceptions import LocalProtocolError, MessageError, RemoteProtocolError, hex_excerpt
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import POLICIES, Dialect, Policy, Role, Transport
+from smartcam.protocols.base import POLICIES, Policy, Role, Transport
 from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import Codec, FramedDialect
     from smartcam.protocols.messages import Message
 
 __all__ = [
@@ -28,6 +30,7 @@ __all__ = [
     "Event",
     "LinkEnded",
     "LinkFailed",
+    "LinkMachine",
     "Machine",
     "ResultBurst",
     "State",
@@ -62,6 +65,8 @@ _SESSION_REQUESTS = (
     m.Start,
     m.Stop,
     m.Reboot,
+    m.GetStatus,
+    m.ResetErrors,
 )
 _SESSION_REPORTS = (
     m.StatusReport,
@@ -69,10 +74,15 @@ _SESSION_REPORTS = (
     m.QueryAnswer,
     m.SwitchAnswer,
     m.ClockAnswer,
+    m.TriggerAnswer,
+    m.SetClockAnswer,
+    m.SetInputAnswer,
+    m.ResetErrorsAnswer,
 )
 
 
-_BY_ITSELF = frozenset((m.StatusReport, m.ResultContainer))  # what the camera sends unasked
+# What the camera sends unasked. A Disconnect may be answered or not, and nobody waits for it.
+_BY_ITSELF = frozenset((m.StatusReport, m.ResultContainer, m.DisconnectAnswer))
 
 
 def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
@@ -94,7 +104,10 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
         # the answer to a second Connect that came in the same bytes as the first
         (connected, camera, m.ConnectAnswer): connected,
     }
-    for request in (*_SESSION_REQUESTS, m.UnknownMessage):
+    for state in (idle, connecting, connected, State.DISCONNECTED):
+        # to the Disconnect that went before a Connect, or ended the session
+        table[state, camera, m.DisconnectAnswer] = state
+    for request in (*_SESSION_REQUESTS, m.UnknownMessage, m.MalformedMessage):
         table[connected, client, request] = connected
         # right behind a Connect, before its answer is out: it is answered after that
         table[connecting, client, request] = connecting
@@ -152,6 +165,82 @@ class LinkEnded:
 Event = m.Message | ResultBurst | LinkFailed | LinkEnded
 
 
+class LinkMachine(Protocol):
+    """What a link needs of the machine that speaks over it, in the client's role.
+
+    :class:`Machine` speaks in frames; a protocol of another kind brings its own. What comes goes in
+    by :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram), and out by
+    :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever the wire looks like.
+    """
+
+    @property
+    def dialect(self) -> Dialect:
+        """What is spoken."""
+        ...
+
+    @property
+    def kin(self) -> Sequence[Dialect]:
+        """What it may be: more than one until :meth:`adopt` says which."""
+        ...
+
+    @property
+    def transport(self) -> Transport:
+        """What carries it."""
+        ...
+
+    @property
+    def replies(self) -> bool:
+        """Whether what comes may make it say something by itself."""
+        ...
+
+    @property
+    def counters(self) -> Counters:
+        """What went through."""
+        ...
+
+    @property
+    def state(self) -> State:
+        """Where the link is."""
+        ...
+
+    def adopt(self, dialect: Dialect) -> None:
+        """It is this one of its kin."""
+        ...
+
+    def room(self) -> memoryview:
+        """Return where a stream's next bytes may be written; call :meth:`filled` next."""
+        ...
+
+    def filled(self, count: int) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`; False for no events yet."""
+        ...
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes of a stream, or one whole datagram; never raises for what is in them."""
+        ...
+
+    def receive_eof(self) -> None:
+        """The peer will send no more."""
+        ...
+
+    def events(self) -> list[Event]:
+        """Return what came since the last call, in order; the caller owns the list."""
+        ...
+
+    def send(self, message: Message, *, answered: bool | None = None) -> None:
+        """Say something; write :meth:`data_to_send` next.
+
+        Raises:
+            LocalProtocolError: not now. Nothing has changed.
+            UnsupportedError: the dialect has no such message.
+        """
+        ...
+
+    def data_to_send(self) -> list[bytes]:
+        """Return what is to be written, in order."""
+        ...
+
+
 @dataclass(slots=True)
 class Counters:
     """What went through a machine."""
@@ -180,21 +269,27 @@ class Machine:
         policy: other than the role's own; the emulator's quirks use it.
         trace: called with the sender and each whole frame, in both directions, and with the error
             for bytes that make none.
+        kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
+            that the answer to Connect does not fit are left out when it comes; where several are
+            left, :meth:`adopt` decides.
     """
 
     def __init__(
         self,
-        dialect: Dialect,
+        dialect: FramedDialect,
         role: Role,
         transport: Transport,
         *,
         max_length: int = DEFAULT_MAX_LENGTH,
         policy: Policy | None = None,
         trace: Callable[[m.Sender, Frame | RemoteProtocolError], None] | None = None,
+        kin: Sequence[FramedDialect] = (),
     ) -> None:
-        self.dialect = dialect
+        self.dialect: FramedDialect = dialect
+        self.kin: Sequence[FramedDialect] = kin or (dialect,)
         self.role = role
         self.transport = transport
+        self.replies: bool = False
         self.error: RemoteProtocolError | None = None
         self.counters: Counters = Counters()
         self._policy = policy or POLICIES[role, transport]
@@ -204,12 +299,30 @@ class Machine:
         self._outbox: list[bytes] = []
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
         self._sender, self._sends = role.receives, role.sends
-        self._decoders = dialect.decoders(role.receives)
+        self._decoders: dict[int, Codec] = {}
+        self._take_up(dialect)
+        self.state = State.IDLE
+
+    def adopt(self, dialect: Dialect) -> None:
+        """It is this one of :attr:`kin`; statuses that :meth:`events` gave before are not redone.
+
+        Raises:
+            LocalProtocolError: it is none of them.
+        """
+        found = [one for one in self.kin if one is dialect]
+        if not found:
+            raise LocalProtocolError(f"{dialect.name} is none of {[d.name for d in self.kin]}")
+        self.kin = found
+        self._take_up(found[0])
+
+    def _take_up(self, dialect: FramedDialect) -> None:
+        self.dialect = dialect
+        self._decoders = dialect.decoders(self._sender)
         result = dialect.encoder(m.ResultContainer)
         self._burst_size = result.size
         self._burst_reader = dialect.header.reader(result.size)
-        self._takes_bursts = role is Role.CLIENT and trace is None
-        self.state = State.IDLE
+        plain = self.role is Role.CLIENT and self._trace is None
+        self._takes_bursts = plain and result.size > 0
 
     @property
     def state(self) -> State:
@@ -363,6 +476,8 @@ class Machine:
         counters.frames_received += 1
         if self._trace is not None:
             self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
+        if len(self.kin) > 1 and self._state is State.CONNECTING:
+            self._narrow(message_id, end - begin)
         codec = self._decoders.get(message_id)
         surplus = 0
         message: Message
@@ -370,6 +485,9 @@ class Machine:
             if codec is None:
                 payload = framer.take(begin, end)
                 message = m.UnknownMessage(message_id=message_id, payload=payload)
+            elif self._policy.tells and not codec.fits(end - begin):
+                payload = framer.take(begin, end)
+                message = m.MalformedMessage(message_id=message_id, payload=payload)
             else:
                 if not codec.has_data:
                     surplus = end - begin - codec.size
@@ -401,6 +519,18 @@ class Machine:
         self._events.append(message)
         if self._takes_bursts and isinstance(message, m.ResultContainer) and framer.buffered:
             self._receive_burst(message, begin)
+
+    def _narrow(self, message_id: int, size: int) -> None:
+        """Leave out the kin that have no such message, or another length of it."""
+        decoders = [dialect.decoders(self._sender).get(message_id) for dialect in self.kin]
+        fitting = tuple(
+            dialect
+            for dialect, codec in zip(self.kin, decoders, strict=True)
+            if codec is not None and codec.fits(size)
+        )
+        if fitting and fitting != self.kin:
+            self.kin = fitting
+            self._take_up(fitting[0])
 
     def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
         """Take the result containers of the same application that come next in these bytes."""

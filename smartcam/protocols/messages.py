@@ -2,39 +2,58 @@
 
 Each message is a frozen dataclass that declares its body once: a field's annotation says what it is
 on the wire (:data:`Word`, :data:`UInt32`, :data:`Data`). A dialect's table (``protocols/bvs.py``)
-says which message has which id; codecs, construct views and the documentation are made from both.
+says which message has which id, and which of its fields the dialect leaves out; codecs, construct
+views and the documentation are made from both.
 """
 
 from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, get_type_hints
+from typing import Annotated, Any, ClassVar, NamedTuple, get_type_hints
 
 from smartcam.models import Status
 
 __all__ = [
+    "UNNAMED_APPLICATION",
+    "Acknowledgement",
+    "CellValue",
     "ClockAnswer",
     "Connect",
     "ConnectAnswer",
     "Data",
     "Disconnect",
+    "DisconnectAnswer",
     "GetClock",
+    "GetStatus",
+    "Image",
+    "LoadFile",
+    "MalformedMessage",
     "Message",
     "Query",
     "QueryAnswer",
+    "ReadImage",
     "Reboot",
+    "Report",
+    "Request",
+    "ResetErrors",
+    "ResetErrorsAnswer",
     "ResultContainer",
     "Sender",
     "SetClock",
+    "SetClockAnswer",
     "SetInput",
+    "SetInputAnswer",
     "SetSequenceNumber",
     "Start",
+    "StartAnswer",
     "StatusReport",
     "Stop",
+    "StopAnswer",
     "SwitchAnswer",
     "SwitchApplication",
     "Trigger",
+    "TriggerAnswer",
     "UInt32",
     "UnknownMessage",
     "Wire",
@@ -83,7 +102,8 @@ class Request(Message):
     """A message from client to camera.
 
     Attributes:
-        answer: the message type the camera answers with, None where it never does.
+        answer: the message type the camera answers with in a dialect that has it, None where it
+            never does.
     """
 
     sender: ClassVar[Sender] = Sender.CLIENT
@@ -98,10 +118,26 @@ class Report(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ConnectAnswer(Report):
+class Acknowledgement(Report):
+    """The answer to a command in a dialect with result codes; which code means what it says.
+
+    Attributes:
+        code: what became of the request; a dialect without result codes leaves it out: 0.
+    """
+
+    code: Word = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectAnswer(Acknowledgement):
     """The session is there. ``version`` counts up with the protocol; 1 is the only one known."""
 
     version: Word
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DisconnectAnswer(Acknowledgement):
+    """The session is over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,38 +147,94 @@ class StatusReport(Report):
     Attributes:
         status: the bits.
         endian: byte order of result containers and input data: 0 little (published), 1 big
-            (inferred). It does not affect headers and messages.
+            (inferred). It does not affect headers and messages. Where a dialect leaves it out
+            everything is little endian.
     """
 
     status: StatusWord
     endian: Word = 0
 
 
+UNNAMED_APPLICATION = -1
+"""Application of a result container that does not say whose it is, or that has no id."""
+
+
+class CellValue(NamedTuple):
+    """A value as text: the name of its cell, and the text, None for a cell that has none."""
+
+    cell: str
+    text: str | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultContainer(Report):
-    """What an inspection sent: the id of its application and bytes without types or names."""
+    """What an inspection sent: the id of its application and bytes without types or names.
 
-    application: Word
+    Attributes:
+        application: its id.
+        data: the bytes.
+        cells: the values that ``data`` was put together from, where the protocol has them as texts:
+            a layout's fields are these, in order.
+    """
+
+    application: Word = UNNAMED_APPLICATION
     data: Data
+    cells: tuple[CellValue, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class QueryAnswer(Report):
+class QueryAnswer(Acknowledgement):
     """Id of the active application."""
 
     application: Word
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SwitchAnswer(Report):
-    """Comes after the switch. ``code`` 0: done, 1: id invalid; ``application`` is active now."""
+class SwitchAnswer(Acknowledgement):
+    """Comes after the switch. ``code`` says what became of it; ``application`` is active now."""
 
-    code: Word
     application: Word
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClockAnswer(Report):
+class TriggerAnswer(Acknowledgement):
+    """The trigger was understood; not whether an inspection began."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetClockAnswer(Acknowledgement):
+    """The clock is set, or why not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetInputAnswer(Acknowledgement):
+    """The input data (BVS ID: the reference value) is taken, or why not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResetErrorsAnswer(Acknowledgement):
+    """The error bits are reset; a status follows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartAnswer(Acknowledgement):
+    """Run mode is entered, or why not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopAnswer(Acknowledgement):
+    """Run mode is left, or why not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Image(Acknowledgement):
+    """A picture, in the file format that the camera has."""
+
+    data: Data
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockAnswer(Acknowledgement):
     """The camera's clock; it carries no time zone."""
 
     year: Word
@@ -166,6 +258,20 @@ class Disconnect(Request):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class GetStatus(Request):
+    """Ask for the status."""
+
+    answer: ClassVar[type[Message] | None] = StatusReport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResetErrors(Request):
+    """Clear the error bits that stay set until then; a status follows the answer."""
+
+    answer: ClassVar[type[Message] | None] = ResetErrorsAnswer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Query(Request):
     """Ask for the active application."""
 
@@ -182,6 +288,22 @@ class SwitchApplication(Request):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LoadFile(Request):
+    """Load the application of a file's name; the active one must be stopped."""
+
+    answer: ClassVar[type[Message] | None] = SwitchAnswer
+
+    name: Data
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadImage(Request):
+    """Ask for the last picture."""
+
+    answer: ClassVar[type[Message] | None] = Image
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GetClock(Request):
     """Ask for the clock."""
 
@@ -191,6 +313,8 @@ class GetClock(Request):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetClock(Request):
     """Set the clock; invalid values may be dropped or converted."""
+
+    answer: ClassVar[type[Message] | None] = SetClockAnswer
 
     year: Word
     month: Word
@@ -202,7 +326,12 @@ class SetClock(Request):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetInput(Request):
-    """Input data for the next inspection, laid out as its "Receive data" tool says."""
+    """Input data for the next inspection, laid out as its "Receive data" tool says.
+
+    On BVS ID it is the reference value, filled with zeros to its configured length.
+    """
+
+    answer: ClassVar[type[Message] | None] = SetInputAnswer
 
     data: Data
 
@@ -218,15 +347,21 @@ class SetSequenceNumber(Request):
 class Trigger(Request):
     """Run a triggered application once."""
 
+    answer: ClassVar[type[Message] | None] = TriggerAnswer
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start(Request):
     """Enter run mode."""
 
+    answer: ClassVar[type[Message] | None] = StartAnswer
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stop(Request):
     """Leave run mode."""
+
+    answer: ClassVar[type[Message] | None] = StopAnswer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -242,11 +377,31 @@ class UnknownMessage(Message):
     payload: bytes
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MalformedMessage(Message):
+    """A whole frame with a known id whose body is too short or too long.
+
+    A camera that answers with result codes gets it; elsewhere such a frame is dropped.
+    """
+
+    message_id: int
+    payload: bytes
+
+
 def wire_fields(message_type: type[Message]) -> tuple[tuple[str, Wire], ...]:
-    """Return name and wire type of each field of a message's body, in order."""
-    hints: dict[str, Any] = get_type_hints(message_type, include_extras=True)
-    return tuple(
-        (name, hint.__metadata__[0])
-        for name, hint in hints.items()
-        if hasattr(hint, "__metadata__") and isinstance(hint.__metadata__[0], Wire)
-    )
+    """Return name and wire type of each field of a message's body, in order.
+
+    They are all that any dialect has; a dialect's row says which of them are on its wire.
+    """
+    found = _WIRE_FIELDS.get(message_type)
+    if found is None:
+        hints: dict[str, Any] = get_type_hints(message_type, include_extras=True)
+        found = _WIRE_FIELDS[message_type] = tuple(
+            (name, hint.__metadata__[0])
+            for name, hint in hints.items()
+            if hasattr(hint, "__metadata__") and isinstance(hint.__metadata__[0], Wire)
+        )
+    return found
+
+
+_WIRE_FIELDS: dict[type[Message], tuple[tuple[str, Wire], ...]] = {}  # hints are slow to read

@@ -52,7 +52,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def test_command_nothing_listens_exits_3(command: str, more: list[str]) -> None:
     with closed_port() as address:
         outcome = run(command, f"bvs://{address}", *more, "--timeout", "1")
-    outcome.failed(3, address, "handbook over TCP: opening the link: ", within=1)
+    outcome.failed(3, address, "b16 or bid over TCP: opening the link: ", within=1)
     assert command == "probe" or outcome.out == ""
 
 
@@ -226,7 +226,7 @@ def test_watch_unknown_interpreter_exits_2_and_lists_known_ones(spec: str) -> No
         ("bvs://127.0.0.1:99999", "ort"),
         ("bvs://127.0.0.1/path", "a path"),
         ("bvs://127.0.0.1?dialect=latin", "handbook, thesis"),
-        ("bvs://127.0.0.1?colour=red", "known is 'dialect'"),
+        ("bvs://127.0.0.1?colour=red", "known are 'dialect', 'quirks'"),
     ],
 )
 @pytest.mark.parametrize(("command", "more"), [c for c in COMMANDS if c[0] != "probe"])

@@ -135,7 +135,7 @@ async def test_switch_to_an_unknown_id_raises_and_the_old_one_runs_again() -> No
     async with by_hand() as (box, camera):
         with pytest.raises(
             CommandRejectedError,
-            match=r"refused to switch to application 99 \(status 1\); application 7 is active",
+            match=r"switch to application 99: code 0x01 \(id invalid\); application 7 is active",
         ) as caught:
             await camera.switch_application(99)
         error = caught.value
@@ -163,7 +163,7 @@ async def test_switch_to_id_0_raises_and_stops_nothing() -> None:
 @pytest.mark.parametrize("application", [-1, 1 << 32])
 async def test_switch_to_no_id_at_all_sends_nothing(application: int) -> None:
     async with by_hand() as (box, camera):
-        with pytest.raises(ConfigurationError, match=f"{application} is not 0 to 4294967295"):
+        with pytest.raises(ConfigurationError, match=f"{application} is not 1 to 4294967295"):
             await camera.switch_application(application)
         assert box.since(3) == []
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.emulator import ManualClock, Quirks
+from smartcam.emulator import Application, Device, ManualClock, Quirks
 from smartcam.emulator.fault_queue import FaultQueue
 from smartcam.emulator.links import MAX_INPUT, TcpListener, _TcpLink
 from smartcam.protocols import messages as m
@@ -64,6 +64,7 @@ class Station:
 
     spoken = HANDBOOK
     quirks = Quirks()
+    device = Device([Application(id=1)])
 
     def __init__(self) -> None:
         self.clock = ManualClock()

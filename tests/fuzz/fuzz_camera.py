@@ -16,12 +16,14 @@ from smartcam.emulator.device import Mode
 from smartcam.exceptions import FrameError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Dialect, Policy, Role, Transport
+from smartcam.protocols.base import Policy, Role, Transport
 from smartcam.protocols.bvs import BVS
 from smartcam.protocols.machine import Machine, State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from smartcam.protocols.framed import FramedDialect
 
 __all__ = ["check"]
 
@@ -53,7 +55,9 @@ LIMIT = 256
 class Camera:
     """A device, its machine, and a client that listens."""
 
-    def __init__(self, dialect: Dialect, quirks: Quirks, active: int, *, running: bool) -> None:
+    def __init__(
+        self, dialect: FramedDialect, quirks: Quirks, active: int, *, running: bool
+    ) -> None:
         self.device = Device(APPLICATIONS.values(), active=active, quirks=quirks, running=running)
         policy = POLICIES_ON_A_BAD_FRAME[quirks.bad_frame]
         self.machine = Machine(dialect, Role.CAMERA, Transport.TCP, max_length=LIMIT, policy=policy)

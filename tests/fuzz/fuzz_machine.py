@@ -23,11 +23,12 @@ from machines import DIALECTS, EXAMPLES, one_by_one
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError, RemoteProtocolError
 from smartcam.protocols import framing
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import POLICIES, Dialect, Policy, Role, Transport
+from smartcam.protocols.base import POLICIES, Policy, Role, Transport
 from smartcam.protocols.framing import Frame
 from smartcam.protocols.machine import TRANSITIONS, LinkEnded, LinkFailed, Machine, State
 
 if TYPE_CHECKING:
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.machine import Event
 
 __all__ = ["check"]
@@ -204,7 +205,7 @@ def check_machine(data: bytes) -> None:
 
 
 def make(
-    dialect: Dialect,
+    dialect: FramedDialect,
     role: Role,
     transport: Transport,
     policy: Policy | None,
@@ -226,7 +227,7 @@ def make(
     return Link(machine, twin, policy or POLICIES[role, transport], limit, traced, state)
 
 
-def answer_to(message: m.Message, answered: bool | None, dialect: Dialect) -> int | None:
+def answer_to(message: m.Message, answered: bool | None, dialect: FramedDialect) -> int | None:
     """Return the id of the answer that a request asks for, None where none is expected."""
     if answered is None:
         answered = isinstance(message, m.UnknownMessage) or (

@@ -19,7 +19,7 @@ from smartcam.protocols.bvs import MESSAGES
 from smartcam.protocols.framing import Frame
 
 if TYPE_CHECKING:
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
 
 __all__ = ["check"]
 
@@ -47,14 +47,14 @@ def check(data: bytes) -> None:
     _check_view(dialect, sender, frame, message)
 
 
-def _message_id(choices: Choices, dialect: Dialect) -> int:
+def _message_id(choices: Choices, dialect: FramedDialect) -> int:
     number = choices.byte()
     if number == ANY_ID:
         return int.from_bytes(choices.take((dialect.header.code == "I" and 4) or 2), "little")
     return dialect.table[number % len(dialect.table)].message_id
 
 
-def _check_view(dialect: Dialect, sender: m.Sender, frame: Frame, message: m.Message) -> None:
+def _check_view(dialect: FramedDialect, sender: m.Sender, frame: Frame, message: m.Message) -> None:
     """Hold construct's reading of the same bytes against the message."""
     raw = dialect.encode_frame(frame)
     fields = view_fields(dialect, sender, raw)

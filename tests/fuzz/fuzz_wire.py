@@ -9,7 +9,7 @@ from smartcam.exceptions import MessageError
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.framing import Frame
 
 __all__ = ["Body", "body_of", "check_decoding"]
@@ -23,7 +23,7 @@ class Body(NamedTuple):
 
 
 @functools.cache
-def body_of(dialect: Dialect, sender: m.Sender, message_id: int) -> Body:
+def body_of(dialect: FramedDialect, sender: m.Sender, message_id: int) -> Body:
     """Return what the body of a frame must be; an unknown id's may be anything."""
     word = {"I": 4, "H": 2}[dialect.word]
     sizes = {m.Wire.WORD: word, m.Wire.UINT32: 4, m.Wire.DATA: 0}
@@ -34,7 +34,7 @@ def body_of(dialect: Dialect, sender: m.Sender, message_id: int) -> Body:
     return Body(0, open_end=True)
 
 
-def check_decoding(dialect: Dialect, sender: m.Sender, frame: Frame) -> m.Message | None:
+def check_decoding(dialect: FramedDialect, sender: m.Sender, frame: Frame) -> m.Message | None:
     """Decode a frame and encode what comes of it; return the message, None for a short body."""
     body = body_of(dialect, sender, frame.message_id)
     too_many = 0 if body.open_end else max(0, len(frame.payload) - body.size)

@@ -20,7 +20,7 @@ from smartcam.emulator import Device
 from smartcam.interpreters.localizations import Localizations
 from smartcam.layout import Layout
 from smartcam.layout.text import parse_text
-from smartcam.protocols.base import Dialect
+from smartcam.protocols.framed import FramedDialect
 from smartcam.protocols.framing import Framer
 from smartcam.protocols.machine import Machine
 from smartcam.settings import Address
@@ -140,7 +140,7 @@ def forget_everything(framer: Framer) -> int:
 
 MISTAKES: dict[str, tuple[object, str, Any]] = {
     "framing": (Framer, "resync", forget_everything),
-    "messages": (Dialect, "surplus", lambda *_: 0),
+    "messages": (FramedDialect, "surplus", lambda *_: 0),
     "machine": (Machine, "_wanted", lambda *_, **__: True),
     "layout": (Layout, "sequence", lambda *_: None),
     "interpreters": (Localizations, "_check_finite", lambda *_: None),

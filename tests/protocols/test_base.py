@@ -1,30 +1,39 @@
-"""Dialects as data: messages to frames and back, and who may do what with broken ones."""
+"""Roles, policies, and what a client tries: what every protocol has."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from machines import DIALECTS, EXAMPLES, SIXTEEN
+from machines import CODE, NO_ID
 
-from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
-from smartcam.models import Status
+from smartcam.exceptions import ConfigurationError, FrameError, MessageError
+from smartcam.models import Capabilities
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import MAX_KNOWN, POLICIES, Dialect, Policy, Role, Transport
-from smartcam.protocols.bvs import HANDBOOK, MESSAGES, THESIS
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.base import (
+    POLICIES,
+    UNDOCUMENTED,
+    Code,
+    Dialect,
+    Policy,
+    Protocol,
+    RawRequest,
+    Role,
+    Spelled,
+    Transport,
+    Verdict,
+)
+from smartcam.protocols.bvs import B16, BID, BVS, HANDBOOK, THESIS
+from smartcam.protocols.machine import Machine
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.protocols.framing import Frame
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
-KNOWN = EXAMPLES[:-1]
-
-each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=lambda one: one.name)
-each_message = pytest.mark.parametrize("message", KNOWN, ids=lambda one: type(one).__name__)
-
-WITHOUT_SWITCH = dataclasses.replace(
-    HANDBOOK,
-    name="small",
-    table=tuple(row for row in MESSAGES if row.type is not m.SwitchApplication),
-)
+TCP, UDP = Transport.TCP, Transport.UDP
 
 
 # ---------------------------------------------------------------------- roles and policies
@@ -37,199 +46,157 @@ def test_role_sends_as_itself_and_receives_from_the_other() -> None:
 
 def test_policies_only_a_client_on_tcp_fails_and_only_a_camera_wants_exact_lengths() -> None:
     assert dict(POLICIES) == {
-        (Role.CLIENT, Transport.TCP): Policy(fatal=(FrameError, MessageError), exact_length=False),
-        (Role.CLIENT, Transport.UDP): Policy(fatal=(), exact_length=False),
-        (Role.CAMERA, Transport.TCP): Policy(fatal=(), exact_length=True),
-        (Role.CAMERA, Transport.UDP): Policy(fatal=(), exact_length=True),
+        (Role.CLIENT, TCP): Policy(fatal=(FrameError, MessageError), exact_length=False),
+        (Role.CLIENT, UDP): Policy(fatal=(), exact_length=False),
+        (Role.CAMERA, TCP): Policy(fatal=(), exact_length=True),
+        (Role.CAMERA, UDP): Policy(fatal=(), exact_length=True),
     }
+    assert not any(policy.tells for policy in POLICIES.values())
 
 
-# ---------------------------------------------------------------------- messages
+def test_verdicts_are_the_four_that_a_request_can_have() -> None:
+    assert [one.value for one in Verdict] == ["done", "busy", "unknown", "refused"]
+    assert Code("not documented", Verdict.REFUSED) == UNDOCUMENTED
 
 
-def test_wire_fields_are_what_the_annotations_say_in_order() -> None:
-    assert m.wire_fields(m.StatusReport) == (("status", m.Wire.WORD), ("endian", m.Wire.WORD))
-    assert m.wire_fields(m.ResultContainer) == (
-        ("application", m.Wire.WORD),
-        ("data", m.Wire.DATA),
+# ---------------------------------------------------------------------- a dialect of another kind
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Spoken(Dialect):
+    """A dialect of words, with what every dialect must say and no more."""
+
+    room: str = "hall"
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(dialect=self.name, switch=True, get_clock=True)
+
+    @property
+    def application_ids(self) -> range:
+        return range(10)
+
+    def code(self, code: int) -> Code:
+        return UNDOCUMENTED
+
+    def has(self, message_type: type[m.Message]) -> bool:
+        return message_type in {m.Query, m.QueryAnswer, m.GetClock}
+
+    def message_id(self, message: m.Message | type[m.Message]) -> int:
+        raise self.unsupported(message if isinstance(message, type) else type(message))
+
+    def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
+        return Spelled(None, frame.payload.decode(), None, frame.payload)
+
+    def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
+        return RawRequest(m.Query(), m.QueryAnswer, answered=True, known=True)
+
+    def body(self, answer: m.Message) -> bytes:
+        return b""
+
+    def with_parameters(self, parameters: Mapping[str, str]) -> Spoken:
+        if parameters.get("room") == "":
+            raise ConfigurationError("a room has a name")
+        return dataclasses.replace(self, **dict(parameters))
+
+
+SPOKEN = Spoken(name="spoken", about="words", source="made for the tests")
+
+
+def protocol(**options: Any) -> Protocol:
+    """Return a protocol of two dialects that says what it has to."""
+    return Protocol(
+        name="made",
+        schemes={"made": TCP},
+        default_port=1,
+        models=(),
+        dialects={"spoken": SPOKEN, "b16": B16},
+        machine=Machine,
+        **options,
     )
-    assert m.wire_fields(m.SetSequenceNumber) == (("number", m.Wire.UINT32),)
-    assert m.wire_fields(m.Connect) == ()
-    assert m.wire_fields(m.UnknownMessage) == ()
 
 
-@each_message
-def test_message_is_frozen_and_has_no_other_attributes(message: m.Message) -> None:
-    assert not hasattr(message, "__dict__")
-    names = [field.name for field in dataclasses.fields(message)] or ["sender"]
-    with pytest.raises((dataclasses.FrozenInstanceError, TypeError, AttributeError)):
-        setattr(message, names[0], 1)
+def test_dialect_without_more_has_no_quirks_and_all_fields() -> None:
+    assert (SPOKEN.quirks, SPOKEN.label) == ((), "spoken")
+    assert SPOKEN.fields(m.QueryAnswer) == ("code", "application")
+    report = m.StatusReport(status=m.Status(1))
+    assert SPOKEN.restate(report) is report
+    assert SPOKEN.with_quirks([]) is SPOKEN
+    with pytest.raises(ConfigurationError) as caught:
+        SPOKEN.with_quirks(["loud"])
+    assert str(caught.value) == "dialect spoken has no quirk 'loud'; it has none"
 
 
-@each_message
-def test_message_sender_is_the_clients_for_requests_only(message: m.Message) -> None:
-    assert message.sender is (CLIENT if isinstance(message, m.Request) else CAMERA)
+def test_dialect_answers_where_the_answer_is_one_of_its_messages() -> None:
+    assert SPOKEN.answers(m.Query)
+    assert not SPOKEN.answers(m.GetClock)
+    assert not SPOKEN.answers(m.Start)
 
 
-# ---------------------------------------------------------------------- ids
+def test_dialect_unsupported_names_itself_the_message_and_what_it_can() -> None:
+    error = SPOKEN.unsupported(m.Start)
+    assert str(error) == "dialect spoken has no Start; it can: switch, get_clock"
 
 
-@each_dialect
-def test_message_type_and_id_are_each_others_inverse(dialect: Dialect) -> None:
-    for row in dialect.table:
-        assert dialect.message_type(row.type.sender, row.message_id) is row.type
-        assert dialect.message_id(row.type) == row.message_id
-    for message in EXAMPLES:
-        assert dialect.message_id(message) == dialect.to_frame(message).message_id
-
-
-def test_message_type_unknown_id_or_wrong_sender_is_an_unknown_message() -> None:
-    assert HANDBOOK.message_type(CAMERA, 0x77) is m.UnknownMessage
-    assert HANDBOOK.message_type(CLIENT, 0x20) is m.UnknownMessage
-    assert HANDBOOK.message_type(CAMERA, 0x40) is m.UnknownMessage
-    assert HANDBOOK.knows(CLIENT, 0x40)
-    assert not HANDBOOK.knows(CAMERA, 0x40)
+# ---------------------------------------------------------------------- what a client tries
 
 
 @pytest.mark.parametrize(
-    ("request_id", "answer_id"),
-    [(0x01, 0x01), (0x30, 0x30), (0x31, 0x31), (0x32, 0x32)]
-    + [(silent, None) for silent in (0x02, 0x33, 0x34, 0x35, 0x40, 0x41, 0x42, 0x43)]
-    + [(0x77, 0x77)],
+    ("transport", "groups"),
+    [
+        (TCP, [(B16, CODE, BID), (HANDBOOK,), (THESIS,)]),
+        (UDP, [(HANDBOOK,), (B16, CODE, BID), (THESIS,)]),
+    ],
 )
-def test_answer_id_is_the_requests_where_it_is_answered(
-    request_id: int, answer_id: int | None
+def test_tries_without_a_dialect_are_the_most_probable_first(
+    transport: Transport, groups: list[tuple[Dialect, ...]]
 ) -> None:
-    assert HANDBOOK.answer_id(request_id) == answer_id
+    assert BVS.tries(transport) == groups
+    assert {one.name for group in groups for one in group} == {*BVS.dialects}
 
 
-# ---------------------------------------------------------------------- encoding
-
-
-def test_encode_word_is_as_wide_as_the_dialects_and_uint32_always_four_bytes() -> None:
-    switch, number = m.SwitchApplication(application=5), m.SetSequenceNumber(number=7)
-    assert HANDBOOK.encode(switch).hex() == "505356420400000031000000" + "05000000"
-    assert THESIS.encode(switch).hex() == "425653500800000031000000" + "05000000"
-    assert SIXTEEN.encode(switch).hex() == "31000200" + "0500"
-    assert SIXTEEN.encode(number).hex() == "35000400" + "07000000"
-
-
-def test_encode_unknown_message_writes_its_payload_under_its_id() -> None:
-    message = m.UnknownMessage(message_id=0x77, payload=b"\x01\x02")
-    assert HANDBOOK.to_frame(message) == Frame(0x77, b"\x01\x02")
-    assert SIXTEEN.encode(message).hex() == "770002000102"
-
-
-@pytest.mark.parametrize("application", [-1, 0x1_0000_0000, "5"])
-def test_encode_field_that_does_not_fit_is_refused(application: int) -> None:
-    message = m.SwitchApplication(application=application)
-    with pytest.raises(LocalProtocolError, match=r"SwitchApplication\(.*does not fit its fields"):
-        HANDBOOK.encode(message)
-
-
-def test_encode_message_that_the_dialect_lacks_is_refused() -> None:
-    with pytest.raises(LocalProtocolError) as caught:
-        WITHOUT_SWITCH.encode(m.SwitchApplication(application=1))
-    assert str(caught.value) == "dialect small has no message SwitchApplication"
-
-
-def test_encode_payload_longer_than_the_header_can_say_is_refused() -> None:
-    with pytest.raises(
-        LocalProtocolError, match="0x34 with 65536 bytes of payload does not fit the sixteen header"
-    ):
-        SIXTEEN.encode(m.SetInput(data=bytes(0x10000)))
-    assert len(SIXTEEN.encode(m.SetInput(data=bytes(0xFFFF)))) == 0xFFFF + 4
-
-
-def test_encode_id_that_does_not_fit_the_header_is_refused() -> None:
-    with pytest.raises(LocalProtocolError, match="message 0x12345 with 0 bytes of payload"):
-        SIXTEEN.encode(m.UnknownMessage(message_id=0x12345, payload=b""))
-
-
-# ---------------------------------------------------------------------- decoding
-
-
-@each_dialect
-@each_message
-def test_decode_whole_body_gives_the_message(dialect: Dialect, message: m.Message) -> None:
-    frame = dialect.to_frame(message)
-    assert dialect.decode(message.sender, frame) == message
-    assert dialect.surplus(message.sender, frame) == 0
-
-
-@each_dialect
-@each_message
-def test_decode_body_cut_at_every_length_is_a_message_error(
-    dialect: Dialect, message: m.Message
+@pytest.mark.parametrize("transport", Transport)
+@pytest.mark.parametrize(
+    ("name", "group"),
+    [("handbook", (HANDBOOK,)), ("thesis", (THESIS,)), ("b16", (B16, CODE)), ("bid", (BID,))],
+)
+def test_tries_of_a_pinned_dialect_are_it_and_its_quirks(
+    name: str, group: tuple[Dialect, ...], transport: Transport
 ) -> None:
-    frame = dialect.to_frame(message)
-    needed = dialect.encoder(type(message)).size
-    for size in range(needed):
-        cut = frame._replace(payload=frame.payload[:size])
-        with pytest.raises(MessageError) as caught:
-            dialect.decode(message.sender, cut)
-        assert str(caught.value).startswith(
-            f"{type(message).__name__} ({frame.message_id:#04x}) came with {size} bytes, "
-            f"it needs {needed}: {cut.payload.hex(' ')}"
-        )
-        assert caught.value.offset == dialect.header.size
-        assert caught.value.data == cut.payload
+    assert BVS.tries(transport, name) == [group]
 
 
-@each_dialect
-@each_message
-def test_decode_trailing_bytes_are_data_or_cut_and_counted(
-    dialect: Dialect, message: m.Message
-) -> None:
-    frame = dialect.to_frame(message)
-    longer = frame._replace(payload=frame.payload + b"\xaa\xbb\xcc")
-    decoded = dialect.decode(message.sender, longer)
-    if isinstance(message, (m.ResultContainer, m.SetInput)):
-        assert decoded == dataclasses.replace(message, data=message.data + b"\xaa\xbb\xcc")
-        assert dialect.surplus(message.sender, longer) == 0
-    else:
-        assert decoded == message
-        assert dialect.surplus(message.sender, longer) == 3
+@pytest.mark.parametrize("transport", Transport)
+def test_tries_of_pinned_quirks_are_that_one(transport: Transport) -> None:
+    assert BVS.tries(transport, "b16", ["code"]) == [(CODE,)]
+    assert BVS.tries(transport, "b16", ["no_id"]) == [(NO_ID,)]
+    both = B16.with_quirks(["code", "no_id"])
+    assert BVS.tries(transport, "b16", ("no_id", "code")) == [(both,)]
 
 
-def test_decode_unknown_id_keeps_the_payload() -> None:
-    frame = Frame(0x77, b"whatever")
-    assert HANDBOOK.decode(CAMERA, frame) == m.UnknownMessage(message_id=0x77, payload=b"whatever")
-    assert HANDBOOK.surplus(CAMERA, frame) == 0
+def test_tries_of_an_unknown_quirk_is_told() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        BVS.tries(TCP, "handbook", ["code"])
+    assert str(caught.value) == "dialect handbook has no quirk 'code'; it has none"
 
 
-def test_decode_status_keeps_unknown_bits() -> None:
-    frame = Frame(0x12, bytes.fromhex("48000000 01000000"))
-    assert HANDBOOK.decode(CAMERA, frame) == m.StatusReport(status=Status(0x48), endian=1)
+def test_tries_without_detection_are_the_dialects_one_by_one() -> None:
+    assert protocol().tries(UDP) == [(SPOKEN,), (B16,)]
+    assert protocol().tries(UDP, "b16") == [(B16,)]
+    known = protocol(detection={TCP: ((B16, SPOKEN),)})
+    assert known.tries(TCP) == [(B16, SPOKEN)]
+    assert known.tries(UDP) == [(SPOKEN,), (B16,)]
 
 
-def test_decode_empty_data_is_empty() -> None:
-    assert HANDBOOK.decode(CLIENT, Frame(0x34, b"")) == m.SetInput(data=b"")
-    container = HANDBOOK.decode(CAMERA, Frame(0x20, b"\x03\0\0\0"))
-    assert container == m.ResultContainer(application=3, data=b"")
+def test_tries_of_a_dialect_that_is_not_found_out_are_that_one() -> None:
+    made = protocol(detection={TCP: ((B16,),)})
+    assert made.tries(TCP, "spoken") == [(SPOKEN,)]
 
 
-@each_dialect
-def test_decode_ever_new_bodies_gives_their_messages_and_keeps_a_bounded_number(
-    dialect: Dialect,
-) -> None:
-    fresh = dataclasses.replace(dialect, name="fresh")
-    reports = [m.StatusReport(status=Status(word), endian=1) for word in range(3 * MAX_KNOWN)]
-    for _ in range(2):
-        for report in (*reports, *reports[::-1]):
-            frame = fresh.to_frame(report)
-            assert fresh.decode(CAMERA, frame) == report
-            assert fresh.decode(CAMERA, Frame(frame.message_id, frame.payload + b"more")) == report
-    codec = fresh.encoder(m.StatusReport)
-    assert len(codec._known) == MAX_KNOWN
-    first = fresh.to_frame(reports[0])
-    assert fresh.decode(CAMERA, first) is fresh.decode(CAMERA, first)
-
-
-@each_dialect
-def test_decode_containers_and_unknown_messages_are_not_kept(dialect: Dialect) -> None:
-    fresh = dataclasses.replace(dialect, name="fresh")
-    for message in (m.ResultContainer(application=1, data=b"x"), EXAMPLES[-1]):
-        frame = fresh.to_frame(message)
-        assert fresh.decode(CAMERA, frame) == message
-        assert fresh.decode(CAMERA, frame) is not fresh.decode(CAMERA, frame)
+def test_tries_with_parameters_hand_them_to_every_dialect() -> None:
+    made = protocol(parameters={"room": "where"})
+    (first,), (second,) = made.tries(TCP, parameters={"room": "attic"})
+    assert isinstance(first, Spoken)
+    assert (first.room, second) == ("attic", B16)
+    with pytest.raises(ConfigurationError, match="^a room has a name$"):
+        made.tries(TCP, "spoken", parameters={"room": ""})

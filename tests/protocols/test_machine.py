@@ -7,18 +7,33 @@ import struct
 from typing import TYPE_CHECKING
 
 import pytest
-from machines import DIALECTS, EXAMPLES, camera, client, feed, machine
+from machines import (
+    BIG_ENDIAN_NUMBER,
+    CODE,
+    DIALECTS,
+    EVERYTHING,
+    EXAMPLES,
+    NO_ID,
+    camera,
+    carried,
+    client,
+    examples,
+    feed,
+    label,
+    machine,
+)
 
 from smartcam.exceptions import (
     FrameError,
     LocalProtocolError,
     MessageError,
     RemoteProtocolError,
+    UnsupportedError,
 )
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Dialect, Policy, Role, Transport
-from smartcam.protocols.bvs import HANDBOOK
+from smartcam.protocols.base import Policy, Role, Transport
+from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
 from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame
 from smartcam.protocols.machine import (
     TRANSITIONS,
@@ -31,6 +46,7 @@ from smartcam.protocols.machine import (
 )
 
 if TYPE_CHECKING:
+    from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.machine import Event
 
 TCP, UDP = Transport.TCP, Transport.UDP
@@ -44,7 +60,11 @@ QUERY = bytes.fromhex("50535642 00000000 30000000")
 QUERY_ANSWER = bytes.fromhex("50535642 04000000 30000000 15000000")
 TRIGGER = bytes.fromhex("50535642 00000000 40000000")
 
-each_message = pytest.mark.parametrize("message", EXAMPLES, ids=lambda one: type(one).__name__)
+MALFORMED = m.MalformedMessage(message_id=0x40, payload=b"!")
+KIN = (B16, CODE, BID)
+CODE_OR_BID = (CODE, BID)
+
+each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
 each_state = pytest.mark.parametrize("state", State)
 each_transport = pytest.mark.parametrize("transport", Transport)
 
@@ -64,9 +84,15 @@ def failure(events: list[Event]) -> RemoteProtocolError:
 
 
 def test_transitions_camera_says_nothing_without_a_session() -> None:
-    assert not [key for key in TRANSITIONS if key[:2] == (State.IDLE, CAMERA)]
-    connecting = [key[2] for key in TRANSITIONS if key[:2] == (State.CONNECTING, CAMERA)]
-    assert connecting == [m.ConnectAnswer]
+    idle = [key[2] for key in TRANSITIONS if key[:2] == (State.IDLE, CAMERA)]
+    assert idle == [m.DisconnectAnswer]  # to the Disconnect that goes before a Connect
+    connecting = {key[2] for key in TRANSITIONS if key[:2] == (State.CONNECTING, CAMERA)}
+    assert connecting == {m.ConnectAnswer, m.DisconnectAnswer}
+
+
+def test_transitions_answer_to_disconnect_changes_nothing() -> None:
+    for state in LIVE:
+        assert TRANSITIONS[state, CAMERA, m.DisconnectAnswer] is state
 
 
 def test_transitions_ended_links_take_nothing() -> None:
@@ -84,29 +110,34 @@ def test_transitions_disconnect_is_legal_in_every_live_state_and_connect_too() -
 
 def test_transitions_senders_are_those_of_the_messages() -> None:
     for _, sender, message in TRANSITIONS:
-        if message is not m.UnknownMessage:
+        if message not in {m.UnknownMessage, m.MalformedMessage}:
             assert message.sender is sender
 
 
 def test_transitions_every_message_has_a_place() -> None:
-    assert {message for _, _, message in TRANSITIONS} == {type(one) for one in EXAMPLES}
+    assert {message for _, _, message in TRANSITIONS} == {
+        *(type(one) for one in EXAMPLES),
+        m.MalformedMessage,
+    }
 
 
 # ---------------------------------------------------------------------- state x input
 
 
 @each_state
-@each_message
+@pytest.mark.parametrize(
+    ("dialect", "message"), [*EVERYTHING, *((one, MALFORMED) for one in DIALECTS)], ids=label
+)
 @pytest.mark.parametrize("role", Role)
 def test_send_in_every_state_follows_the_table_or_changes_nothing(
-    role: Role, message: m.Message, state: State
+    role: Role, dialect: FramedDialect, message: m.Message, state: State
 ) -> None:
-    made = machine(role, state)
+    made = machine(role, state, dialect=dialect)
     following = TRANSITIONS.get((state, role.sends, type(message)))
     if following is not None:
         made.send(message)
         assert made.state is following
-        assert made.data_to_send() == [HANDBOOK.encode(message)]
+        assert made.data_to_send() == [dialect.encode(message)]
         assert made.counters.frames_sent == 1
         return
     with pytest.raises(LocalProtocolError) as caught:
@@ -117,23 +148,38 @@ def test_send_in_every_state_follows_the_table_or_changes_nothing(
     assert (made.state, made.data_to_send(), made.counters) == (state, [], Counters())
 
 
+@pytest.mark.parametrize(
+    ("dialect", "message"),
+    [(dialect, one) for dialect in DIALECTS for one in EXAMPLES[:-1] if not dialect.has(type(one))],
+    ids=label,
+)
+def test_send_what_the_dialect_lacks_is_unsupported_and_changes_nothing(
+    dialect: FramedDialect, message: m.Message
+) -> None:
+    made = (client if message.sender is CLIENT else camera)(dialect)
+    before = dataclasses.replace(made.counters)
+    with pytest.raises(UnsupportedError, match=f"^dialect {dialect.name} has no"):
+        made.send(message)
+    assert (made.state, made.data_to_send(), made.counters) == (State.CONNECTED, [], before)
+
+
 @each_state
 @each_transport
 @pytest.mark.parametrize(
-    ("role", "message"),
+    ("role", "dialect", "message"),
     [
-        pytest.param(role, message, id=f"{role.value}-{type(message).__name__}")
+        pytest.param(role, dialect, one, id=f"{role.value}-{label(dialect)}-{label(one)}")
         for role in Role
-        for message in EXAMPLES
-        if getattr(message, "sender", role.receives) is role.receives
+        for dialect, one in EVERYTHING
+        if getattr(one, "sender", role.receives) is role.receives
     ],
 )
 def test_receive_in_every_state_follows_the_table_or_the_policy(
-    role: Role, transport: Transport, message: m.Message, state: State
+    role: Role, transport: Transport, dialect: FramedDialect, message: m.Message, state: State
 ) -> None:
-    made = machine(role, state, transport=transport)
+    made = machine(role, state, dialect=dialect, transport=transport)
     following = TRANSITIONS.get((state, role.receives, type(message)))
-    events = feed(made, HANDBOOK.encode(message))
+    events = feed(made, dialect.encode(message))
     if state in {State.CLOSED, State.FAILED}:
         assert (events, made.state, made.counters) == ([], state, Counters())
     elif following is not None:
@@ -148,11 +194,14 @@ def test_receive_in_every_state_follows_the_table_or_the_policy(
         assert (events, made.state, made.counters.ignored_frames) == ([], state, 1)
 
 
-def test_client_that_hears_its_own_connect_fails() -> None:
-    made = machine(Role.CLIENT)
+@pytest.mark.parametrize(
+    ("dialect", "needs"), [(HANDBOOK, 4), (THESIS, 4), (B16, 2), (CODE, 4), (BID, 4)], ids=str
+)
+def test_client_that_hears_its_own_connect_fails(dialect: FramedDialect, needs: int) -> None:
+    made = machine(Role.CLIENT, dialect=dialect)
     made.send(m.Connect())
     error = failure(feed(made, *made.data_to_send()))
-    assert str(error) == "ConnectAnswer (0x01) came with 0 bytes, it needs 4: "
+    assert str(error) == f"ConnectAnswer (0x01) came with 0 bytes, it needs {needs}: "
 
 
 @each_state
@@ -354,6 +403,26 @@ def test_length_bomb_is_refused_before_any_payload_is_kept(length: int) -> None:
     assert made.buffered == 0
 
 
+@each_transport
+@pytest.mark.parametrize("dialect", [B16, BID], ids=label)
+def test_payload_as_long_as_sixteen_bits_can_say_is_sent_and_taken_one_more_is_refused(
+    dialect: FramedDialect, transport: Transport
+) -> None:
+    one, other = client(dialect, transport), camera(dialect, transport)
+    whole = m.SetInput(data=bytes(range(255)) * 257)
+    assert len(whole.data) == 0xFFFF
+    sent = dataclasses.replace(one.counters)
+    with pytest.raises(LocalProtocolError) as caught:
+        one.send(m.SetInput(data=bytes(0x10000)))
+    assert str(caught.value).startswith(
+        f"message 0x34 with 65536 bytes of payload does not fit the {dialect.name} header: "
+    )
+    assert (one.data_to_send(), one.counters) == ([], sent)
+    one.send(whole)
+    (data,) = one.data_to_send()
+    assert feed(other, data) == [whole]
+
+
 def test_payload_of_exactly_the_limit_is_taken_and_never_more_is_kept() -> None:
     made = client(max_length=100)
     data = header(100) + b"\x07\0\0\0" + bytes(96)
@@ -495,8 +564,8 @@ def test_counters_tell_frames_and_bytes_of_both_directions() -> None:
 
 
 @pytest.mark.parametrize("role", Role)
-@pytest.mark.parametrize("dialect", DIALECTS, ids=lambda one: one.name)
-def test_trace_sees_each_frame_of_both_directions(role: Role, dialect: Dialect) -> None:
+@each_dialect
+def test_trace_sees_each_frame_of_both_directions(role: Role, dialect: FramedDialect) -> None:
     seen: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
     made = Machine(dialect, role, TCP, trace=lambda sender, frame: seen.append((sender, frame)))
     made.state = State.CONNECTED
@@ -547,9 +616,9 @@ def result(data: bytes, application: int = 21) -> m.ResultContainer:
     return m.ResultContainer(application=application, data=data)
 
 
-@pytest.mark.parametrize("dialect", DIALECTS, ids=lambda one: one.name)
+@pytest.mark.parametrize("dialect", [one for one in DIALECTS if one is not NO_ID], ids=label)
 def test_burst_is_of_containers_of_one_application_right_behind_one_another(
-    dialect: Dialect,
+    dialect: FramedDialect,
 ) -> None:
     said = [*(result(one) for one in (b"a", b"", b"ccc")), STATUS_MESSAGE, result(b"d")]
     said += [result(b"e", 5), result(b"f", 5), result(b"g")]
@@ -623,3 +692,268 @@ def test_camera_and_datagrams_give_messages_one_by_one(transport: Transport) -> 
     for one in frames:
         made.receive_data(one)
     assert made.events() == [m.Trigger(), m.Trigger()]
+
+
+@each_transport
+def test_containers_without_an_id_come_one_by_one_without_an_application(
+    transport: Transport,
+) -> None:
+    made = client(NO_ID, transport)
+    frame = bytes.fromhex("20000100 21")
+    for data in [frame] * 3 if transport is UDP else [frame * 3]:
+        made.receive_data(data)
+    assert made.events() == [m.ResultContainer(application=-1, data=b"!")] * 3
+    assert made.counters.frames_received == 1 + 3
+
+
+# ---------------------------------------------------------------------- what bid adds
+
+
+@pytest.mark.parametrize("before", [0, 1, 2])
+def test_bid_answer_to_disconnect_may_come_anywhere_and_is_expected(before: int) -> None:
+    """Before the session, while it is made, and behind it; once for each or more often."""
+    answer = bytes.fromhex("02000200 0000")
+    made = machine(Role.CLIENT, dialect=BID)
+    steps = (m.Disconnect(), m.Connect(), m.Disconnect())
+    for said in steps[: before + 1]:
+        made.send(said)
+        if said == m.Connect() and before > 1:
+            feed(made, BID.encode(m.ConnectAnswer(version=1)))
+    state = made.state
+    assert feed(made, answer, answer) == [m.DisconnectAnswer()] * 2
+    assert made.state is state is (State.IDLE, State.CONNECTING, State.DISCONNECTED)[before]
+    assert made.counters.unexpected_messages == 0
+
+
+def test_bid_disconnect_that_is_never_answered_may_be_said_again() -> None:
+    made = client(BID)
+    made.send(m.Disconnect())
+    made.send(m.Disconnect())
+    made.send(m.Connect())
+    assert len(made.data_to_send()) == 3
+
+
+def test_bid_status_answers_get_status_whether_it_was_meant_so_or_not() -> None:
+    made = client(BID)
+    status = bytes.fromhex("12000200 2000")
+    report = m.StatusReport(status=Status.RUNNING)
+    assert feed(made, status) == [report]
+    made.send(m.GetStatus())
+    with pytest.raises(LocalProtocolError, match="0x12 is still owed"):
+        made.send(m.GetStatus())
+    assert feed(made, BID.encode(result(b"!")), status) == [result(b"!"), report]
+    made.send(m.GetStatus())
+    assert made.counters.unexpected_messages == 0
+
+
+@pytest.mark.parametrize(
+    ("request_", "answer"),
+    [
+        (m.Trigger(), m.TriggerAnswer(code=0x16)),
+        (m.ResetErrors(), m.ResetErrorsAnswer()),
+        (m.SetInput(data=b"Hello"), m.SetInputAnswer(code=0x10)),
+        (m.SetClock(year=1, month=2, day=3, hour=4, minute=5, second=6), m.SetClockAnswer()),
+    ],
+    ids=label,
+)
+def test_bid_acknowledgement_is_owed_and_an_unasked_one_is_counted_only(
+    request_: m.Request, answer: m.Message
+) -> None:
+    made = client(BID)
+    assert feed(made, BID.encode(answer)) == []
+    assert made.counters.unexpected_messages == 1
+    made.send(request_)
+    with pytest.raises(LocalProtocolError, match="is still owed"):
+        made.send(request_)
+    assert feed(made, BID.encode(answer)) == [answer]
+    made.send(request_)
+
+
+def test_bid_answer_to_an_unknown_request_comes_under_its_id() -> None:
+    made = client(BID)
+    made.send(m.UnknownMessage(message_id=0x41, payload=b""))
+    assert feed(made, bytes.fromhex("41000200 1300")) == [
+        m.UnknownMessage(message_id=0x41, payload=b"\x13\0")
+    ]
+
+
+# ---------------------------------------------------------------------- bodies of a wrong length
+
+TELLING = Policy(fatal=(), exact_length=True, tells=True)
+
+
+@each_transport
+@pytest.mark.parametrize(
+    ("dialect", "data", "payload"),
+    [
+        (BID, "40000100 21", b"!"),
+        (BID, "31000100 05", b"\x05"),
+        (BID, "31000300 050021", b"\x05\0!"),
+        (BID, "33000200 e007", b"\xe0\x07"),
+        (HANDBOOK, "50535642 01000000 40000000 21", b"!"),
+    ],
+)
+def test_camera_that_tells_gets_a_body_of_a_wrong_length(
+    dialect: FramedDialect, data: str, payload: bytes, transport: Transport
+) -> None:
+    made = camera(dialect, transport, policy=TELLING)
+    frame = bytes.fromhex(data)
+    message_id = frame[8] if dialect is HANDBOOK else frame[0]
+    assert feed(made, frame) == [m.MalformedMessage(message_id=message_id, payload=payload)]
+    assert (made.counters.ignored_frames, made.counters.long_bodies) == (0, 0)
+    assert feed(made, dialect.encode(m.Trigger())) == [m.Trigger()]
+
+
+@each_dialect
+def test_camera_that_tells_takes_right_and_unknown_bodies_as_ever(dialect: FramedDialect) -> None:
+    said = [one for one in examples(dialect) if getattr(one, "sender", CLIENT) is CLIENT]
+    said.sort(key=lambda one: isinstance(one, m.Disconnect))  # nothing is heard behind it
+    made = camera(dialect, policy=TELLING)
+    assert feed(made, b"".join(dialect.encode(one) for one in said)) == said
+
+
+def test_camera_that_tells_ignores_a_wrong_length_without_a_session() -> None:
+    made = machine(Role.CAMERA, dialect=BID, policy=TELLING)
+    assert feed(made, bytes.fromhex("40000100 21"), bytes.fromhex("01000100 21")) == []
+    assert (made.state, made.counters.ignored_frames) == (State.IDLE, 2)
+
+
+def test_camera_that_does_not_tell_drops_a_wrong_length() -> None:
+    made = camera(BID)
+    assert feed(made, bytes.fromhex("40000100 21"), bytes.fromhex("31000100 05")) == []
+    assert made.counters.ignored_frames == 2
+
+
+# ---------------------------------------------------------------------- dialects that begin alike
+
+
+def asking(transport: Transport = TCP, *, kin: tuple[FramedDialect, ...] = KIN) -> Machine:
+    """Return a client that has said Disconnect and Connect and does not know to whom."""
+    made = Machine(kin[0], Role.CLIENT, transport, kin=kin)
+    made.send(m.Disconnect())
+    made.send(m.Connect())
+    assert made.data_to_send() == [b"\x02\0\0\0", b"\x01\0\0\0"]
+    return made
+
+
+def test_kin_of_a_machine_that_knows_is_its_dialect() -> None:
+    assert Machine(BID, Role.CLIENT, TCP).kin == (BID,)
+    assert asking().kin == KIN
+    assert asking().dialect is B16
+
+
+@each_transport
+@pytest.mark.parametrize(
+    ("answer", "kin"),
+    [("01000200 0100", (B16,)), ("01000400 0000 0100", CODE_OR_BID)],
+    ids=["two bytes", "four bytes"],
+)
+def test_kin_are_narrowed_by_the_length_of_the_answer_to_connect(
+    answer: str, kin: tuple[FramedDialect, ...], transport: Transport
+) -> None:
+    made = asking(transport)
+    assert feed(made, bytes.fromhex(answer)) == [m.ConnectAnswer(code=0, version=1)]
+    assert (made.kin, made.dialect, made.state) == (kin, kin[0], State.CONNECTED)
+
+
+def test_kin_are_narrowed_by_the_first_byte_wise_too() -> None:
+    made = asking()
+    data = bytes.fromhex("01000400 0000 0100")
+    assert feed(made, *[bytes([byte]) for byte in data]) == [m.ConnectAnswer(version=1)]
+    assert made.kin == CODE_OR_BID
+
+
+def test_kin_are_narrowed_by_an_answer_to_disconnect() -> None:
+    made = asking()
+    assert feed(made, bytes.fromhex("02000200 0000")) == [m.DisconnectAnswer()]
+    assert (made.kin, made.dialect, made.state) == ((BID,), BID, State.CONNECTING)
+    assert feed(made, bytes.fromhex("01000400 0000 0100")) == [m.ConnectAnswer(version=1)]
+    assert feed(made, bytes.fromhex("12000200 2000")) == [m.StatusReport(status=Status.RUNNING)]
+
+
+@pytest.mark.parametrize(
+    ("answer", "taken"),
+    [("01000600 0100 0000 0000", True), ("01000100 01", False), ("01000000", False)],
+    ids=["longer than any", "one byte", "no byte"],
+)
+def test_kin_that_an_answer_of_no_known_length_leaves_are_all(answer: str, taken: bool) -> None:
+    made = asking()
+    events = feed(made, bytes.fromhex(answer))
+    assert made.kin == KIN
+    if taken:
+        assert events == [m.ConnectAnswer(version=1)]
+        assert made.counters.long_bodies == 1
+    else:
+        assert "ConnectAnswer (0x01) came with" in str(failure(events))
+
+
+def test_kin_are_left_alone_by_what_comes_in_the_session() -> None:
+    made = asking()
+    feed(made, bytes.fromhex("01000400 0000 0100"))
+    made.send(m.Query())
+    assert feed(made, bytes.fromhex("12000200 2001"), bytes.fromhex("30000400 0200 1500")) == [
+        m.StatusReport(status=Status(0x120)),
+        m.QueryAnswer(code=2, application=21),
+    ]
+    assert made.kin == CODE_OR_BID
+
+
+@pytest.mark.parametrize("dialect", CODE_OR_BID, ids=label)
+def test_adopt_one_of_the_kin_reads_as_it_from_then_on(dialect: FramedDialect) -> None:
+    made = asking()
+    feed(made, bytes.fromhex("01000400 0000 0100"))
+    made.adopt(dialect)
+    assert (made.kin, made.dialect) == ([dialect], dialect)
+    (report,) = feed(made, bytes.fromhex("12000200 2001"))
+    assert report == dialect.decode(CAMERA, Frame(0x12, b"\x20\x01"))
+    if dialect is BID:
+        made.send(m.GetStatus())
+    else:
+        with pytest.raises(UnsupportedError, match="dialect b16 has no GetStatus"):
+            made.send(m.GetStatus())
+
+
+def test_adopt_a_stranger_is_refused() -> None:
+    made = asking()
+    feed(made, bytes.fromhex("01000400 0000 0100"))
+    for stranger in (HANDBOOK, B16, BIG_ENDIAN_NUMBER):
+        with pytest.raises(LocalProtocolError) as caught:
+            made.adopt(stranger)
+        assert str(caught.value) == f"{stranger.name} is none of ['b16', 'bid']"
+    assert (made.kin, made.dialect) == (CODE_OR_BID, CODE)
+
+
+def test_adopt_bid_has_containers_in_bursts_as_before() -> None:
+    made = asking()
+    feed(made, bytes.fromhex("01000400 0000 0100"))
+    made.adopt(BID)
+    made.receive_data(BID.encode(result(b"a")) * 2)
+    assert made.events() == [ResultBurst(application=21, data=[b"a", b"a"])]
+
+
+def test_kin_of_the_other_header_are_not_told_apart_by_it() -> None:
+    """A frame with a magic number is waited for, as one of 16,982 bytes."""
+    made = asking()
+    assert feed(made, HANDBOOK.encode(m.ConnectAnswer(version=1))) == []
+    assert (made.kin, made.buffered) == (KIN, 16)
+
+
+@pytest.mark.parametrize("dialect", [*KIN, NO_ID], ids=label)
+@pytest.mark.parametrize("transport", Transport)
+def test_session_of_a_narrow_dialect_from_connect_to_disconnect(
+    dialect: FramedDialect, transport: Transport
+) -> None:
+    one, other = client(dialect, transport), camera(dialect, transport)
+    status = m.StatusReport(status=Status.RUNNING)
+    heard = [m.QueryAnswer(application=3), status, carried(dialect, result(b"!", 3))]
+    for said in (m.Query(), m.Trigger()):
+        one.send(said)
+    for data in one.data_to_send():
+        other.receive_data(data)
+    assert other.events() == [m.Query(), m.Trigger()]
+    for answer in heard:
+        other.send(answer)
+    assert feed(one, *other.data_to_send()) == heard
+    one.send(m.Disconnect())
+    assert feed(other, *one.data_to_send()) == [m.Disconnect()]
+    assert (one.state, other.state) == (State.DISCONNECTED, State.DISCONNECTED)

@@ -1,0 +1,74 @@
+"""Asking for the status where it does not come by itself (``bid``), while somebody wants it.
+
+One timer, there as long as a wait for a status or a trigger is under way, or statuses or events are
+subscribed to. At most one question is open; one that was not answered is repeated after a while,
+since a datagram may be lost.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import SmartCamError
+from smartcam.protocols.messages import GetStatus
+
+if TYPE_CHECKING:
+    from smartcam.connection import Link
+    from smartcam.inbox import Inbox
+
+__all__ = ["StatusPoll"]
+
+PERIOD = 0.02
+"""Seconds between two questions while somebody waits: a fraction of a usual inspection."""
+
+IDLE_PERIOD = 0.25
+"""Seconds between two questions where statuses are only subscribed to."""
+
+REPEAT_AFTER = 0.5
+"""Seconds until an open question counts as lost: answers take milliseconds."""
+
+
+class StatusPoll:
+    """Asks for the status over one link.
+
+    Args:
+        link: the link.
+        inbox: knows who wants a status, and how many have come.
+    """
+
+    def __init__(self, link: Link, inbox: Inbox) -> None:
+        self._link = link
+        self._inbox = inbox
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._asked_at = 0.0
+        self._heard = -1  # statuses that had come when the open question was asked
+
+    def wanted(self) -> None:
+        """Somebody wants a status: begin to ask, or ask more often."""
+        if self._timer is not None and self._timer.when() - self._loop.time() <= PERIOD:
+            return
+        self.stop()
+        self._timer = self._loop.call_later(0.0, self._tick)
+
+    def stop(self) -> None:
+        """Ask no more."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _tick(self) -> None:
+        self._timer = None
+        inbox = self._inbox
+        if not (inbox.awaits_status or inbox.watches_status) or self._link.lost:
+            return
+        now = self._loop.time()
+        if inbox.statuses_heard != self._heard or now - self._asked_at >= REPEAT_AFTER:
+            self._heard, self._asked_at = inbox.statuses_heard, now
+            try:
+                self._link.send(GetStatus(), answered=False)
+            except SmartCamError:  # the link is over: its reader knows
+                return
+        period = PERIOD if inbox.awaits_status else IDLE_PERIOD
+        self._timer = self._loop.call_later(period, self._tick)

@@ -1,0 +1,543 @@
+"""Words of Cognex In-Sight native mode, for both ends: lines, commands, status codes, cell names.
+
+Native mode is text over telnet (TCP port 23). The client sends one command a line, the camera
+answers with a status code on a line of its own and, where the command asks for something, with data
+behind it. Nothing in here does input or output.
+
+Where a fact comes from stands in ``docs/insight.md``: *manual* is the maker's published help,
+*clients* is what public clients and records of their traffic show (derived).
+"""
+
+from __future__ import annotations
+
+import binascii
+import enum
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import ConfigurationError, FrameError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = [
+    "CHECKSUM_DIGITS",
+    "COMMANDS",
+    "DEFAULT_PORT",
+    "ENCODING",
+    "ERROR_VALUE",
+    "HEX_WIDTH",
+    "INVALID_PASSWORD",
+    "LAST_COLUMN",
+    "LAST_JOB_ID",
+    "LAST_ROW",
+    "LINE_END",
+    "LOGGED_IN",
+    "MAX_CELLS",
+    "MAX_LINE",
+    "PASSWORD_PROMPT",
+    "TRIGGER_EVENT",
+    "USER_PROMPT",
+    "WELCOME",
+    "AnswerForm",
+    "Cell",
+    "CommandRow",
+    "LineReader",
+    "Mode",
+    "StatusCode",
+    "checksum",
+    "code_text",
+    "hex_lines",
+    "job_id",
+    "parse_cell",
+    "parse_cells",
+    "parse_tag",
+    "parse_wire_cell",
+]
+
+DEFAULT_PORT = 23
+"""The telnet port (manual, published)."""
+
+ENCODING = "latin-1"
+"""Of all text: a value with a degree sign came as the one byte B0 (clients, derived)."""
+
+LINE_END = b"\r\n"
+"""Ends each line over telnet, in both directions (manual, published)."""
+
+WELCOME = "Welcome to In-Sight"
+"""How the camera's first line begins (clients, derived)."""
+
+USER_PROMPT = b"User: "
+"""Asks for the user; no line end follows (clients, derived)."""
+
+PASSWORD_PROMPT = b"Password: "
+"""Asks for the password; no line end follows (clients, derived)."""
+
+LOGGED_IN = "User Logged In"
+"""The line that says that commands are taken from now on (clients, derived)."""
+
+INVALID_PASSWORD = "Invalid Password"  # noqa: S105 - the camera's words
+"""The line that refuses a login (clients, derived)."""
+
+MAX_LINE = 4096
+"""Bytes of a line, its end not counted, that either side takes. The longest regular ones are values
+of cells; the camera's own bound is not published."""
+
+LAST_COLUMN = "Z"
+"""Of the spreadsheet, beginning with A (manual, published)."""
+
+LAST_ROW = 399
+"""Of the spreadsheet, beginning with 0 (manual, published)."""
+
+MAX_CELLS = 1024
+"""Cells that one range may name. A range is of this library: each cell is asked for on its own."""
+
+LAST_JOB_ID = 999
+"""Ids of jobs are 0 to this (manual, published)."""
+
+TRIGGER_EVENT = 8
+"""The event that acquires an image; 0 to 7 are soft events of the job (manual, published)."""
+
+ERROR_VALUE = "#ERR"
+"""What a cell shows whose function failed (manual, published)."""
+
+HEX_WIDTH = 80
+"""Hexadecimal digits a line of image data (manual, published)."""
+
+CHECKSUM_DIGITS = 4
+"""Hexadecimal digits of a checksum (manual, published)."""
+
+
+class StatusCode(enum.IntEnum):
+    """The number that begins an answer (manual, published). What it means depends on the command.
+
+    :func:`code_text` says it for a command.
+    """
+
+    DONE = 1
+    UNRECOGNIZED = 0
+    INVALID_ARGUMENT = -1
+    FAILED = -2
+    CHECKSUM_OR_READ_ONLY = -3
+    OUT_OF_MEMORY_OR_WRONG_TYPE = -4
+    STILL_OFFLINE = -5
+    NO_ACCESS = -6
+
+
+class AnswerForm(enum.Enum):
+    """What an answer consists of. A code other than 1 always stands alone."""
+
+    CODE = "code"
+    """The code, nothing else."""
+    BARE = "bare"
+    """One line with the value; no code comes before it."""
+    LINE = "line"
+    """The code, then one line."""
+    INFO = "info"
+    """The code, then five lines of the form ``name: value``."""
+    SIZED = "sized"
+    """The code, a line with a number of characters, then as many, then a line end."""
+    HEX = "hex"
+    """The code, a line with a size, lines of hexadecimal digits, a line with their checksum."""
+
+
+class Mode(enum.Enum):
+    """In which mode of the camera a command is possible."""
+
+    ANY = "any"
+    ONLINE = "online"
+    OFFLINE = "offline"
+
+
+class CommandRow(NamedTuple):
+    """One command.
+
+    Attributes:
+        mnemonic: its two letters; upper and lower case are the same (manual, published).
+        title: the manual's name.
+        arguments: what stands behind the letters, without a space unless one is shown.
+        form: the answer's form.
+        mode: in which mode it is possible; otherwise the answer is -2.
+        codes: what the codes mean beside 1 and 0.
+        source: where the row stands, with its grade.
+    """
+
+    mnemonic: str
+    title: str
+    arguments: str
+    form: AnswerForm
+    mode: Mode
+    codes: Mapping[int, str]
+    source: str
+
+
+INFO_LINES = 5
+"""Lines of ``GI`` (clients, derived)."""
+
+_NO_ACCESS = {-6: "the user has no full access"}
+_EVENT = {-1: "the event is no number from 0 to 8", -2: "not possible, or the camera is offline"}
+_LOAD = "the camera is online, there is no such job, or it failed to load"
+_SET_EXTRA = {-3: "the cell is read-only (newer firmware)", -4: "wrong type (newer firmware)"}
+_MANUAL = "manual: published"
+_CLIENTS = "clients: derived"
+
+_ROWS = (
+    CommandRow("GO", "Get Online", "", AnswerForm.BARE, Mode.ANY, {}, _CLIENTS),
+    CommandRow(
+        "SO",
+        "Set Online",
+        "0 or 1",
+        AnswerForm.CODE,
+        Mode.ANY,
+        {
+            -1: "neither 0 nor 1",
+            -2: "not possible",
+            -5: "accepted, but an operator or an input holds the camera offline",
+            **_NO_ACCESS,
+        },
+        _MANUAL,
+    ),
+    CommandRow(
+        "SE",
+        "Set Event",
+        "0 to 8",
+        AnswerForm.CODE,
+        Mode.ONLINE,
+        _EVENT | _NO_ACCESS,
+        _CLIENTS,
+    ),
+    CommandRow(
+        "SW",
+        "Set Event and Wait",
+        "0 to 8",
+        AnswerForm.CODE,
+        Mode.ONLINE,
+        _EVENT | _NO_ACCESS,
+        _CLIENTS,
+    ),
+    CommandRow(
+        "LF",
+        "Load File",
+        "FILE",
+        AnswerForm.CODE,
+        Mode.OFFLINE,
+        {-1: "the file name is missing", -2: _LOAD, -4: "out of memory", **_NO_ACCESS},
+        _CLIENTS,
+    ),
+    CommandRow(
+        "GF",
+        "Get File",
+        "",
+        AnswerForm.LINE,
+        Mode.ANY,
+        {-2: "the active job was never saved"},
+        _CLIENTS,
+    ),
+    CommandRow(
+        "SJ",
+        "Set Job",
+        "ID",
+        AnswerForm.CODE,
+        Mode.OFFLINE,
+        {-1: "the id is no number, or negative", -2: _LOAD, -4: "out of memory", **_NO_ACCESS},
+        _CLIENTS,
+    ),
+    CommandRow(
+        "GJ",
+        "Get Job",
+        "",
+        AnswerForm.LINE,
+        Mode.ANY,
+        {-2: "the active job was never saved, or its name does not begin with a number"},
+        _CLIENTS,
+    ),
+    CommandRow(
+        "GV",
+        "Get Value",
+        "CELL or NAME",
+        AnswerForm.LINE,
+        Mode.ANY,
+        {-1: "no such cell or name", -2: "not possible"},
+        _CLIENTS,
+    ),
+    CommandRow(
+        "SI",
+        "Set Integer",
+        "CELL VALUE without a space, or NAME VALUE",
+        AnswerForm.CODE,
+        Mode.ANY,
+        {
+            -1: "no such cell or name, or no integer",
+            -2: "out of the control's range, or the cell has no control for integers",
+            **_SET_EXTRA,
+            **_NO_ACCESS,
+        },
+        _MANUAL,
+    ),
+    CommandRow(
+        "SF",
+        "Set Float",
+        "CELL VALUE without a space, or NAME VALUE",
+        AnswerForm.CODE,
+        Mode.ANY,
+        {
+            -1: "no such cell or name, or no number",
+            -2: "the cell has no control for numbers",
+            **_SET_EXTRA,
+            **_NO_ACCESS,
+        },
+        _CLIENTS,
+    ),
+    CommandRow(
+        "SS",
+        "Set String",
+        "CELL TEXT without a space, or NAME TEXT",
+        AnswerForm.CODE,
+        Mode.ANY,
+        {
+            -1: "no such cell or name",
+            -2: "too long, or the cell has no control for texts",
+            **_SET_EXTRA,
+            **_NO_ACCESS,
+        },
+        _MANUAL,
+    ),
+    CommandRow("GI", "Get Info", "", AnswerForm.INFO, Mode.ANY, {-2: "not possible"}, _CLIENTS),
+    CommandRow(
+        "EV",
+        "Evaluate",
+        " EXPRESSION",
+        AnswerForm.SIZED,
+        Mode.ANY,
+        {-1: "no such cell", -2: "not possible", -4: "out of memory", **_NO_ACCESS},
+        _MANUAL,
+    ),
+    CommandRow(
+        "RI",
+        "Read Image",
+        "",
+        AnswerForm.HEX,
+        Mode.ANY,
+        {-4: "out of memory", **_NO_ACCESS},
+        _MANUAL,
+    ),
+    CommandRow(
+        "RB",
+        "Read BMP",
+        "",
+        AnswerForm.HEX,
+        Mode.ANY,
+        {-4: "out of memory", **_NO_ACCESS},
+        _MANUAL,
+    ),
+)
+
+COMMANDS: Mapping[str, CommandRow] = {row.mnemonic: row for row in _ROWS}
+"""The commands that this library knows, by mnemonic. The camera has more."""
+
+_COMMON_TEXTS = {1: "done", 0: "the camera does not know the command"}
+
+
+def code_text(command: str, code: int) -> str:
+    """Return what a status code says in the answer to a command, in words.
+
+    Args:
+        command: the command line, or its two letters.
+        code: the status code.
+    """
+    row = COMMANDS.get(command[:2].upper())
+    texts = _COMMON_TEXTS if row is None else {**_COMMON_TEXTS, **row.codes}
+    return texts.get(code, "a code that is not documented for this command")
+
+
+# ---------------------------------------------------------------------- cells
+
+
+class Cell(NamedTuple):
+    """A cell of the spreadsheet.
+
+    Attributes:
+        column: its letter, upper case.
+        row: its number, 0 to 399.
+    """
+
+    column: str
+    row: int
+
+    @property
+    def wire(self) -> str:
+        """As commands name it: the letter and three digits (manual, published)."""
+        return f"{self.column}{self.row:03d}"
+
+    def __str__(self) -> str:
+        return f"{self.column}{self.row}"
+
+
+_CELL = re.compile(r"([A-Za-z])([0-9]{1,3})", re.ASCII)
+_WIRE_CELL = re.compile(r"([A-Za-z])([0-9]{3})", re.ASCII)
+_TAG = re.compile(r"[A-Za-z_][A-Za-z0-9_.]{0,126}", re.ASCII)
+_CELL_LIKE = re.compile(r"[A-Za-z][0-9]+", re.ASCII)
+_JOB_NUMBER = re.compile(r"([0-9]{1,3})(?![0-9])", re.ASCII)
+
+
+def parse_cell(text: str) -> Cell:
+    """Read a cell as people write it, such as ``A1`` or ``b012``.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    match = _CELL.fullmatch(text)
+    if match is None or int(match[2]) > LAST_ROW:
+        raise ConfigurationError(
+            f"{text!r} is no cell: expected a column A to {LAST_COLUMN} and a row 0 to {LAST_ROW}"
+        )
+    return Cell(match[1].upper(), int(match[2]))
+
+
+def parse_cells(text: str) -> list[Cell]:
+    """Read a cell or a rectangle of cells, such as ``B2:D4``: row by row, each from left to right.
+
+    Raises:
+        ConfigurationError: it is neither, its corners are not top left and bottom right, or it has
+            more than 1024 cells.
+    """
+    first_text, colon, last_text = text.partition(":")
+    first = parse_cell(first_text)
+    last = parse_cell(last_text) if colon else first
+    if last.column < first.column or last.row < first.row:
+        raise ConfigurationError(f"{text!r}: the second cell lies left of the first, or above it")
+    columns = [chr(code) for code in range(ord(first.column), ord(last.column) + 1)]
+    rows = range(first.row, last.row + 1)
+    if len(columns) * len(rows) > MAX_CELLS:
+        raise ConfigurationError(
+            f"{text!r} has {len(columns) * len(rows)} cells, more than {MAX_CELLS}"
+        )
+    return [Cell(column, row) for row in rows for column in columns]
+
+
+def parse_wire_cell(text: str) -> tuple[Cell, str] | None:
+    """Read the cell at the beginning of a command's argument: a letter and exactly three digits.
+
+    Returns:
+        The cell and what stands behind it; None if no cell stands there.
+    """
+    match = _WIRE_CELL.match(text)
+    if match is None or int(match[2]) > LAST_ROW:
+        return None
+    return Cell(match[1].upper(), int(match[2])), text[match.end() :]
+
+
+def parse_tag(text: str) -> str:
+    """Read a cell's name: letters, digits, underscores and dots, at most 127 (manual, published).
+
+    Two names that differ in case only are the same (manual, published), so it is returned in lower
+    case.
+
+    Raises:
+        ConfigurationError: it is none, or it has the form of a cell.
+    """
+    if not _TAG.fullmatch(text) or _CELL_LIKE.fullmatch(text):
+        raise ConfigurationError(
+            f"{text!r} is no name of a cell: expected 1 to 127 letters, digits, '_' and '.', "
+            "no digit first, not the form of a cell"
+        )
+    return text.lower()
+
+
+def job_id(file: str) -> int | None:
+    """Return the id of a job: the number that its file name begins with (manual, published).
+
+    None where it begins with no number, or one above 999.
+    """
+    match = _JOB_NUMBER.match(file)
+    return None if match is None else int(match[1])
+
+
+# ---------------------------------------------------------------------- data
+
+
+def checksum(digits: bytes) -> str:
+    """Return the checksum of hexadecimal data: CRC-16 with polynomial 0x1021, first value 0.
+
+    It is made of the digits' characters in upper case, without line ends (manual, published).
+
+    Args:
+        digits: the hexadecimal digits in upper case.
+    """
+    return f"{binascii.crc_hqx(digits, 0):04X}"
+
+
+def hex_lines(data: bytes) -> tuple[int, bytes]:
+    """Write data as the camera sends it.
+
+    Returns:
+        The number of hexadecimal digits, and the lines: 80 digits each, then the checksum's.
+    """
+    digits = data.hex().upper().encode("ascii")
+    lines = [digits[begin : begin + HEX_WIDTH] for begin in range(0, len(digits), HEX_WIDTH)]
+    lines.append(checksum(digits).encode("ascii"))
+    return len(digits), b"".join(line + LINE_END for line in lines)
+
+
+# ---------------------------------------------------------------------- lines
+
+
+class LineReader:
+    r"""Cuts lines, prompts and counted text from a stream of bytes.
+
+    Args:
+        max_line: bytes of a line, its end not counted.
+        nul_ends: a byte NUL ends a line as CR LF does, which is what the camera hears (manual,
+            published); a CR right before it is dropped, since ``\r\0`` is telnet's bare CR.
+    """
+
+    def __init__(self, *, max_line: int = MAX_LINE, nul_ends: bool = False) -> None:
+        self._max_line = max_line
+        self._end = re.compile(rb"\r\n|\r?\x00" if nul_ends else rb"\r\n")
+        self._buffer = bytearray()
+        self._searched = 0  # no end begins before this
+
+    def __len__(self) -> int:
+        """Bytes that wait."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> None:
+        """Take what came. Whoever feeds it bounds what waits, by :func:`len`."""
+        self._buffer += data
+
+    def next_line(self) -> str | None:
+        """Return the next line without its end, None if no whole one is there.
+
+        Raises:
+            FrameError: it is too long; the stream cannot be read on.
+        """
+        found = self._end.search(self._buffer, self._searched)
+        size = found.start() if found is not None else len(self._buffer)
+        # a CR at the end may be half of a line end
+        if size > self._max_line + (found is None):
+            raise FrameError(
+                f"a line of more than {self._max_line} bytes came", data=self._buffer[:64]
+            )
+        if found is None:
+            self._searched = max(0, size - 1)
+            return None
+        line = self._buffer[:size].decode(ENCODING)
+        del self._buffer[: found.end()]
+        self._searched = 0
+        return line
+
+    def take(self, size: int) -> bytes | None:
+        """Return the next ``size`` bytes, None if they are not all there yet."""
+        if len(self._buffer) < size:
+            return None
+        data = bytes(self._buffer[:size])
+        del self._buffer[:size]
+        self._searched = 0
+        return data
+
+    def take_prompt(self, prompt: bytes) -> bool:
+        """Take a prompt, which has no line end, if it is what comes next and all of it is there."""
+        if not self._buffer.startswith(prompt):
+            return False
+        self.take(len(prompt))
+        return True
