@@ -11,6 +11,7 @@ The functions in :data:`GENERATED` need nothing of Sphinx; ``tests/test_docs.py`
 from __future__ import annotations
 
 import ast
+import dataclasses
 import importlib
 import inspect
 import itertools
@@ -23,16 +24,18 @@ from typing import TYPE_CHECKING, Any
 
 import smartcam
 from smartcam.emulator import Quirks
+from smartcam.handshake import load_protocol
 from smartcam.protocols.base import POLICIES
-from smartcam.protocols.bvs import HANDBOOK, MESSAGES, THESIS
+from smartcam.protocols.bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
 from smartcam.protocols.machine import TRANSITIONS, State
-from smartcam.protocols.messages import Request, Sender, Wire, wire_fields
+from smartcam.protocols.messages import Request, Sender, Wire
+from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from smartcam.protocols.base import MessageRow
+    from smartcam.protocols.framed import FramedDialect, MessageRow
 
 project = "smartcam"
 version = release = smartcam.__version__
@@ -50,25 +53,26 @@ napoleon_custom_sections = ["Cancellation", "Source"]
 
 ROOT = Path(__file__).parents[1]
 
-TYPES = {
-    Wire.WORD: ("UINT32", struct.calcsize(f"<{HANDBOOK.word}")),
-    Wire.UINT32: ("UINT32", 4),
-    Wire.DATA: ("bytes", None),
-}
-"""A field's name and size in the dialects with a magic number, whose word has 32 bits."""
+WORDS = {"I": "UINT32", "H": "UINT16"}
+"""A dialect's ordinary integers."""
 
 LIMITS = (
     "protocols.framing.DEFAULT_MAX_LENGTH",
     "protocols.framing.LARGE",
     "protocols.framing.FIRST_READ",
     "protocols.framing.MOST_READ",
-    "protocols.base.MAX_KNOWN",
+    "protocols.framed.MAX_KNOWN",
     "connection.MAX_CHUNKS",
     "client.DEFAULT_MAX_QUEUE",
     "client.MAX_INTERPRETATIONS",
     "client.DEFAULT_TRIGGER_TIMEOUT",
     "handshake.DETECTION_SHARE",
-    "conversation.MAX_APPLICATION_ID",
+    "handshake.TELLING_ROUNDS",
+    "handshake.BUSY_PAUSE",
+    "conversation.BUSY_PAUSE",
+    "polling.PERIOD",
+    "polling.IDLE_PERIOD",
+    "polling.REPEAT_AFTER",
     "conversation.LATE_GRACE",
     "conversation.OVERTRIGGERED_GRACE",
     "attribution.NUMBER_STEP",
@@ -84,6 +88,16 @@ LIMITS = (
     "emulator.faults.MAX_FAULTS",
     "emulator.faults.MAX_FIRED",
     "emulator.faults.MAX_BYTES",
+    "protocols.insight_words.MAX_LINE",
+    "protocols.insight_words.MAX_CELLS",
+    "protocols.insight_answers.MAX_IMAGE",
+    "emulator.insight_connection.MAX_SESSIONS",
+    "emulator.insight_connection.MAX_WAITING",
+    "emulator.insight_connection.WRITE_LIMIT",
+    "emulator.insight.MAX_ENTRIES",
+    "emulator.insight.MAX_ORDERED",
+    "emulator.insight_image.MAX_PIXELS",
+    "emulator.insight_job.MAX_CELL_TEXT",
 )
 """Constants that bound something, below ``smartcam.``."""
 
@@ -103,13 +117,14 @@ def _type_name(row: MessageRow) -> str:
     return f"`{row.type.__name__}`"
 
 
-def _answer(row: MessageRow) -> str:
+def _answer(row: MessageRow, dialect: FramedDialect) -> str:
     if not issubclass(row.type, Request):
         return ""
-    return f"`{row.type.answer.__name__}`" if row.type.answer else "none"
+    answer = row.type.answer
+    return f"`{answer.__name__}`" if answer and dialect.has(answer) else "none"
 
 
-def messages() -> str:
+def _messages(dialect: FramedDialect) -> str:
     """Return every message with its id, its sender, its answer and its source."""
     rows = [
         (
@@ -117,44 +132,112 @@ def messages() -> str:
             row.title,
             _type_name(row),
             row.type.sender.value,
-            _answer(row),
+            _answer(row, dialect),
             *row.source.rsplit(", ", 1),
         )
-        for row in MESSAGES
+        for row in dialect.table
     ]
     head = ("id", "manual's name", "class", "from", "answer", "source", "grade")
     return _table(head, rows)
 
 
-def bodies() -> str:
-    """Return every body field by field, and what the two length fields say about it."""
+def _bodies(*dialects: FramedDialect) -> str:
+    """Return every body field by field, and what the length fields of these dialects say."""
+    dialect = dialects[0]
+    types = {
+        Wire.WORD: (WORDS[dialect.word], struct.calcsize(f"<{dialect.word}")),
+        Wire.UINT32: ("UINT32", 4),
+        Wire.DATA: ("bytes", None),
+    }
     rows: list[tuple[object, ...]] = []
-    for row in MESSAGES:
-        fields = wire_fields(row.type)
-        sizes = [TYPES[wire][1] for _, wire in fields]
+    for row in dialect.table:
+        sizes = [types[wire][1] for _, wire in row.fields]
         known = sum(size for size in sizes if size)
         open_end = " + n" if None in sizes else ""
-        lengths = [f"{known + d.header.length_includes}{open_end}" for d in (HANDBOOK, THESIS)]
+        lengths = [f"{known + d.header.length_includes}{open_end}" for d in dialects]
         start = [f"`{row.message_id:#04x}`", _type_name(row)]
-        offset = HANDBOOK.header.size
-        for name, wire in fields:
-            kind, size = TYPES[wire]
+        offset = dialect.header.size
+        for name, wire in row.fields:
+            kind, size = types[wire]
             rows.append((*start, offset, f"`{name}`", kind, size or "n", *lengths))
-            start, lengths = ["", ""], ["", ""]
+            start, lengths = ["", ""], [""] * len(lengths)
             offset += size or 0
-        if not fields:
+        if not row.fields:
             rows.append((*start, "", "none", "", "", *lengths))
-    head = (
-        "id",
-        "class",
-        "offset",
-        "field",
-        "type",
-        "bytes",
-        "length in `handbook`",
-        "in `thesis`",
-    )
-    return _table(head, rows)
+    names = [f"length in `{one.name}`" for one in dialects]
+    return _table(("id", "class", "offset", "field", "type", "bytes", *names), rows)
+
+
+def messages() -> str:
+    """Return the messages of the dialects with a magic number."""
+    return _messages(HANDBOOK)
+
+
+def bodies() -> str:
+    """Return their bodies."""
+    return _bodies(HANDBOOK, THESIS)
+
+
+def messages_b16() -> str:
+    """Return the messages of ``b16``."""
+    return _messages(B16)
+
+
+def bodies_b16() -> str:
+    """Return their bodies."""
+    return _bodies(B16)
+
+
+def messages_bid() -> str:
+    """Return the messages of ``bid``."""
+    return _messages(BID)
+
+
+def bodies_bid() -> str:
+    """Return their bodies."""
+    return _bodies(BID)
+
+
+def result_codes() -> str:
+    """Return the result codes of ``bid``."""
+    rows = [(f"`{int(c):#04x}`", code.text, code.verdict.value) for c, code in CODES.items()]
+    return _table(("code", "meaning", "taken as"), rows)
+
+
+def wire_quirks() -> str:
+    """Return the deviations of dialects that a URL can name."""
+    rows = [
+        (f"`?dialect={dialect.name}&quirks={name}`", quirk.about, *quirk.source.rsplit(", ", 1))
+        for dialect in BVS.dialects.values()
+        for name, quirk in dialect.wire_quirks.items()
+    ]
+    return _table(("in a URL", "what differs", "source", "grade"), rows)
+
+
+def dialects() -> str:
+    """Return every protocol and dialect, over what it is spoken, and who says so."""
+    rows: list[tuple[object, ...]] = []
+    for info in PROTOCOLS.available():
+        protocol = load_protocol(info.name)
+        for dialect in protocol.dialects.values():
+            ways = ", ".join(f"`{scheme}://`" for scheme in protocol.schemes)
+            *source, grade = dialect.source.rsplit(", ", 1)
+            rows.append(
+                (f"`{info.name}`", f"`{dialect.name}`", ways, dialect.about, *source, grade)
+            )
+    return _table(("protocol", "dialect", "URL", "what it is", "source", "grade"), rows)
+
+
+def abilities() -> str:
+    """Return what a camera can do in each dialect, as ``camera.capabilities`` tells it."""
+    found = [
+        dialect.capabilities
+        for info in PROTOCOLS.available()
+        for dialect in load_protocol(info.name).dialects.values()
+    ]
+    names = [one.name for one in dataclasses.fields(found[0]) if one.name != "dialect"]
+    rows = [(f"`{name}`", *("yes" if getattr(c, name) else "" for c in found)) for name in names]
+    return _table(("", *(f"`{one.dialect}`" for one in found)), rows)
 
 
 def quirks() -> str:
@@ -250,7 +333,11 @@ def _constant_doc(module: Any, name: str) -> str:
 
 GENERATED: dict[str, Callable[[], str]] = {
     one.__name__: one
-    for one in (messages, bodies, quirks, settings, transitions, policies, layers, limits)
+    for one in (
+        *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
+        *(result_codes, wire_quirks, dialects, abilities),
+        *(quirks, settings, transitions, policies, layers, limits),
+    )
 }
 """What ``{generated}`` knows."""
 

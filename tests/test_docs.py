@@ -23,13 +23,14 @@ from smartcam import exceptions
 from smartcam.client import SmartCamera
 from smartcam.emulator import Quirks
 from smartcam.models import Status
-from smartcam.protocols.bvs import MESSAGES
+from smartcam.protocols.bvs import B16, BID, BVS, CODES, HANDBOOK
 from smartcam.protocols.machine import TRANSITIONS, State
-from smartcam.protocols.messages import wire_fields
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from smartcam.protocols.framed import FramedDialect
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -303,18 +304,41 @@ def rows(table: str) -> list[list[str]]:
     return [[cell.strip(" `") for cell in line] for line in lines]
 
 
-def test_message_table_has_every_message(tables: dict[str, str]) -> None:
-    shown = [(int(row[0], 16), row[2], f"{row[5]}, {row[6]}") for row in rows(tables["messages"])]
-    assert shown == [(row.message_id, row.type.__name__, row.source) for row in MESSAGES]
+each_table = pytest.mark.parametrize(
+    ("suffix", "dialect"), [("", HANDBOOK), ("_b16", B16), ("_bid", BID)]
+)
 
 
-def test_body_table_has_every_field_at_its_offset(tables: dict[str, str]) -> None:
-    names = [row[3] for row in rows(tables["bodies"])]
+@each_table
+def test_message_table_has_every_message(
+    tables: dict[str, str], suffix: str, dialect: FramedDialect
+) -> None:
+    table = rows(tables["messages" + suffix])
+    shown = [(int(row[0], 16), row[2], f"{row[5]}, {row[6]}") for row in table]
+    assert shown == [(row.message_id, row.type.__name__, row.source) for row in dialect.table]
+    assert {row[6] for row in table} <= {"published", "derived", "inferred"}
+
+
+@each_table
+def test_body_table_has_every_field_at_its_offset(
+    tables: dict[str, str], suffix: str, dialect: FramedDialect
+) -> None:
+    table = rows(tables["bodies" + suffix])
+    names = [row[3] for row in table]
     assert names == [
-        name for row in MESSAGES for name in [f for f, _ in wire_fields(row.type)] or ["none"]
+        name for row in dialect.table for name in [f for f, _ in row.fields] or ["none"]
     ]
-    seconds = [row for row in rows(tables["bodies"]) if row[3] == "second"]
-    assert [row[2] for row in seconds] == ["32", "32"]
+    seconds = [row[2] for row in table if row[3] == "second"]
+    assert seconds == {"": ["32", "32"], "_b16": ["14", "14"], "_bid": ["16", "14"]}[suffix]
+
+
+def test_tables_of_the_dialects_have_all_of_them(tables: dict[str, str]) -> None:
+    shown = [(row[0], row[1]) for row in rows(tables["dialects"])]
+    assert shown == [*(("bvs", name) for name in BVS.dialects), ("insight", "native")]
+    yes = {row[0] for row in rows(tables["abilities"]) if row[4] == "yes"}
+    assert yes == set(BID.capabilities.names)
+    assert [int(row[0], 16) for row in rows(tables["result_codes"])] == list(CODES)
+    assert len(rows(tables["wire_quirks"])) == len(B16.wire_quirks)
 
 
 def test_quirk_table_has_every_quirk(tables: dict[str, str]) -> None:
@@ -348,7 +372,12 @@ def test_import_contract_is_shown(tables: dict[str, str]) -> None:
 
 def test_protocol_page_has_every_status_bit() -> None:
     page = (DOCS / "protocol.md").read_text(encoding="utf-8")
-    assert [bit for bit in Status if f"| `{bit.value:#05x}` | `{bit.name}` |" not in page] == []
+    table = [bit for bit in Status if bit.value < 1 << 32]
+    assert [bit for bit in table if f"| `{bit.value:#05x}` | `{bit.name}` |" not in page] == []
+    bid = page.partition("### `bid`")[2].partition("\n## ")[0]
+    assert {bit.name for bit in Status if f"| `{bit.name}` |" in bid} == {
+        "OVERTRIGGERED", "SIMULATION_MODE", "WAITING_FOR_TRIGGER"
+    }  # fmt: skip
 
 
 def test_every_generated_table_is_in_a_page(tables: dict[str, str]) -> None:

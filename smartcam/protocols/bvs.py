@@ -145,7 +145,7 @@ THESIS = FramedDialect(
 
 # ---------------------------------------------------------------------- 16 bit
 
-_NARROWED = "the bodies of the dialects with 32 bits in 16 bits: inferred"
+_NARROWED = "the bodies of the dialects with 32 bits, narrowed, inferred"
 _KB_SEQUENCE = "Balluff knowledge base, sequence of commands, published"
 _KB_STRUCTURE = "Balluff knowledge base, message structure, published"
 
@@ -174,7 +174,7 @@ B16_MESSAGES = (
         _ID.SET_SEQUENCE_NUMBER,
         m.SetSequenceNumber,
         "Set sequence number",
-        "newest SC manual p. 48 (four bytes), published; their order: inferred",
+        "newest SC manual p. 48; the order of its bytes is doubtful, published",
     ),
     MessageRow(_ID.TRIGGER, m.Trigger, "Trigger", "newest SC manual p. 48; " + _KB_SEQUENCE),
     MessageRow(_ID.START, m.Start, "Start", _KB_SEQUENCE),
@@ -183,7 +183,7 @@ B16_MESSAGES = (
         _ID.REBOOT,
         m.Reboot,
         "Restart camera",
-        "Balluff knowledge base, message structure (the name), published; the id: inferred",
+        "Balluff knowledge base, message structure (the name only), inferred",
     ),
 )
 """Every message of ``b16``."""
@@ -220,7 +220,7 @@ CODES: Mapping[int, Code] = {
 """What BVS ID's result codes mean (BVS ID guide p. 52, published)."""
 
 _16_BIT = HeaderLayout(code="H", order="id, length")
-_CODE_GUESS = "that BVS SC answers as BVS ID does: inferred"
+_CODE_GUESS = "BVS ID's answers carried over to BVS SC, inferred"
 
 B16 = FramedDialect(
     name="b16",
