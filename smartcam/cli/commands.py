@@ -23,6 +23,7 @@ from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import NotRunningError, TriggerTimeoutError
 from smartcam.handshake import load_protocol
 from smartcam.models import Status
+from smartcam.protocols.bvs import BVS
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -202,18 +203,27 @@ def stop(url: str, **shared: Any) -> None:
 
 @command.command(
     help="Decode DATA: hex, the name of a file (binary or hex text), or - for standard input. "
-    "Frames are shown field by field; anything else is a result container's data and needs "
-    "--interpret-as."
+    "Frames are shown field by field (those without a magic number need --dialect); anything else "
+    "is a result container's data and needs --interpret-as."
 )
 @click.argument("data")
 @click.option("--interpret-as", metavar="SPEC", help="How to read a result container's data.")
 @click.option("--big-endian", is_flag=True, help="The container is big endian.")
+@click.option("--dialect", type=click.Choice(tuple(BVS.dialects)), help="Whose frames they are.")
+@click.option("--quirks", metavar="NAMES", default="", help="The dialect's quirks, as in a URL.")
 @output_options
-def decode(data: str, interpret_as: str | None, big_endian: bool, **shared: Any) -> None:
+def decode(
+    data: str,
+    interpret_as: str | None,
+    big_endian: bool,
+    dialect: str | None,
+    quirks: str,
+    **shared: Any,
+) -> None:
     options = Options(interpret_as=interpret_as, **shared)
 
     async def main() -> None:
-        decoding.decode(data, options, big_endian=big_endian)
+        decoding.decode(data, options, big_endian=big_endian, dialect_name=dialect, quirks=quirks)
 
     run(main(), program="smartcam", debug=options.debug)
 

@@ -35,21 +35,35 @@ def from_hex(text: str, where: str) -> bytes:
         raise ConfigurationError(f"{where}: {text[:64]!r} is no hex: {exc}") from exc
 
 
-def decode(data: str, options: Options, *, big_endian: bool) -> None:
-    """Print what ``data`` means."""
+def decode(
+    data: str, options: Options, *, big_endian: bool, dialect_name: str | None, quirks: str
+) -> None:
+    """Print what ``data`` means.
+
+    Args:
+        data: hex, a file's name, or ``-``.
+        options: shared ones.
+        big_endian: of the container.
+        dialect_name: whose frames they are; None: one with a magic number shows by itself.
+        quirks: the dialect's, with commas between them.
+    """
     payload = _load(data)
     if not payload:
         raise ConfigurationError("decode: there are no bytes to decode")
     byte_order: ByteOrder = "big" if big_endian else "little"
     interpreter = None if options.interpret_as is None else resolve(options.interpret_as)
-    dialect = _dialect_of(payload)
+    if dialect_name is None and quirks:
+        raise ConfigurationError("decode: --quirks are a dialect's: name it with --dialect")
+    dialect = _dialect_of(payload) if dialect_name is None else BVS.dialects[dialect_name]
+    if dialect is not None and quirks:
+        dialect = dialect.with_quirks(name.strip() for name in quirks.split(","))
     if dialect is not None:
         _decode_frames(payload, dialect, interpreter, byte_order, options)
         return
     if interpreter is None:
         raise ConfigurationError(
             f"decode: {hex_excerpt(payload[:8])} begins no frame (no magic number), so "
-            "--interpret-as must say what the container holds"
+            "--dialect must say whose frames they are, or --interpret-as what the container holds"
         )
     value = _interpret(payload, interpreter, byte_order)
     options.show({"value": value}, value_text(value))
@@ -124,7 +138,7 @@ def _show_frame(
             "message": name,
             "fields": fields,
         }
-        lines = [f"at {offset}: {name} from the {sender.value}, dialect {dialect.name}"]
+        lines = [f"at {offset}: {name} from the {sender.value}, dialect {dialect.label}"]
         rows = [
             (f.offset, f.name, hex_excerpt(f.raw), f.value if isinstance(f.value, int) else "")
             for f in fields

@@ -176,3 +176,26 @@ def test_decode_short_container_exits_6() -> None:
 
 def test_decode_short_container_in_a_frame_exits_6() -> None:
     run("decode", HELLO_WORLD.hex(), "--interpret-as", "n: int32, s: string[20]").failed(6, "'s'")
+
+
+def test_decode_frames_without_a_magic_number_by_their_dialect() -> None:
+    outcome = run("decode", "31 00 04 00 1A 00 01 00", "--dialect", "bid", "--json")
+    (shown,) = outcome.lines
+    assert (shown["message"], shown["dialect"], shown["sender"]) == (
+        "SwitchAnswer",
+        "bid",
+        "camera",
+    )
+    assert [(f["name"], f["value"]) for f in shown["fields"][2:]] == [
+        ("code", 0x1A),
+        ("application", 1),
+    ]
+
+
+def test_decode_frames_of_a_dialect_with_a_quirk() -> None:
+    outcome = run("decode", "0100040000000100", "--dialect", "b16", "--quirks", "code")
+    assert "ConnectAnswer from the camera, dialect b16 with quirk code" in outcome.out
+
+
+def test_decode_quirks_without_a_dialect_is_wrong_usage() -> None:
+    run("decode", "00", "--quirks", "code").failed(2, "name it with --dialect")
