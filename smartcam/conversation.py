@@ -41,7 +41,8 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport, Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Coroutine
+    from typing import Any
 
     from smartcam.connection import Link
     from smartcam.inbox import Inbox
@@ -405,10 +406,20 @@ class Conversation:
             link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 
     async def refresh_status(self, deadline: float) -> None:
-        """Know the status as it is now, where it can be asked for."""
-        if self.dialect.has(m.GetStatus):
+        """Know the status as it is now, where it can be asked for.
+
+        Raises:
+            ResponseTimeoutError: the camera did not tell it.
+        """
+        if not self.dialect.has(m.GetStatus):
+            return
+        heard = self.inbox.statuses_heard
+        while True:  # a datagram may be lost
             self.require_link().send(m.GetStatus(), answered=False)
             await self._fence(deadline)
+            if self.inbox.statuses_heard != heard:
+                return
+            await self._pause(deadline, "the camera to tell its status")
 
     # ------------------------------------------------------------------ run state, application
 
@@ -494,13 +505,13 @@ class Conversation:
             if not self._is_busy(answer):
                 self.check(m.Query, answer)
                 return answer.application
-            await self._pause(deadline, "the camera to name its application")
+            await self._pause(deadline, "the busy camera to name its application")
 
     def _is_busy(self, answer: m.Acknowledgement) -> bool:
         return self.dialect.code(answer.code).verdict is Verdict.BUSY
 
     async def _pause(self, deadline: float, what: str) -> None:
-        """Wait a moment before a camera that is too busy is asked again.
+        """Wait a moment before the camera is asked again.
 
         Raises:
             ResponseTimeoutError: there is no time left.
@@ -508,8 +519,7 @@ class Conversation:
         left = deadline - asyncio.get_running_loop().time()
         if left <= BUSY_PAUSE:
             raise ResponseTimeoutError(
-                f"{self.name}: waited for {what} until the time was over, it is busy; "
-                f"status: {self.status}"
+                f"{self.name}: waited until the time was over for {what}; status: {self.status}"
             )
         await asyncio.sleep(BUSY_PAUSE)
 
@@ -553,7 +563,7 @@ class Conversation:
                 await self._leave_run_mode(deadline)
             answer = await self.ask(request, m.SwitchAnswer, deadline)
             while self._is_busy(answer):
-                await self._pause(deadline, f"application {application} to be loaded")
+                await self._pause(deadline, f"the busy camera to load {application}")
                 answer = await self.ask(request, m.SwitchAnswer, deadline)
             code, active = answer.code, answer.application
         done = self.dialect.code(code).verdict is Verdict.DONE
@@ -593,14 +603,20 @@ class Conversation:
 
     # ------------------------------------------------------------------ trigger
 
-    async def trigger(self, request: TriggerRequest, deadline: float) -> list[Result]:
+    def trigger(
+        self, request: TriggerRequest, deadline: float
+    ) -> Coroutine[Any, Any, list[Result]]:
         """Wait until the camera takes a trigger, send it, return its results.
-
-        A camera that says that it was too busy for the trigger gets it again.
 
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
+        if self._acknowledged:
+            return self._trigger_until_taken(request, deadline)
+        return self._trigger_once(request, deadline)
+
+    async def _trigger_until_taken(self, request: TriggerRequest, deadline: float) -> list[Result]:
+        """Trigger again where the camera says that it was too busy for it."""
         while True:
             try:
                 return await self._trigger_once(request, deadline)
@@ -682,7 +698,8 @@ class Conversation:
                 self._expect_acknowledgement(pending, deadline)
             else:
                 inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
-            inbox.want_status()
+            if self._poll is not None:
+                self._poll.wanted()
             if not link.writable:
                 with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
                     async with asyncio.timeout_at(deadline):

@@ -188,13 +188,15 @@ class _Collector:
 
         A status may also come by itself, so it must come to each of several questions.
         """
-        machine = self.link.machine
+        machine, reader = self.link.machine, self.link.machine.dialect
         asking = [dialect for dialect in machine.kin if dialect.has(GetStatus)]
         others = [dialect for dialect in machine.kin if not dialect.has(GetStatus)]
         if asking and others:
             # one that goes on without an answer is certain where no message is lost
             certain = 1 if machine.transport is Transport.TCP else 2
-            question = UnknownMessage(message_id=asking[0].message_id(GetStatus), payload=b"")
+            number = asking[0].message_id(GetStatus)
+            known = reader.has(GetStatus)
+            question = GetStatus() if known else UnknownMessage(message_id=number, payload=b"")
             answered = unanswered = 0
             while answered < TELLING_ROUNDS and unanswered < certain:
                 before = self.statuses
@@ -206,7 +208,7 @@ class _Collector:
             machine.adopt(machine.kin[0])
         for chunk in self.early:
             chunk.events[:] = [
-                machine.dialect.restate(event) if isinstance(event, StatusReport) else event
+                machine.dialect.restate(event, reader) if isinstance(event, StatusReport) else event
                 for event in chunk.events
             ]
 

@@ -216,7 +216,8 @@ class Inbox:
     @property
     def watches_status(self) -> bool:
         """Whether somebody subscribed to statuses or events."""
-        return bool(self.status_streams) or bool(self.event_streams)
+        streams: list[Queue[Any]] = [*self.status_streams, *self.event_streams]
+        return any(not stream.ended for stream in streams)
 
     def want_status(self) -> None:
         """Have the status asked for, where it does not come by itself."""

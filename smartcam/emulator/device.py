@@ -754,9 +754,12 @@ class Device:
         return values
 
     def _in_step(self, *, fits: bool) -> None:
-        """Set the bit where containers and inspections are out of step, clear it where not."""
+        """Set the bit where containers and inspections are out of step, clear it where not.
+
+        A reference value, which does not queue, cannot be.
+        """
         self._conditions &= ~_INPUT_CONTAINER
-        if not fits:
+        if not fits and not self.manner.acknowledges:
             self._conditions |= _INPUT_CONTAINER
 
     def _forget_inputs(self) -> None:

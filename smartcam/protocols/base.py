@@ -211,8 +211,8 @@ class Dialect(ABC):
         """Return the names of the fields that a message has on the wire."""
         return tuple(name for name, _ in wire_fields(message_type))
 
-    def restate(self, report: StatusReport) -> StatusReport:
-        """Return a status that was read by the first of the dialect's kin as this one reads it."""
+    def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
+        """Return a status that another dialect has read as this one reads it."""
         return report
 
     @abstractmethod

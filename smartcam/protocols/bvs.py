@@ -363,7 +363,8 @@ class _Bvs(Protocol):
     dialects: Mapping[str, FramedDialect]
 
 
-_16_BIT_KIN = (B16, B16.with_quirks(["code"]), BID)
+# while it is open which of the last two it is, frames are shown as those of bid, which is published
+_16_BIT_KIN = (B16, BID, B16.with_quirks(["code"]))
 
 BVS = _Bvs(
     name="bvs",

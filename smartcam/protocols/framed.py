@@ -377,9 +377,12 @@ class FramedDialect(Dialect):
             return message.message_id
         return self.encoder(message if isinstance(message, type) else type(message)).message_id
 
-    def restate(self, report: StatusReport) -> StatusReport:
-        """Return a status that was read bit by bit as this dialect reads it."""
-        return dataclasses.replace(report, status=self.status_bits.read(int(report.status)))
+    def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
+        """Return a status that another dialect has read as this one reads it."""
+        if not isinstance(reader, FramedDialect):
+            return report
+        word = reader.status_bits.write(report.status)
+        return dataclasses.replace(report, status=self.status_bits.read(word))
 
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
         """Return a frame in words, for a trace; it never raises."""
