@@ -262,9 +262,11 @@ async def _look_again(way: Way, notes: _Notes, missing: int) -> None:
     A link shows whole frames and broken ones; what waited for its rest when the try ended is seen
     by saying the same words on a plain socket once more.
     """
-    if way.transport is not Transport.TCP:
-        return  # a datagram that is no whole frame is broken at once
     said = [entry for entry in notes.frames if entry.direction == ">"]
+    if way.transport is not Transport.TCP or any(entry.message_id is None for entry in said):
+        # a datagram that is no whole frame is broken at once; commands, a login among them, are
+        # not repeated
+        return
     goodbye = said[1:] and said[-1].message == Disconnect.__name__
     words = [bytes.fromhex(entry.hex) for entry in said]
     split = len(words) - 1 if goodbye else len(words)

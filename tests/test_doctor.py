@@ -5,17 +5,24 @@ from __future__ import annotations
 import asyncio
 from contextlib import aclosing
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from doctorkit import WATCH, errors, examined, of, severities
+from handmade import until
 
 import smartcam
+from smartcam import doctor
 from smartcam.doctor import Exit, Finding, examine, summary
 from smartcam.doctor.figures import Figures, figures
 from smartcam.emulator import Application, EmulatedCamera, faults
+from smartcam.emulator.insight import EmulatedInSight
 from smartcam.exceptions import ConfigurationError
+from smartcam.models import Status
 from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from smartcam.doctor.visit import Visit
 
 QUICK = [
     Application(id=2, layout="n: int32", constant={"n": 1}, load_time=0, processing_time=0.001),
@@ -239,8 +246,26 @@ async def test_application_that_is_not_there_is_an_error_with_triggers() -> None
 async def test_application_zero_is_an_error(trigger: bool) -> None:
     async with camera() as emulator:
         findings = await examined(emulator.url, application=0, trigger=trigger, count=1)
+        assert m.Trigger not in sent(emulator)
     assert errors(findings) == [("application", Exit.REFUSED)]
     assert "no application has the id 0" in of(findings, "application").text
+
+
+async def test_application_that_does_not_get_ready_is_an_error_and_not_triggered() -> None:
+    async with camera(faults=[faults.BusyForEver()]) as emulator:
+        findings = await examined(emulator.url, application=5, trigger=True, timeout=0.2)
+        assert m.Trigger not in sent(emulator)
+    assert errors(findings) == [("application", Exit.RAN_OUT), ("run state", Exit.RAN_OUT)]
+    assert "did not get ready in time" in of(findings, "application").text
+
+
+async def test_application_that_cannot_go_back_is_a_warning() -> None:
+    busy = faults.BusyForEver(on="Trigger", when="after")
+    async with camera(5, faults=[busy]) as emulator:
+        findings = await examined(emulator.url, application=2, trigger=True, count=1, timeout=0.3)
+    made, failed = [one for one in findings if one.check == "application"]
+    assert (made.severity, failed.severity) == ("ok", "warning")
+    assert failed.text.startswith("the camera did not go back to how it was: ")
 
 
 # ---------------------------------------------------------------------- run state
@@ -256,6 +281,14 @@ async def test_stopped_camera_is_an_error_that_says_how_to_start() -> None:
     assert f"smartcam start '{emulator.url}'" in found.cure
 
 
+async def test_camera_that_is_stopped_while_watched_is_an_error() -> None:
+    async with camera(5) as emulator, asyncio.TaskGroup() as group:
+        watching = group.create_task(examined(emulator.url, seconds=0.3))
+        await emulator.wait_received(m.Query, count=5 + 1 + 30)
+        emulator.device.stop()
+    assert errors(watching.result()) == [("run state", Exit.REFUSED)]
+
+
 async def test_camera_busy_for_long_is_an_error() -> None:
     async with camera(faults=[faults.BusyForEver()]) as emulator:
         findings = await examined(emulator.url, trigger=True)
@@ -267,6 +300,18 @@ async def test_waiting_camera_is_told() -> None:
     async with camera() as emulator:
         found = of(await examined(emulator.url), "run state")
     assert (found.severity, found.text) == ("ok", "application 2 runs and waits for triggers")
+
+
+async def test_waiting_camera_that_a_sensor_triggers_has_a_rate() -> None:
+    async with camera() as emulator, asyncio.TaskGroup() as group:
+        watching = group.create_task(examined(emulator.url, seconds=0.3))
+        await emulator.wait_received(m.Query, count=5 + 1 + 30)
+        for _ in range(3):
+            emulator.device.trigger()
+            await until(lambda: emulator.device.status & Status.WAITING_FOR_TRIGGER)
+    found = of(watching.result(), "run state")
+    assert "waits for triggers; " in found.text
+    assert found.details["results"] >= 1
 
 
 async def test_free_running_camera_is_told_with_its_rate() -> None:
@@ -362,11 +407,21 @@ async def test_trigger_that_fails_is_told_with_its_error(
     assert found.details["error"] == error
 
 
+async def test_layout_with_a_sequence_number_sets_none() -> None:
+    async with camera() as emulator:
+        layout = "n: int32 @sequence"
+        findings = await examined(emulator.url, trigger=True, count=2, interpret_as=layout)
+        assert m.SetSequenceNumber not in sent(emulator)
+    assert errors(findings) == []
+    assert of(findings, "layout").text == "2 results fit the layout 'n: int32 @sequence'"
+
+
 async def test_second_trigger_that_fails_keeps_the_figures_of_the_first() -> None:
     async with camera(faults=[faults.NoResult(on="Trigger", nth=2)]) as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
     failed, measured = [one for one in findings if one.check == "trigger"]
     assert failed.text.startswith("trigger 2 was inspected")
+    assert measured.details["results_per_second"] > 5  # the wait for the second left out
     assert measured.details["trigger_time"]["times"] == 1
 
 
@@ -419,6 +474,59 @@ async def test_clock_that_is_no_date_is_a_warning() -> None:
         found = of(await examined(emulator.url), "clock")
     assert found.severity == "warning"
     assert found.text == "the camera's clock is no date: (2026, 13, 1, 0, 0, 0)"
+
+
+# ---------------------------------------------------------------------- a fault of ours
+
+
+async def test_check_that_never_ends_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    never = doctor._Check("never", lambda visit: asyncio.sleep(60), lambda plan: 0.05)
+    name, session, *_ = doctor._CHECKS
+    monkeypatch.setattr(doctor, "_CHECKS", (name, session, never))
+    async with camera() as emulator:
+        findings = await examined(emulator.url)
+    assert errors(findings) == [("never", Exit.RAN_OUT)]
+    assert of(findings, "never").text == "this check did not end within 0.05 s"
+
+
+async def test_session_lost_where_nobody_waits_is_noticed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with camera() as emulator:
+
+        async def lose(visit: Visit) -> None:
+            emulator.inject(faults.SecondClient())
+            await until(lambda: not visit.patient.connected)
+
+        idle = doctor._Check("idle", lose, lambda plan: 5.0)
+        name, session, *_ = doctor._CHECKS
+        monkeypatch.setattr(doctor, "_CHECKS", (name, session, idle))
+        findings = await examined(emulator.url)
+    assert errors(findings) == [("taken", Exit.NO_SESSION)]
+
+
+# ---------------------------------------------------------------------- another maker's camera
+
+
+async def test_camera_with_a_login_is_examined_and_its_password_not_shown() -> None:
+    async with EmulatedInSight(users={"me": "secret"}, online=True) as emulator:
+        address = emulator.url.replace("://", "://me:secret@")
+        findings = await examined(address)
+    assert errors(findings) == []
+    assert of(findings, "clock").text == "native has no message for a clock"
+    assert "secret" not in repr(findings)
+
+
+async def test_cells_of_a_spreadsheet_are_compared_with_the_layout() -> None:
+    job = {"file": "one.job", "cells": {"B2": 112.5, "C2": "abc"}}
+    async with EmulatedInSight([job], online=True) as emulator:
+        address = f"{emulator.url}?cells=B2,C2"
+        layout = "x: real32, name: string[3]"
+        findings = await examined(address, trigger=True, count=2, interpret_as=layout)
+        wrong = await examined(address, trigger=True, count=2, interpret_as="x: real32")
+    assert of(findings, "values").text.startswith("x goes up to 112.5")
+    assert errors(wrong) == [("layout", Exit.UNREADABLE)]
+    assert "2 cells came, the layout has 1 fields" in of(wrong, "layout").text
 
 
 # ---------------------------------------------------------------------- figures, summary

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import sys
 from typing import TYPE_CHECKING
+from unittest import mock
 
 import pytest
 from doctorkit import SHORT, errors, examined, of, severities
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults import BaseFault
 
 NO_SESSION = [("session", Exit.NO_SESSION)]
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="how the system refuses differs")
 
 
 # ---------------------------------------------------------------------- the name
@@ -81,12 +85,26 @@ async def test_nothing_listens_is_told_with_every_way_that_was_tried() -> None:
     assert findings[-1] is found
 
 
+async def test_nothing_listens_at_any_address_of_a_name_is_told() -> None:
+    with refusing(socket.SOCK_STREAM) as port:
+        loop = asyncio.get_running_loop()
+        several = [
+            (socket.AF_INET, socket.SOCK_STREAM, 6, "", (host, port))
+            for host in (HOST, "127.0.0.2")
+        ]
+        with mock.patch.object(loop, "getaddrinfo", mock.AsyncMock(return_value=several)):
+            findings = await examined(f"bvs://several:{port}", timeout=SHORT)
+    assert of(findings, "name").text == "several is 127.0.0.1, 127.0.0.2"
+    assert of(findings, "session").text.startswith(f"nothing listens at several:{port} (TCP): ")
+
+
 async def test_nothing_listens_on_udp_is_told() -> None:
     with refusing(socket.SOCK_DGRAM) as port:
         findings = await examined(f"bvs+udp://{HOST}:{port}", timeout=SHORT)
     assert of(findings, "session").text.startswith(f"nothing listens at {HOST}:{port} (UDP)")
 
 
+@linux
 async def test_host_without_a_route_is_unreachable() -> None:
     findings = await examined("bvs://255.255.255.255", timeout=SHORT)
     found = of(findings, "session")
@@ -94,6 +112,7 @@ async def test_host_without_a_route_is_unreachable() -> None:
     assert "both must be in one network" in found.cure
 
 
+@linux
 async def test_connection_that_never_opens_is_told() -> None:
     with socket.socket() as full:
         full.bind((HOST, 0))
@@ -153,6 +172,15 @@ async def test_wrong_dialect_pinned_the_right_one_is_named() -> None:
     failed, made = [one for one in findings if one.check == "session"]
     assert failed.exit_code is Exit.NO_SESSION
     assert failed.details["answers_at"] == made.details["url"] == emulator.url
+
+
+async def test_camera_that_answers_one_try_only_is_gone_again() -> None:
+    once = faults.Refuse(on="Disconnect", seconds=60)
+    async with EmulatedCamera(dialect="thesis", faults=[once]) as emulator:
+        wrong = emulator.url.replace("thesis", "handbook")
+        findings = await examined(wrong, timeout=2 * SHORT)
+    assert errors(findings) == 2 * NO_SESSION
+    assert findings[-1].text.startswith("and it is gone again: ")
 
 
 async def test_camera_that_refuses_newcomers_hangs_up() -> None:
@@ -250,12 +278,9 @@ LATER = 8
 """A Query of the round trip: five sessions have one each before it."""
 
 
-async def lost(
-    *given: BaseFault, transport: str = "tcp", timeout: float = 1.0
-) -> tuple[str, str, Exit]:
+async def lost(*given: BaseFault, timeout: float = 1.0) -> tuple[str, str, Exit]:
     """Return check, text and exit code of how an examination ended."""
-    kind = "tcp" if transport == "tcp" else "udp"
-    async with EmulatedCamera(faults=given, transport=kind, running=True) as emulator:
+    async with EmulatedCamera(faults=given, running=True) as emulator:
         findings = await examined(emulator.url, timeout=timeout)
     last = findings[-1]
     assert errors(findings) == [(last.check, last.exit_code)]

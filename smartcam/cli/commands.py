@@ -12,15 +12,16 @@ from smartcam.cli import decoding, demo, doctoring, probing
 from smartcam.cli.options import (
     CONNECTS,
     SECONDS,
+    ApplicationName,
     Options,
     camera_options,
     output_options,
     result_options,
 )
 from smartcam.cli.running import run
-from smartcam.cli.texts import result_text, table_text
+from smartcam.cli.texts import application_text, result_text, table_text
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
-from smartcam.exceptions import NotRunningError, TriggerTimeoutError
+from smartcam.exceptions import NotRunningError, TriggerTimeoutError, UnsupportedError
 from smartcam.handshake import load_protocol
 from smartcam.models import Status
 from smartcam.protocols.bvs import BVS
@@ -43,8 +44,9 @@ EPILOG = (
 def command() -> None:
     """Talk to industrial smart cameras.
 
-    A camera is named by its URL: bvs://HOST[:PORT] over TCP, bvs+udp://HOST[:PORT] over UDP;
-    ?dialect=NAME pins what is otherwise found out (see "smartcam protocols").
+    A camera is named by its URL: bvs://HOST[:PORT] over TCP, bvs+udp://HOST[:PORT] over UDP,
+    insight://[USER[:PASSWORD]@]HOST[:PORT]; ?dialect=NAME pins what is otherwise found out (see
+    "smartcam protocols").
     """
 
 
@@ -154,6 +156,11 @@ async def _watch(url: str, options: Options) -> None:
         # subscribed before the session is there, so the first result is seen too
         results = unopened.results()
         async with unopened as camera:
+            if not camera.capabilities.unasked_results:
+                raise UnsupportedError(
+                    f"{camera.name}: the camera sends no results by itself; to have some: "
+                    f"smartcam trigger {camera.url} --count N"
+                )
             done = 0
             try:
                 async with asyncio.timeout(options.seconds):
@@ -175,13 +182,13 @@ async def _watch(url: str, options: Options) -> None:
 
 
 @command.command(
-    help="Load another application; returns when the camera is ready. It runs if the one before "
-    f"ran. {CONNECTS}"
+    help="Load another application by its id, or by the name of its file where the camera can do "
+    f"that; returns when the camera is ready. It runs if the one before ran. {CONNECTS}"
 )
 @click.argument("url")
-@click.argument("application", type=click.IntRange(0, 0xFFFFFFFF))
+@click.argument("application", metavar="ID|FILE", type=ApplicationName())
 @camera_options
-def switch(url: str, application: int, **shared: Any) -> None:
+def switch(url: str, application: int | str, **shared: Any) -> None:
     _then_show(url, Options(**shared), lambda camera: camera.switch_application(application))
 
 
@@ -247,6 +254,7 @@ def protocols(**shared: Any) -> None:
                     {"name": d.name, "about": d.about, "source": d.source}
                     for d in protocol.dialects.values()
                 ],
+                "parameters": protocol.parameters,
             }
             rows = [(d.name, d.about) for d in protocol.dialects.values()]
             head = (
@@ -305,8 +313,9 @@ def _show_camera(camera: smartcam.SmartCamera, options: Options) -> None:
         "protocol_version": camera.protocol_version,
     }
     running = "running" if Status.RUNNING in camera.status else "stopped"
+    active = application_text(camera.active_application)
     options.show(
         value,
-        f"{camera.url}\n  application {camera.active_application}, {running}\n"
+        f"{camera.url}\n  {active}, {running}\n"
         f"  status: {camera.status}\n  protocol version {camera.protocol_version}",
     )

@@ -8,14 +8,17 @@ import importlib
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+from click.core import ParameterSource
 
 import smartcam
 from smartcam.cli.options import Options, output_options
 from smartcam.cli.running import run
 from smartcam.emulator import EmulatedCamera, load_scenario
+from smartcam.emulator.insight import BUILTIN_JOBS, EmulatedInSight
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 from smartcam.layout.files import YAML_ALSO_RAISES
 from smartcam.protocols.bvs import BVS
+from smartcam.protocols.insight import INSIGHT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 DIALECTS = tuple(BVS.dialects)
+PROTOCOLS = (BVS.name, INSIGHT.name)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -35,7 +39,15 @@ DIALECTS = tuple(BVS.dialects)
     type=click.IntRange(0, 65535),
     default=0,
     show_default=True,
-    help="Port; 0 takes a free one, a camera's own is 36701. Further cameras take the next ones.",
+    help="Port; 0 takes a free one, a camera's own is 36701 (BVS) or 23 (In-Sight). Further "
+    "cameras take the next ones.",
+)
+@click.option(
+    "--protocol",
+    type=click.Choice(PROTOCOLS),
+    default=PROTOCOLS[0],
+    show_default=True,
+    help="Whose cameras; insight takes no scenario, --dialect or --transport.",
 )
 @click.option(
     "--dialect", type=click.Choice(DIALECTS), default=DIALECTS[0], show_default=True, help="Speak."
@@ -56,10 +68,13 @@ DIALECTS = tuple(BVS.dialects)
 )
 @output_options
 @click.version_option(smartcam.__version__)
+@click.pass_context
 def command(
+    context: click.Context,
     scenario: str | None,
     host: str,
     port: int,
+    protocol: str,
     dialect: str,
     transport: Literal["tcp", "udp"],
     cameras: int,
@@ -70,24 +85,37 @@ def command(
 
     Prints one line per camera, its URL. Without a scenario there are the built-in applications:
     1 three strings, 3 mixed fields, 7 the tangram table's localizations, 9 a free-running counter,
-    21 "Hello World".
+    21 "Hello World". An In-Sight camera has the jobs 1 (constants), 7 (a counter of triggers) and
+    9 (free-running), and is offline at first.
     """
     options = Options(**shared)
+    in_sight = protocol == INSIGHT.name
+    if in_sight:
+        _refuse_what_does_not_fit(context)
 
     async def main() -> None:
         loaded = None if scenario is None else load_scenario(scenario)
         chosen = _quirks(loaded, quirks)
+
+        def made(index: int) -> EmulatedCamera | EmulatedInSight:
+            at = port + index if port else 0
+            name = f"camera{index + 1}" if cameras > 1 else None
+            if in_sight:
+                named = {} if name is None else {"name": name}
+                return EmulatedInSight(BUILTIN_JOBS, host=host, port=at, quirks=chosen, **named)
+            return EmulatedCamera(
+                scenario=loaded,
+                host=host,
+                port=at,
+                dialect=dialect,
+                transport=transport,
+                quirks=chosen,
+                name=name,
+            )
+
         async with contextlib.AsyncExitStack() as stack:
             for index in range(cameras):
-                emulator = EmulatedCamera(
-                    scenario=loaded,
-                    host=host,
-                    port=port + index if port else 0,
-                    dialect=dialect,
-                    transport=transport,
-                    quirks=chosen,
-                    name=f"camera{index + 1}" if cameras > 1 else None,
-                )
+                emulator = made(index)
                 await stack.enter_async_context(emulator)
                 _announce(emulator, options)
             await asyncio.Event().wait()
@@ -131,13 +159,31 @@ def _quirk(text: str) -> tuple[str, Any]:
         raise ConfigurationError(f"--quirk {text}: {exc}") from exc
 
 
-def _announce(emulator: EmulatedCamera, options: Options) -> None:
+def _refuse_what_does_not_fit(context: click.Context) -> None:
+    """Refuse what was said for the cameras of another protocol.
+
+    Raises:
+        click.UsageError: names it.
+    """
+    said = {"scenario": "scenario", "dialect": "--dialect", "transport": "--transport"}
+    for name, text in said.items():
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--protocol {INSIGHT.name} takes no {text}")
+
+
+def _announce(emulator: EmulatedCamera | EmulatedInSight, options: Options) -> None:
+    if isinstance(emulator, EmulatedInSight):
+        transport, dialect = INSIGHT.schemes["insight"].value, next(iter(INSIGHT.dialects))
+        ids = [job.id for job in emulator.device.jobs.values() if job.id is not None]
+    else:
+        transport, dialect = emulator.transport, emulator.dialect
+        ids = list(emulator.device.applications)
     value = {
         "url": emulator.url,
         "host": emulator.host,
         "port": emulator.port,
-        "transport": emulator.transport,
-        "dialect": emulator.dialect,
-        "applications": sorted(emulator.device.applications),
+        "transport": transport,
+        "dialect": dialect,
+        "applications": sorted(ids),
     }
     options.show(value, emulator.url)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CONNECTS",
+    "ApplicationName",
     "Options",
     "camera_options",
     "camera_url",
@@ -43,6 +44,21 @@ class _Seconds(click.FloatRange):
         if math.isnan(seconds):
             self.fail(f"{value!r} is not a number.", param, ctx)
         return seconds
+
+
+class ApplicationName(click.ParamType):
+    """An application's id, or the name of its file: whatever is no number."""
+
+    name = "id or file"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | str:
+        """Return an int for an id; click's own error for one that is out of range."""
+        if isinstance(value, str) and not value.lstrip("+-").isdecimal():
+            return value
+        number: int = click.IntRange(0, 0xFFFFFFFF).convert(value, param, ctx)
+        return number
 
 
 SECONDS = _Seconds(min=0, min_open=True, max=86_400)

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import hex_excerpt
 from smartcam.models import Localization, Result, jsonable
+from smartcam.protocols.messages import UNNAMED_APPLICATION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["result_text", "table_text", "value_text"]
+__all__ = ["application_text", "result_text", "table_text", "value_text"]
 
 
 def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -28,12 +29,19 @@ def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     return "\n".join("  " + line for line in lines)
 
 
+def application_text(application: int | None) -> str:
+    """Return which application it is; a job of a camera may have none of the ids."""
+    if application == UNNAMED_APPLICATION:
+        return "application without an id"
+    return f"application {application}"
+
+
 def result_text(result: Result) -> str:
     """Return a result: a line about it, then its value."""
     latency = f", {1e3 * result.latency:.1f} ms after its trigger" if result.latency else ""
     sequence = f", sequence {result.sequence}" if result.sequence is not None else ""
     return (
-        f"result {result.number} of application {result.application}{sequence}{latency}\n"
+        f"result {result.number} of {application_text(result.application)}{sequence}{latency}\n"
         f"{value_text(result.value)}"
     )
 

@@ -73,7 +73,7 @@ def _switch(plan: Plan) -> float:
 
 
 _CHECKS = (
-    _Check("name", reaching.resolve, lambda plan: plan.step(10.0), in_session=False),
+    _Check("name", reaching.resolve, lambda plan: plan.step(10.0) + 1.0, in_session=False),
     _Check(
         "session",
         reaching.connect,
@@ -146,13 +146,11 @@ async def examine(
         seconds=seconds,
         count=count,
     )
-    visit = Visit(plan, parse_address(url), trace, Witness(trace), wants_trigger=trigger)
+    visit = Visit(plan, parse_address(url), trace, Witness(), wants_trigger=trigger)
     visit.make_camera()  # which sees to it that the options can work
     yield NOTICE
     async with visit.stack, visit.borrowed:
         for check in _CHECKS:
-            if check.in_session and visit.camera is None:
-                return
             goes_on = await _run(check, visit)
             for finding in visit.take():
                 yield finding

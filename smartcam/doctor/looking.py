@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections import deque
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.doctor.figures import figures
+from smartcam.doctor.figures import Figures, figures
 from smartcam.doctor.findings import Exit
+from smartcam.doctor.visit import called
 from smartcam.exceptions import InterpretationError, ResponseTimeoutError
 from smartcam.models import Status
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam.doctor.findings import Severity
-    from smartcam.doctor.visit import Visit
+    from smartcam.doctor.visit import Visit, Witness
 
 __all__ = ["look_at_clock", "look_at_status", "measure_round_trip", "watch"]
 
@@ -27,6 +31,9 @@ QUERIES_WITHIN = 3.0
 
 SLOW = 0.05
 """Seconds of round trip from which on a hint is given: on a local network it takes milliseconds."""
+
+MAX_SEEN = 1000
+"""Statuses kept while watching; the last ones."""
 
 CLOCK_MAY_DIFFER = timedelta(minutes=1)
 """A camera's clock is set by hand or by a client; a minute is what a day or two make of it."""
@@ -94,9 +101,9 @@ async def look_at_status(visit: Visit) -> None:
     for one in wrong:
         sticky = one.bit is Status.OVERTRIGGERED and capable.reset_errors
         cure = one.cure + (_STICKY if sticky else "")
-        visit.say("status", one.severity, one.text, cure, exit_code=one.exit_code, bits=status)
+        visit.say("status", one.severity, one.text, cure, exit_code=one.exit_code, status=status)
     if not wrong:
-        visit.say("status", "ok", f"no fault is reported: {status}", bits=status)
+        visit.say("status", "ok", f"no fault is reported: {status}", status=status)
 
 
 # ---------------------------------------------------------------------- round trip
@@ -125,6 +132,48 @@ async def measure_round_trip(visit: Visit) -> None:
 # ---------------------------------------------------------------------- run state
 
 
+class _RunState(NamedTuple):
+    """A run state in which no result comes.
+
+    Attributes:
+        fits: whether it is that, by the statuses seen.
+        text: what to say; ``application`` and ``seconds`` are filled in.
+        cure: what to do; ``url`` is filled in.
+        exit_code: of the finding.
+    """
+
+    fits: Callable[[list[Status]], bool]
+    text: str
+    cure: str
+    exit_code: Exit
+
+
+_RUN_STATES = (
+    _RunState(
+        lambda seen: _is_stopped(seen[-1]),
+        "{application} is stopped, so no result comes",
+        "Start it: smartcam start '{url}', or await camera.start(), or name the application "
+        "(smartcam trigger --application, connect(application=...)), which starts it.",
+        Exit.REFUSED,
+    ),
+    _RunState(
+        lambda seen: all(Status.BUSY in one for one in seen),
+        "the camera is BUSY, all {seconds:g} s long",
+        "It loads an application, or somebody works on its pages. If it stays so for minutes, "
+        "restart it.",
+        Exit.RAN_OUT,
+    ),
+    _RunState(
+        lambda seen: True,
+        "{application} runs, does not wait for a trigger, and sent nothing in {seconds:g} s",
+        'It runs free without a "send results" tool, or an inspection takes longer than that: '
+        "watch longer (--seconds), or look at the application on the camera.",
+        Exit.RAN_OUT,
+    ),
+)
+"""The first that fits is it."""
+
+
 async def watch(visit: Visit) -> None:
     """Check ``run state``: stopped, busy, waiting for triggers, or running free.
 
@@ -134,64 +183,35 @@ async def watch(visit: Visit) -> None:
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
         return  # that was told, and explains everything
-    if _is_stopped(status) or _waits(status):
-        seen = [status]
-        if not (_is_stopped(status) or visit.wants_trigger):
-            seen = await _watch(visit, seconds)
-    else:
-        seen = await _watch(visit, seconds)
-    status = camera.status
-    arrivals = list(witness.arrivals)
-    if all(_is_stopped(one) for one in seen):
-        visit.say(
-            "run state",
-            "error",
-            f"application {application} is stopped, so no result comes",
-            f"Start it: smartcam start '{camera.url}', or await camera.start(), or name the "
-            "application (smartcam trigger --application, connect(application=...)), which starts "
-            "it.",
-            exit_code=Exit.REFUSED,
-            application=application,
-            bits=status,
-        )
-    elif all(Status.BUSY in one for one in seen):
-        visit.say(
-            "run state",
-            "error",
-            f"the camera is BUSY, all {seconds:g} s long",
-            "It loads an application, or somebody works on its pages. If it stays so for minutes, "
-            "restart it.",
-            exit_code=Exit.RAN_OUT,
-            bits=status,
-        )
-    elif any(_waits(one) for one in seen):
+    settled = _is_stopped(status) or (_waits(status) and visit.wants_trigger)
+    seen = [status] if settled else await _watch(visit, seconds)
+    details: dict[str, Any] = {"application": application, "status": camera.status}
+    stopped = _is_stopped(seen[-1])  # perhaps while it was watched
+    if any(_waits(one) for one in seen) and not stopped:
         visit.may_trigger = True
-        came = f"; {len(arrivals)} results came in {seconds:g} s" if arrivals else ""
-        text = f"application {application} runs and waits for triggers{came}"
-        visit.say("run state", "ok", text, application=application, bits=status, **_rate(arrivals))
-    elif arrivals:
-        _say_free(visit, arrivals)
+        came = f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
+        text = f"{called(application)} runs and waits for triggers{came}"
+        visit.say("run state", "ok", text, **details, **_rate(witness))
+    elif witness.results and not stopped:
+        _say_free(visit, details)
     else:
+        state = next(state for state in _RUN_STATES if state.fits(seen))
         visit.say(
             "run state",
             "error",
-            f"application {application} runs, does not wait for a trigger, and sent nothing in "
-            f"{seconds:g} s",
-            'It runs free without a "send results" tool, or an inspection takes longer than '
-            "that: watch longer (--seconds), or look at the application on the camera.",
-            exit_code=Exit.RAN_OUT,
-            application=application,
-            bits=status,
+            state.text.format(application=called(application), seconds=seconds),
+            state.cure.format(url=camera.url),
+            exit_code=state.exit_code,
+            **details,
         )
 
 
-def _say_free(visit: Visit, arrivals: list[float]) -> None:
-    application, rate = visit.patient.active_application, _rate(arrivals)
-    text = f"application {application} runs free: {len(arrivals)} results in "
-    text += f"{visit.plan.seconds:g} s"
+def _say_free(visit: Visit, details: dict[str, Any]) -> None:
+    witness, rate = visit.witness, _rate(visit.witness)
+    text = f"{called(visit.patient.active_application)} runs free: {witness.results} results "
+    text += f"in {visit.plan.seconds:g} s"
     if rate:
-        text += f", {rate['results_per_second']:.1f} a second; between two: "
-        text += str(figures([after - before for before, after in pairwise(arrivals)]))
+        text += f", {rate['results_per_second']:.1f} a second; between two: {_intervals(witness)}"
     wanted = visit.wants_trigger
     visit.say(
         "run state",
@@ -202,44 +222,41 @@ def _say_free(visit: Visit, arrivals: list[float]) -> None:
         if wanted
         else "",
         exit_code=Exit.RAN_OUT if wanted else Exit.DONE,
-        application=application,
-        bits=visit.patient.status,
+        **details,
         **rate,
     )
 
 
 async def _watch(visit: Visit, seconds: float) -> list[Status]:
     """Return every status of so many seconds, the present one first."""
-    seen: list[Status] = []
+    seen: deque[Status] = deque(maxlen=MAX_SEEN)
 
     def note(status: Status) -> bool:
-        if not seen or seen[-1] != status:
-            seen.append(status)
-            del seen[:-MAX_SEEN]
+        seen.append(status)
         return False
 
-    visit.witness.arrivals.clear()
+    visit.witness.forget_arrivals()
     # held while it watches: results are made where somebody takes them
     async with visit.patient.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
             await visit.patient.wait_status(note, timeout=seconds)
-    return seen
+    return list(seen)
 
 
-MAX_SEEN = 1000
-"""Statuses kept while watching; the last ones."""
+def _intervals(witness: Witness) -> Figures:
+    return figures([after - before for before, after in pairwise(witness.arrivals)])
 
 
-def _rate(arrivals: list[float]) -> dict[str, Any]:
+def _rate(witness: Witness) -> dict[str, Any]:
     """Return rate and spread of results that came by themselves; nothing for a single one."""
-    times = [after - before for before, after in pairwise(arrivals)]
-    if not times:
+    arrivals = witness.arrivals
+    if len(arrivals) < 2:
         return {}
     span = arrivals[-1] - arrivals[0]
     return {
-        "results": len(arrivals),
-        "results_per_second": len(times) / span if span else 0.0,
-        "interval": figures(times)._asdict(),
+        "results": witness.results,
+        "results_per_second": (len(arrivals) - 1) / span if span else 0.0,
+        "interval": _intervals(witness)._asdict(),
     }
 
 
@@ -257,7 +274,9 @@ def _waits(status: Status) -> bool:
 async def look_at_clock(visit: Visit) -> None:
     """Check ``clock``: whether it shows this machine's time, local or UTC.
 
-    It carries no time zone, and a restart loses it (bvs.md 5.6 and 8.9; published for a sibling).
+    It carries no time zone, and a restart loses it.
+
+    Source: BVS ID guide p. 231 (published); for the others inferred.
     """
     camera = visit.patient
     if not camera.capabilities.get_clock:

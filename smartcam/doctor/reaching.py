@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import re
 import socket
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,14 +13,12 @@ from smartcam.doctor.figures import figures
 from smartcam.doctor.findings import Exit
 from smartcam.exceptions import (
     ConnectFailedError,
-    ConnectionTakenError,
     ProtocolError,
     ResponseTimeoutError,
 )
 from smartcam.handshake import load_protocol
 from smartcam.probing import trials
 from smartcam.protocols.base import Transport
-from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from smartcam.client import SmartCamera
     from smartcam.doctor.visit import Visit
     from smartcam.exceptions import SmartCamError
-    from smartcam.probing import Trial
+    from smartcam.probing import Answer, Trial
 
 __all__ = ["connect", "explain_loss", "resolve"]
 
@@ -39,6 +38,9 @@ CONNECTS_WITHIN = 3.0
 
 KNOCK_TIMEOUT = 1.0
 """Seconds for a bare TCP connection, to tell a camera that is away from one that hung up."""
+
+KNOCK_AFTER = 0.25
+"""Seconds before that: what goes down closes its connections a moment before its port."""
 
 SOON = 10.0
 """Seconds: a session that is lost so soon after its Connect was probably taken, as the client's
@@ -52,10 +54,13 @@ async def resolve(visit: Visit) -> None:
     """Check ``name``: what the host resolves to."""
     host, port = visit.address.host, visit.address.port
     loop = asyncio.get_running_loop()
+    limit = visit.plan.step(10.0)
     try:
-        found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        async with asyncio.timeout(limit):
+            found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as exc:
         why = exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)
+        why = why or f"no name server answers within {limit:g} s"
         visit.say(
             "name",
             "error",
@@ -89,7 +94,7 @@ async def connect(visit: Visit) -> None:
         camera, times, begin = answered, list[float](), loop.time()
     else:
         times = [loop.time() - begin]
-    visit.address = parse_address(camera.url)
+    visit.pin(camera.url)
     first = times[0] if times and not pinned else None
     try:
         while len(times) < CONNECTS and loop.time() - begin < CONNECTS_WITHIN:
@@ -149,15 +154,18 @@ class _Kind(NamedTuple):
     cure: str
 
 
-def _root(error: BaseException | None) -> BaseException | None:
-    """Return the system's own error under a link's."""
-    cause = error.__cause__ if error is not None else None
-    return cause if isinstance(cause, OSError) else error
-
-
 def _is_errno(trial: Trial, *numbers: int) -> bool:
-    root = _root(trial.error)
-    return isinstance(root, OSError) and root.errno in numbers
+    """Whether one of these errors of the system is behind it; a name has several addresses."""
+    error = trial.error
+    if error is not None and isinstance(error.__cause__, OSError):
+        error = error.__cause__
+    if not isinstance(error, OSError):
+        return False
+    found = {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
+    return not found.isdisjoint(numbers)
+
+
+_ERRNO = re.compile(r"\[Errno (\d+)\]")
 
 
 _UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
@@ -186,6 +194,11 @@ _KINDS: tuple[_Kind, ...] = (
         "nobody answers at {where}, not even with a refusal: {said}",
         "Wrong address, no power, another network, or a firewall that drops what comes. Does the "
         "camera answer a ping from this machine?",
+    ),
+    _Kind(
+        lambda trial: not trial.opened,
+        "no connection to {where}: {said}",
+        "Look at the address, this machine's network and the camera's.",
     ),
     _Kind(
         lambda trial: trial.hung_up,
@@ -221,15 +234,13 @@ _KINDS: tuple[_Kind, ...] = (
 
 async def _diagnose(visit: Visit, failure: ConnectFailedError) -> SmartCamera | None:
     """Say why there is no session; return a camera where another way leads to one."""
-    own = visit.address
-    found: list[Trial] = []
-    timeout = visit.plan.step(10.0)
-    async with contextlib.aclosing(trials(own, timeout=timeout, trace=visit.trace)) as tries:
-        found.extend([trial async for trial in tries])
+    own, found = visit.address, await _try_all(visit)
     answer = found[-1].answer
-    tried = [str(trial) for trial in found]
-    same = parse_address(answer.url) if answer is not None else None
-    if same is not None and same.scheme == own.scheme and own.dialect in {None, same.dialect}:
+    if answer is None:
+        _say_no_session(visit, found, None)
+        return None
+    visit.pin(answer.url)
+    if visit.address.scheme == own.scheme and own.dialect in {None, visit.address.dialect}:
         visit.say(
             "session",
             "warning",
@@ -239,38 +250,49 @@ async def _diagnose(visit: Visit, failure: ConnectFailedError) -> SmartCamera | 
             attempts=list(failure.attempts),
         )
     else:
-        kind, trial = _reason(found, pinned=own.dialect is not None)
-        words = {
-            "where": f"{visit.host_and_port} ({trial.transport.upper()})",
-            "said": trial.outcome,
-            "step": trial.step,
-            "this": trial.transport.upper(),
-            "other": "UDP" if trial.transport == "tcp" else "TCP",
-            "port": str(own.port),
-        }
-        others = [one for one in found if one is not trial]
-        also = f" Also tried: {_folded(others)}." if others else ""
-        cure = kind.cure.format(**words) + also
-        if answer is not None:
-            cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
-        visit.say(
-            "session",
-            "error",
-            kind.text.format(**words),
-            cure,
-            exit_code=Exit.NO_SESSION,
-            tries=tried,
-            frames=[trial.frames for trial in found],
-            answers_at=answer.url if answer is not None else None,
-        )
-    if same is None:
-        return None
-    visit.address = same
+        _say_no_session(visit, found, answer)
     try:
         return await visit.make_camera().open()
     except ConnectFailedError as exc:
         visit.say("session", "error", f"and it is gone again: {exc}", exit_code=Exit.NO_SESSION)
         return None
+
+
+async def _try_all(visit: Visit) -> list[Trial]:
+    """Return every try, up to the one that is answered."""
+    timeout = visit.plan.step(10.0)
+    tries = trials(visit.address, timeout=timeout, trace=visit.trace)
+    async with contextlib.aclosing(tries):
+        return [trial async for trial in tries]
+
+
+def _say_no_session(visit: Visit, found: list[Trial], answer: Answer | None) -> None:
+    own = found[0].address
+    kind, trial = _reason(found, pinned=own.dialect is not None)
+    words = {
+        "where": f"{visit.host_and_port} ({trial.transport.upper()})",
+        "said": trial.outcome,
+        "step": trial.step,
+        "this": trial.transport.upper(),
+        "other": "UDP" if trial.transport == "tcp" else "TCP",
+        "port": str(own.port),
+    }
+    if answer is not None:
+        cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
+    else:
+        others = [one for one in found if one is not trial]
+        also = f" Also tried: {_folded(others)}." if others else ""
+        cure = kind.cure.format(**words) + also
+    visit.say(
+        "session",
+        "error",
+        kind.text.format(**words),
+        cure,
+        exit_code=Exit.NO_SESSION,
+        tries=[str(one) for one in found],
+        frames=[one.frames for one in found],
+        answers_at=answer.url if answer is not None else None,
+    )
 
 
 def _reason(found: list[Trial], *, pinned: bool) -> tuple[_Kind, Trial]:
@@ -302,8 +324,10 @@ def _folded(found: list[Trial]) -> str:
 async def explain_loss(visit: Visit, error: SmartCamError) -> None:
     """Say why a session is over; takes the camera from nobody.
 
-    Whether the camera is still there is tried with a bare TCP connection: it is a Connect that
-    takes a session over, not a connection (inferred).
+    A client that makes a new session and loses it again knows that it was taken
+    (ConnectionTakenError), at the price of taking the camera back once. This does not: whether the
+    camera is still there is tried with a bare TCP connection. It is a Connect that takes a session
+    over, not a connection (inferred).
     """
     age = asyncio.get_running_loop().time() - visit.connected_at
     cause = error.__cause__
@@ -320,7 +344,7 @@ async def explain_loss(visit: Visit, error: SmartCamError) -> None:
             exit_code=Exit.NO_SESSION,
             **details,
         )
-    elif isinstance(error, ConnectionTakenError) or (closed and not udp and await _knock(visit)):
+    elif closed and not udp and await _knock(visit):
         soon = ", soon after its Connect" if age < SOON else ""
         visit.say(
             "taken",
@@ -356,6 +380,7 @@ async def explain_loss(visit: Visit, error: SmartCamError) -> None:
 
 async def _knock(visit: Visit) -> bool:
     """Whether something takes a TCP connection there."""
+    await asyncio.sleep(KNOCK_AFTER)
     try:
         async with asyncio.timeout(KNOCK_TIMEOUT):
             _, writer = await asyncio.open_connection(visit.address.host, visit.address.port)

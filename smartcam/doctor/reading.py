@@ -8,13 +8,15 @@ import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.doctor.findings import Exit
-from smartcam.exceptions import InterpretationError, hex_excerpt
-from smartcam.interpreters.base import Context, Reader, run
+from smartcam.doctor.visit import called
+from smartcam.exceptions import hex_excerpt
+from smartcam.interpreters.localizations import Localizations
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from smartcam.doctor.visit import Visit
+    from smartcam.doctor.visit import Reading, Visit
+    from smartcam.exceptions import InterpretationError
     from smartcam.interpreters.base import Interpreter
     from smartcam.layout import Field, Layout
     from smartcam.models import ByteOrder, Result
@@ -123,21 +125,18 @@ async def look_at_results(visit: Visit) -> None:
         visit.say(
             "layout",
             "error",
-            f"a result came, and its byte order is not known: {unreadable}",
-            "Please tell us, with --trace.",
+            f"a result came that cannot be read: {unreadable}",
+            "Compare it with what the camera is told to send; smartcam watch and --trace show it.",
             exit_code=Exit.UNREADABLE,
         )
-        return
-    if not containers:
-        if interpreter is not None:
-            visit.say(
-                "layout",
-                "hint",
-                "no result came, so the layout was not compared with one",
-                "With --trigger, or while the application runs free, there are results.",
-            )
-        return
-    if interpreter is None:
+    elif not containers and interpreter is not None:
+        visit.say(
+            "layout",
+            "hint",
+            "no result came, so the layout was not compared with one",
+            "With --trigger, or while the application runs free, there are results.",
+        )
+    elif containers and interpreter is None:
         sizes = sorted({len(result.raw) for result in containers})
         visit.say(
             "layout",
@@ -147,19 +146,23 @@ async def look_at_results(visit: Visit) -> None:
             sizes=sizes,
             first=containers[0].raw,
         )
-        return
-    values: list[Any] = []
-    order: ByteOrder = "big" if visit.witness.endian == 1 else "little"
-    for result in containers:
-        try:
-            values.append(_read(visit, interpreter, result, order))
-        except InterpretationError as exc:
-            _say_misfit(visit, interpreter, result, exc, order)
+    elif interpreter is not None:
+        _compare(visit, interpreter, containers)
+
+
+def _compare(visit: Visit, interpreter: Interpreter, containers: list[Result]) -> None:
+    """Tell the first result that does not fit, or that all do and what their values look like."""
+    readings: list[Reading] = [result.value for result in containers]
+    for result, reading in zip(containers, readings, strict=True):
+        if reading.error is not None:
+            _say_misfit(visit, interpreter, result, reading, reading.error)
             return
     fit = "were read" if interpreter.layout is None else f"fit the layout '{interpreter.layout}'"
-    visit.say("layout", "ok", f"{len(values)} results {fit}", results=len(values))
+    visit.say("layout", "ok", f"{len(readings)} results {fit}", results=len(readings))
     if interpreter.layout is not None:
-        _look_at_values(visit, interpreter.layout, containers, order)
+        # there integers are metres and radians, too; elsewhere they may count pixels
+        integers = isinstance(interpreter, Localizations)
+        _look_at_values(visit, interpreter.layout, readings, integers=integers)
 
 
 def _listed(sizes: Sequence[int]) -> str:
@@ -167,36 +170,24 @@ def _listed(sizes: Sequence[int]) -> str:
     return shown + (" ..." if len(sizes) > 8 else "")
 
 
-def _read(visit: Visit, interpreter: Interpreter, result: Result, order: ByteOrder) -> Any:
-    context = Context(
-        camera=result.camera,
-        application=result.application,
-        number=result.number,
-        received_at=result.received_at,
-        byte_order=order,
-        y_down=visit.plan.y_down,
-    )
-    return run(interpreter, Reader(result.raw, context, interpreter.layout))
-
-
 def _say_misfit(
     visit: Visit,
     interpreter: Interpreter,
     result: Result,
+    reading: Reading,
     error: InterpretationError,
-    order: ByteOrder,
 ) -> None:
-    layout, raw = interpreter.layout, result.raw
+    layout, raw = interpreter.layout, reading.data
     details: dict[str, Any] = {
         "application": result.application,
         "offset": error.offset,
         "received": len(raw),
         "raw": raw,
     }
-    text = f"a result of application {result.application} does not fit the layout: {error}"
+    text = f"a result of {called(result.application)} does not fit the layout: {error}"
     if layout is not None:
         details["expected"] = _size_text(layout)
-        details["dump"] = aligned(layout, raw, order, around=error.offset)
+        details["dump"] = aligned(layout, raw, reading.byte_order, around=error.offset)
         text += f". The layout has {_size_text(layout)}, {len(raw)} came"
     visit.say(
         "layout",
@@ -244,7 +235,7 @@ PLAUSIBLE: tuple[_Plausible, ...] = (
         2 * math.pi + 1e-6,
         "degrees",
         "deg",
-        "one turn: cameras give angles of half a turn to either side, or of one turn",
+        "cameras give angles of half a turn to either side, or of one turn",
     ),
     _Plausible(
         "length",
@@ -252,7 +243,7 @@ PLAUSIBLE: tuple[_Plausible, ...] = (
         5.0,
         "millimetres (or pixels)",
         "mm",
-        "a smart camera's field of view is below two metres, a robot's reach below five",
+        "a camera's field of view is below two metres, a robot's reach below five",
     ),
     _Plausible(
         "ratio",
@@ -260,7 +251,7 @@ PLAUSIBLE: tuple[_Plausible, ...] = (
         1.0 + 1e-6,
         "percent",
         "percent",
-        "a quality goes from 0 to 1",
+        "they go from 0 to 1",
     ),
 )
 """The limits that a value must exceed to be called implausible; the first row that names it."""
@@ -270,17 +261,17 @@ NONSENSE = (1e-20, 1e20)
 
 
 def _look_at_values(
-    visit: Visit, layout: Layout, containers: list[Result], order: ByteOrder
+    visit: Visit, layout: Layout, readings: list[Reading], *, integers: bool
 ) -> None:
     """Give a hint for each field without a unit whose values are not plausible in SI."""
     found: dict[str, float] = {}  # largest magnitude by field
     nonsense: dict[str, float] = {}
-    fields = [f for f in layout.fields if f.wire.numpy[0] == "f"]
-    for result in containers:
-        for record in layout.parse_records(result.raw, order):
+    fields = [f for f in layout.fields if f.wire.is_number and (integers or not f.wire.is_integer)]
+    for reading in readings:
+        for record in layout.parse_records(reading.data, reading.byte_order):
             for field in fields:
                 value = abs(float(getattr(record, field.name)))
-                if value and not NONSENSE[0] < value < NONSENSE[1]:
+                if value and not field.wire.is_integer and not NONSENSE[0] < value < NONSENSE[1]:
                     nonsense.setdefault(field.name, value)
                 elif field.unit is None:
                     found[field.name] = max(value, found.get(field.name, 0.0))

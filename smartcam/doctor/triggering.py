@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.doctor.figures import figures
 from smartcam.doctor.findings import Exit
+from smartcam.doctor.visit import called
 from smartcam.exceptions import (
     CommandRejectedError,
     InterpretationError,
@@ -31,12 +32,13 @@ async def look_at_application(visit: Visit) -> None:
     active = await camera.query_application()
     details: dict[str, Any] = {"active": active, "wanted": wanted}
     if wanted is None or (wanted == active and not visit.wants_trigger):
-        visit.say("application", "ok", f"application {active} is active", **details)
+        visit.say("application", "ok", f"{called(active)} is active", **details)
     elif wanted == 0:
+        visit.wants_trigger = False  # of another application than the one that is meant
         visit.say(
             "application",
             "error",
-            f"no application has the id 0; application {active} is active",
+            f"no application has the id 0; {called(active)} is active",
             "Name another id: the camera's pages show them.",
             exit_code=Exit.REFUSED,
             **details,
@@ -47,7 +49,7 @@ async def look_at_application(visit: Visit) -> None:
         visit.say(
             "application",
             "warning",
-            f"application {active} is active, not {wanted}; whether the camera has {wanted} cannot "
+            f"{called(active)} is active, not {wanted}; whether the camera has {wanted} cannot "
             "be known without loading it",
             f"smartcam switch '{camera.url}' {wanted} loads it. With --trigger the doctor loads "
             "it, and the one before again afterwards.",
@@ -58,10 +60,10 @@ async def look_at_application(visit: Visit) -> None:
 async def _borrow(visit: Visit, active: int, wanted: int) -> None:
     camera = visit.patient
     details: dict[str, Any] = {"active": active, "wanted": wanted}
+    visit.wants_trigger = False  # until it is the one that is meant
     try:
         await visit.borrowed.enter_async_context(camera.application(wanted))
     except CommandRejectedError as exc:
-        visit.wants_trigger = False
         visit.say(
             "application",
             "error",
@@ -71,6 +73,7 @@ async def _borrow(visit: Visit, active: int, wanted: int) -> None:
             **details,
         )
         return
+    visit.wants_trigger = True
     text = f"application {wanted} is loaded and runs, for the triggers"
     visit.say("application", "ok", text, **details)
 
@@ -99,7 +102,7 @@ async def trigger(visit: Visit) -> None:
         return
     camera, loop, plan = visit.patient, asyncio.get_running_loop(), visit.plan
     times: list[float] = []
-    begin = loop.time()
+    begin = ended = loop.time()
     async with camera.results(max_queue=1):
         for _ in range(plan.count):
             visit.witness.statuses.clear()
@@ -108,15 +111,17 @@ async def trigger(visit: Visit) -> None:
                 result = await camera.trigger(timeout=plan.step(5.0))
             except LinkError:
                 raise
+            except InterpretationError:
+                break  # the check of the layout tells it
             except SmartCamError as exc:
                 _say_failed(visit, exc, len(times))
                 break
-            times.append(loop.time() - sent_at if result.latency is None else result.latency)
-    elapsed = loop.time() - begin
+            ended = loop.time()
+            times.append(ended - sent_at if result.latency is None else result.latency)
     if not times:
         return
     measured = figures(times)
-    rate = len(times) / elapsed
+    rate = len(times) / max(ended - begin, sum(times))
     text = f"{measured.times} triggers to their results: {measured}; {rate:.1f} results a second"
     visit.say("trigger", "ok", text, trigger_time=measured._asdict(), results_per_second=rate)
     extra = camera.statistics().extra_results
@@ -138,7 +143,7 @@ def _say_failed(visit: Visit, error: SmartCamError, done: int) -> None:
             "error",
             f"{which} gave no result: {error}",
             "docs/troubleshooting.md has what stands behind this error.",
-            exit_code=Exit.UNREADABLE if isinstance(error, InterpretationError) else Exit.REFUSED,
+            exit_code=Exit.REFUSED,
             error=type(error).__name__,
         )
         return

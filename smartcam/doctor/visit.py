@@ -6,13 +6,16 @@ import asyncio
 from collections import deque
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.client import SmartCamera, connect
+from smartcam.client import SmartCamera
 from smartcam.doctor.findings import Exit, Finding, Severity
 from smartcam.exceptions import InterpretationError
+from smartcam.interpreters.base import Interpreter, Reader, run
+from smartcam.layout import Layout
 from smartcam.models import CameraEvent, Result, Status, StatusChanged
 from smartcam.observers import Observer
+from smartcam.settings import CameraSettings, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,16 +23,25 @@ if TYPE_CHECKING:
 
     from smartcam.connection import TraceEntry
     from smartcam.exceptions import SmartCamError
-    from smartcam.interpreters.base import Interpreter
-    from smartcam.settings import Address
+    from smartcam.models import ByteOrder
+    from smartcam.settings import Address, CameraOptions
 
-__all__ = ["Plan", "Visit", "Witness"]
+__all__ = ["Keeper", "Plan", "Reading", "Visit", "Witness", "called"]
 
 MAX_KEPT = 1000
 """Statuses and arrival times kept: at 300 results a second those of the default 3 seconds."""
 
-MAX_CONTAINERS = 100
-"""Result containers kept, to be compared with the layout."""
+MAX_CONTAINERS = 32
+"""Result containers kept, to be compared with the layout: 2 MB of the largest."""
+
+
+def called(application: int | None) -> str:
+    """Return what an application is called; not every camera has ids for all of them."""
+    return (
+        "the application"
+        if application is None or application < 0
+        else f"application {application}"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,32 +74,22 @@ class Plan:
 class Witness(Observer):
     """Sees what the camera sends and keeps the last of it.
 
-    Args:
-        trace: called with every frame.
-
     Attributes:
         statuses: those that differ from the one before.
-        arrivals: loop times of results.
-        containers: the last results, as raw bytes.
-        endian: the last status's endian field.
-        unreadable: the first result that could not even be taken as bytes: an endian field that
-            is neither little nor big.
+        results: how many came.
+        arrivals: loop times of the last ones.
+        containers: the last results; each value is a :class:`Reading` where an interpreter was
+            given.
+        unreadable: why the first result could not be given to an interpreter: an endian field
+            that is neither little nor big, cells that are not the layout's.
     """
 
-    def __init__(self, trace: Callable[[TraceEntry], None] | None) -> None:
+    def __init__(self) -> None:
         self.statuses: deque[Status] = deque(maxlen=MAX_KEPT)
         self.arrivals: deque[float] = deque(maxlen=MAX_KEPT)
         self.containers: deque[Result] = deque(maxlen=MAX_CONTAINERS)
-        self.endian = 0
+        self.results: int = 0
         self.unreadable: InterpretationError | None = None
-        self._trace = trace
-
-    def on_frame(self, entry: TraceEntry) -> None:
-        """Hand it on; note the byte order."""
-        fields = entry.fields or {}
-        self.endian = int(fields.get("endian", self.endian))
-        if self._trace is not None:
-            self._trace(entry)
 
     def on_state(self, event: CameraEvent) -> None:
         """Keep a status."""
@@ -96,14 +98,74 @@ class Witness(Observer):
 
     def on_result(self, result: Result) -> None:
         """Keep a result."""
-        self.arrivals.append(asyncio.get_running_loop().time())
+        self._arrived()
         self.containers.append(result)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
-        """Keep the first result that could not even be taken as bytes."""
+        """Keep why a result could not be given to an interpreter."""
         if isinstance(error, InterpretationError):
-            self.arrivals.append(asyncio.get_running_loop().time())
+            self._arrived()
             self.unreadable = self.unreadable or error
+
+    def forget_arrivals(self) -> None:
+        """Count results anew."""
+        self.results = 0
+        self.arrivals.clear()
+
+    def _arrived(self) -> None:
+        self.results += 1
+        self.arrivals.append(asyncio.get_running_loop().time())
+
+
+class _Frames(Observer):
+    """Gives every frame to a function."""
+
+    def __init__(self, trace: Callable[[TraceEntry], None]) -> None:
+        self._trace = trace
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        self._trace(entry)
+
+
+class Reading(NamedTuple):
+    """A result container's bytes and what an interpreter made of them.
+
+    Attributes:
+        data: the bytes.
+        byte_order: of their numbers.
+        error: why they do not fit, None where they do.
+    """
+
+    data: bytes
+    byte_order: ByteOrder
+    error: InterpretationError | None
+
+
+class Keeper(Interpreter):
+    """Reads as another interpreter does, and gives a :class:`Reading` whether they fit or not.
+
+    The layout's sequence number is no more than a field to it: setting the number of the next run
+    would change something on the camera.
+
+    Args:
+        inner: the other one.
+    """
+
+    def __init__(self, inner: Interpreter) -> None:
+        layout = inner.layout
+        if layout is not None and layout.sequence_field is not None:
+            layout = Layout(layout.text.replace("@sequence", ""), lenient=layout.lenient)
+        super().__init__(layout)
+        self.inner: Interpreter = inner
+
+    def interpret(self, reader: Reader) -> Reading:
+        """Return the bytes, and the error if there is one."""
+        order = reader.context.byte_order
+        try:
+            run(self.inner, Reader(reader.data, reader.context, self.inner.layout))
+        except InterpretationError as exc:
+            return Reading(reader.data, order, exc)
+        return Reading(reader.data, order, None)
 
 
 @dataclass(slots=True)
@@ -180,16 +242,32 @@ class Visit:
         host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
         return f"{host}:{self.address.port}"
 
-    def make_camera(self) -> SmartCamera:
-        """Return a client that takes the camera once and never takes it back."""
-        plan = self.plan
-        camera = connect(
-            self.address.url,
-            observers=[self.witness],
-            reconnect=None,
-            connect_timeout=plan.step(10.0),
-            request_timeout=plan.step(5.0),
-            switch_timeout=plan.step(10.0),
+    def pin(self, url: str) -> None:
+        """Take over transport and dialect of a URL; a login, which no URL shows, stays."""
+        found = parse_address(url)
+        self.address = self.address._replace(
+            scheme=found.scheme, dialect=found.dialect, quirks=found.quirks
         )
+
+    def make_camera(self) -> SmartCamera:
+        """Return a client that takes the camera once and never takes it back.
+
+        Raises:
+            ConfigurationError: a time-out is none.
+        """
+        plan = self.plan
+        options: CameraOptions = {
+            "reconnect": None,
+            "connect_timeout": plan.step(10.0),
+            "request_timeout": plan.step(5.0),
+            "switch_timeout": plan.step(10.0),
+            "y_down": plan.y_down,
+        }
+        if plan.interpreter is not None:
+            options["interpret_as"] = Keeper(plan.interpreter)
+        settings = CameraSettings.make(self.address.url, None, options)
+        settings = settings.model_copy(update={"address": self.address})
+        frames = [_Frames(self.trace)] if self.trace is not None else []
+        camera = SmartCamera(settings, observers=[self.witness, *frames])
         self.stack.push_async_callback(camera.close)
         return camera

@@ -128,7 +128,7 @@ def test_doctor_json_has_an_object_for_each_finding_and_the_sum() -> None:
     keys = ["check", "severity", "text", "cure", "details", "exit_code"]
     assert all(list(one) == keys for one in [*findings, end])
     by_check = {one["check"]: one for one in findings}
-    assert by_check["status"]["details"]["bits"] == ["RUNNING", "WAITING_FOR_TRIGGER"]
+    assert by_check["status"]["details"]["status"] == ["RUNNING", "WAITING_FOR_TRIGGER"]
     assert by_check["trigger"]["details"]["trigger_time"]["times"] == 2
     assert by_check["clock"]["details"]["clock"] == "2000-01-02T12:00:00"
     assert (end["check"], end["severity"], end["exit_code"]) == ("summary", "warning", 0)

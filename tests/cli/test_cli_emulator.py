@@ -154,3 +154,55 @@ def test_emulator_stdout_closed_ends_quietly() -> None:
         emulator.close_stdout()
         outcome = emulator.wait()
     assert (outcome.code, outcome.err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("options", "quirks"),
+    [
+        (("--dialect", "b16", "--quirk", "code"), "dialect=b16&quirks=code"),
+        (
+            ("--dialect", "b16", "--quirk", "no_id=on", "--quirk", "code=true"),
+            "dialect=b16&quirks=code,no_id",
+        ),
+        (("--dialect", "b16", "--quirk", "code", "--quirk", "code=false"), "dialect=b16"),
+        (("--dialect", "bid", "--quirk", "push_status"), "dialect=bid"),
+        (("--quirk", "second_client=refuse", "--quirk", "reboot_time=0.5"), "dialect=handbook"),
+    ],
+)
+def test_emulator_quirks_are_those_of_its_url(options: tuple[str, ...], quirks: str) -> None:
+    with Process("smartcam-emulator", *options) as emulator:
+        url = emulator.read_until(b"\n").strip()
+        status = run("status", url, "--json").done().lines[0]
+        emulator.send_signal(signal.SIGTERM)
+        emulator.wait().done()
+    assert url.partition("?")[2] == quirks
+    assert status["url"] == url
+
+
+def test_emulator_quirk_goes_before_the_scenarios_and_leaves_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text("quirks: {no_id: true, code: true}\n", encoding="utf-8")
+    options = (str(path), "--dialect", "b16", "--quirk", "code=no", "--quirk", "big_endian_number")
+    with Process("smartcam-emulator", *options) as emulator:
+        url = emulator.read_until(b"\n").strip()
+        emulator.send_signal(signal.SIGTERM)
+        emulator.wait().done()
+    assert url.partition("?")[2] == "dialect=b16&quirks=big_endian_number,no_id"
+
+
+@pytest.mark.parametrize(
+    ("given", "texts"),
+    [
+        (("colour=red",), ["quirks: colour: ", "got 'red'"]),
+        (("colour",), ["quirks: colour: "]),
+        (("reboot_time=soon",), ["quirks: reboot_time: ", "got 'soon'"]),
+        (("reboot_time=-1",), ["quirks: reboot_time: "]),
+        (("reboot_time=",), ["quirks: reboot_time: "]),
+        (("reboot_time=[",), ["--quirk reboot_time=[: "]),
+        (("second_client=[refuse]",), ["quirks: second_client: "]),
+        (("code",), ["dialect handbook has no quirk 'code'"]),
+    ],
+)
+def test_emulator_bad_quirk_exits_2(given: tuple[str, ...], texts: list[str]) -> None:
+    options = [word for one in given for word in ("--quirk", one)]
+    run_emulator(*options).failed(2, *texts)
