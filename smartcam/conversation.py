@@ -126,7 +126,7 @@ class Conversation:
         self.wants_running: bool | None = None  # None: neither was asked for
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
-        self._halted = False  # stopped by a trigger's fence that has not started it again yet
+        self._halted_at: int | None = None  # loads by others when a trigger's fence stopped it
         self.unconfirmed: bool = False  # a Start or Stop was sent, its status has not come
         self._status_in_doubt = False  # over UDP: it may have been lost
         self._alarm = Alarm(self._expire)
@@ -144,7 +144,7 @@ class Conversation:
         self._numbered = dialect.has(m.SetSequenceNumber)
         self._acknowledged = dialect.has(m.TriggerAnswer)
         if not dialect.capabilities.status_by_itself:
-            self._poll = StatusPoll(link, self.inbox)
+            self._poll = StatusPoll(link, self.inbox, self._patience)
             self.inbox.on_status_wanted = self._poll.wanted
             self._poll.wanted()
 
@@ -201,6 +201,11 @@ class Conversation:
         """Running, or stopped only by a trigger that was interrupted before it started again."""
         return self._halted or Status.RUNNING in self.status
 
+    @property
+    def _halted(self) -> bool:
+        """A trigger's fence has stopped it and not started it again, nor has anybody loaded it."""
+        return self._halted_at == self.inbox.loads_by_others
+
     def deadline(self, timeout: float) -> float:
         """Return the loop time in ``timeout`` seconds.
 
@@ -241,8 +246,15 @@ class Conversation:
             link.give_up(error)
             raise error from exc
 
-    async def command(self, message: m.Request, deadline: float) -> None:
+    async def command(
+        self, message: m.Request, deadline: float, *, due: float | None = None
+    ) -> None:
         """Send a command; where the dialect acknowledges it, wait for that.
+
+        Args:
+            message: the command.
+            deadline: loop time.
+            due: as for :meth:`exchange`.
 
         Raises:
             UnsupportedError: the dialect, or the camera, does not know it.
@@ -253,7 +265,7 @@ class Conversation:
         if answer is None or not self.dialect.answers(type(message)):
             await self.tell(message, deadline)
             return
-        got = await self.ask(message, answer, deadline)
+        got = await self.exchange(message, answer, deadline, due=due)
         self.check(type(message), got)
 
     def check(self, request: type[m.Message], answer: m.Message) -> None:
@@ -437,10 +449,10 @@ class Conversation:
 
     async def _enter_run_mode(self, deadline: float) -> None:
         await self._confirm(m.Start(), is_ready, deadline, "Running and not BUSY after Start")
-        self._halted = False
+        self._halted_at = None
 
     async def _leave_run_mode(self, deadline: float) -> None:
-        self._halted = False
+        self._halted_at = None
         await self._halt(deadline)
 
     async def _halt(self, deadline: float) -> None:
@@ -468,9 +480,12 @@ class Conversation:
 
         The deadline may be a trigger's and as short as it likes: it does not cost the link.
         """
-        due = max(deadline, asyncio.get_running_loop().time() + self._patience)
         await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
-        await self.exchange(m.Query(), m.QueryAnswer, deadline, due=due)
+        await self.exchange(m.Query(), m.QueryAnswer, deadline, due=self._due_after(deadline))
+
+    def _due_after(self, deadline: float) -> float:
+        """Return until when an answer may come that a trigger waits for, however short that is."""
+        return max(deadline, asyncio.get_running_loop().time() + self._patience)
 
     def ask_for_life(self, due: float) -> bool:
         """Send a Query unless one is open; its answer is owed until ``due`` (loop time)."""
@@ -516,12 +531,13 @@ class Conversation:
         Raises:
             ResponseTimeoutError: there is no time left.
         """
-        left = deadline - asyncio.get_running_loop().time()
-        if left <= BUSY_PAUSE:
+        now = asyncio.get_running_loop().time()
+        if deadline - now <= BUSY_PAUSE:
             raise ResponseTimeoutError(
                 f"{self.name}: waited until the time was over for {what}; status: {self.status}"
             )
-        await asyncio.sleep(BUSY_PAUSE)
+        with contextlib.suppress(TimeoutError):  # and a loss ends it at once
+            await self.inbox.wait_status(_never, now + BUSY_PAUSE)
 
     async def query_loaded(self, deadline: float) -> int:
         """Return the active application; while one is being loaded a Query tells the old one."""
@@ -552,9 +568,10 @@ class Conversation:
             CommandRejectedError: the camera refused; the old application runs again if it ran.
         """
         request = self._load_request(application)
+        active: int | None
         stops = self.dialect.has(m.Stop)
         was_running = self.runs and stops
-        if application == 0 and 0 not in self.dialect.application_ids:
+        if stops and application == 0 and 0 not in self.dialect.application_ids:
             # Never allowed, several applications may carry it (SC manual p. 34, published): so
             # nothing is stopped for it.
             code, active = 1, await self.query(deadline)
@@ -565,7 +582,9 @@ class Conversation:
             while self._is_busy(answer):
                 await self._pause(deadline, f"the busy camera to load {application}")
                 answer = await self.ask(request, m.SwitchAnswer, deadline)
-            code, active = answer.code, answer.application
+            code = answer.code
+            told = answer.application in self.dialect.application_ids
+            active = answer.application if told else self.inbox.active
         done = self.dialect.code(code).verdict is Verdict.DONE
         if not done or (isinstance(application, int) and active != application):
             if was_running and Status.RUNNING not in self.status:
@@ -687,7 +706,8 @@ class Conversation:
         if self._acknowledged:
             await self._await_owed(m.TriggerAnswer, m.Trigger(), deadline)
         if input_data is not None and link.machine.dialect.answers(m.SetInput):
-            await self.command(m.SetInput(data=input_data), deadline)
+            due = self._due_after(deadline)
+            await self.command(m.SetInput(data=input_data), deadline, due=due)
         elif input_data is not None:
             words.append(m.SetInput(data=input_data))
         inbox.attribution.send(pending)
@@ -743,7 +763,7 @@ class Conversation:
             except SmartCamError as exc:  # the link is over
                 pending.outcome.set_exception(exc)
 
-        self._due[m.TriggerAnswer] = max(deadline, self.deadline(self._patience))
+        self._due[m.TriggerAnswer] = self._due_after(deadline)
         self.inbox.next_answer(m.TriggerAnswer).add_done_callback(on_answer)
 
     def _expire(self) -> None:
@@ -826,7 +846,8 @@ class Conversation:
             if attribution.debt is None:
                 return
         if self.runs:
-            self._halted = True  # interrupted here, the next trigger does all of it again
+            # interrupted here, the next trigger does all of it again
+            self._halted_at = self.inbox.loads_by_others
             await self._halt(deadline)
             await self._fence(deadline)
             await self._enter_run_mode(deadline)
@@ -839,7 +860,7 @@ class Conversation:
         until it is reset (BVS ID guide p. 227, published).
         """
         if self.dialect.has(m.ResetErrors):
-            await self.command(m.ResetErrors(), deadline)
+            await self.command(m.ResetErrors(), deadline, due=self._due_after(deadline))
             await self.refresh_status(deadline)
             return
         now = asyncio.get_running_loop().time()
@@ -904,6 +925,10 @@ class Conversation:
             f"status: {self.status}",
             message_id=message_id,
         )
+
+
+def _never(_: Status) -> bool:
+    return False
 
 
 def _is_not_overtriggered(status: Status) -> bool:

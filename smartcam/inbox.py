@@ -108,6 +108,7 @@ class Inbox:
         self._status_waiters: list[_StatusWaiter] = []
         self._asked_at: dict[object, float] = {}
         self.active_in_doubt: bool = False  # somebody else loaded an application
+        self.loads_by_others: int = 0
         self._heard_status = False  # in this session
         self._loaded_by_us = False
         self._warned_extra = False
@@ -266,7 +267,8 @@ class Inbox:
             self.input_in_doubt = False
             self._loaded_by_us = True
             self.attribution.settled()
-        if verdict is not Verdict.BUSY:  # too busy to say
+        known = self._dialect is None or answer.application in self._dialect.application_ids
+        if verdict is Verdict.DONE or known:  # too busy, or too short, to say
             self.set_active(answer.application, at)
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
@@ -308,6 +310,7 @@ class Inbox:
         elif was is not None and was & _RUNNING_OR_BUSY == _BUSY:
             by_us = self._loaded_by_us or m.SwitchAnswer in self.answers
             self.active_in_doubt = self.active_in_doubt or not by_us
+            self.loads_by_others += not by_us
 
     def _note_changes(self, risen: int, fallen: int) -> None:
         if risen & Status.OVERTRIGGERED:

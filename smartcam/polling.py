@@ -2,7 +2,8 @@
 
 One timer, there as long as a wait for a status or a trigger is under way, or statuses or events are
 subscribed to. At most one question is open; one that was not answered is repeated after a while,
-since a datagram may be lost.
+since a datagram may be lost. On TCP none is: there a camera that says something and answers no
+question does not say what it should, and the link is given up.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from smartcam.exceptions import SmartCamError
-from smartcam.protocols.messages import GetStatus
+from smartcam.exceptions import ResponseTimeoutError, SmartCamError
+from smartcam.protocols.base import Transport
+from smartcam.protocols.messages import GetStatus, SwitchAnswer, TriggerAnswer
 
 if TYPE_CHECKING:
     from smartcam.connection import Link
@@ -35,14 +37,18 @@ class StatusPoll:
     Args:
         link: the link.
         inbox: knows who wants a status, and how many have come.
+        patience: seconds that an answer may take.
     """
 
-    def __init__(self, link: Link, inbox: Inbox) -> None:
+    def __init__(self, link: Link, inbox: Inbox, patience: float) -> None:
         self._link = link
         self._inbox = inbox
+        self._patience = patience
+        self._ordered = link.machine.transport is Transport.TCP
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._asked_at = 0.0
+        self._open_since = 0.0
         self._heard = -1  # statuses that had come when the open question was asked
 
     def wanted(self) -> None:
@@ -64,7 +70,14 @@ class StatusPoll:
         if not (inbox.awaits_status or inbox.watches_status) or self._link.lost:
             return
         now = self._loop.time()
-        if inbox.statuses_heard != self._heard or now - self._asked_at >= REPEAT_AFTER:
+        answered = inbox.statuses_heard != self._heard
+        if answered or self._may_be_silent:
+            self._open_since = now
+        elif self._ordered and now - self._open_since >= self._patience:
+            silence = f"no status within {now - self._open_since:.1f} s of being asked for"
+            self._link.give_up(ResponseTimeoutError(f"{inbox.name}: {silence}"))
+            return
+        if answered or now - self._asked_at >= REPEAT_AFTER:
             self._heard, self._asked_at = inbox.statuses_heard, now
             try:
                 self._link.send(GetStatus(), answered=False)
@@ -72,3 +85,9 @@ class StatusPoll:
                 return
         period = PERIOD if inbox.awaits_status else IDLE_PERIOD
         self._timer = self._loop.call_later(period, self._tick)
+
+    @property
+    def _may_be_silent(self) -> bool:
+        """Something is loaded or inspected, and one thing may be done after the other."""
+        answers = self._inbox.answers
+        return SwitchAnswer in answers or TriggerAnswer in answers

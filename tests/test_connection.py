@@ -512,6 +512,27 @@ async def test_trace_has_frames_of_both_directions_and_broken_bytes(server: List
     assert all(entry.at.utcoffset() is not None for entry in entries)
 
 
+async def test_trace_of_kin_is_in_the_words_of_the_one_that_answers(server: Listener) -> None:
+    """An answer to Connect that has a code is not shown as a version."""
+    entries: list[TraceEntry] = []
+    kin = BVS.tries(Transport.TCP)[0]
+    assert [one.label for one in kin] == ["b16", "bid", "b16 with quirk code"]
+    link = await open_link(
+        BVS, kin, Transport.TCP, HOST, server.port, name="c", max_length=99, trace=entries.append
+    )
+    peer = await server.accept()
+    link.send(m.Connect())
+    assert await peer.read(4) == bytes.fromhex("01000000")
+    peer.write(bytes.fromhex("01000400 0000 0100"))
+    assert await take(link, 1) == [m.ConnectAnswer(code=0, version=1)]
+    assert link.machine.kin == kin[1:]
+    assert [entry[2:6] for entry in entries] == [
+        (">", 0x01, "Connect", {}),
+        ("<", 0x01, "ConnectAnswer", {"code": 0, "version": 1}),
+    ]
+    link.abort()
+
+
 async def test_trace_body_that_does_not_fit_has_no_fields(server: Listener) -> None:
     entries: list[TraceEntry] = []
     link, peer = await session(server, entries.append)

@@ -23,6 +23,7 @@ from smartcam import models
 from smartcam.models import (
     ApplicationChanged,
     CameraEvent,
+    Capabilities,
     Connected,
     Disconnected,
     Header,
@@ -98,6 +99,29 @@ def test_status_any_word_is_kept_and_named(value: int) -> None:
     assert sum(bits) == value
 
 
+# ---------------------------------------------------------------------- capabilities
+
+
+def test_capabilities_without_more_are_none() -> None:
+    nothing = Capabilities(dialect="small")
+    assert nothing.names == []
+    values = {getattr(nothing, f.name) for f in dataclasses.fields(nothing) if f.name != "dialect"}
+    assert values == {False}
+
+
+def test_capabilities_names_are_in_the_documented_order() -> None:
+    some = Capabilities(dialect="switch", unasked_results=True, start_stop=True, switch=True)
+    assert some.names == ["switch", "start_stop", "unasked_results"]
+    everything = [f.name for f in dataclasses.fields(Capabilities) if f.name != "dialect"]
+    assert Capabilities(dialect="all", **dict.fromkeys(everything, True)).names == everything
+
+
+def test_jsonable_capabilities_have_every_ability() -> None:
+    seen = jsonable(Capabilities(dialect="bid", get_status=True))
+    assert (seen["dialect"], seen["get_status"], seen["reboot"]) == ("bid", True, False)
+    assert [*seen] == [f.name for f in dataclasses.fields(Capabilities)]
+
+
 # ---------------------------------------------------------------------- poses
 
 
@@ -140,6 +164,7 @@ def test_position_without_z_lies_in_the_plane() -> None:
         Connected(camera="c", at=AT, url="bvs://c:1"),
         Disconnected(camera="c", at=AT, reason="gone", expected=False),
         ACCOUNT,
+        Capabilities(dialect="b16"),
         Statistics(),
     ],
     ids=lambda one: type(one).__name__,

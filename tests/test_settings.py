@@ -16,8 +16,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ACME = """
+import dataclasses
+
+from smartcam.exceptions import ConfigurationError
 from smartcam.protocols.base import Protocol, Transport
-from smartcam.protocols.bvs import HANDBOOK
+from smartcam.protocols.bvs import B16, HANDBOOK
+from smartcam.protocols.framed import FramedDialect
+from smartcam.protocols.machine import Machine
 
 PROTOCOL = Protocol(
     name="acme",
@@ -25,8 +30,36 @@ PROTOCOL = Protocol(
     default_port=4242,
     models=("ACME1",),
     dialects={"handbook": HANDBOOK},
+    machine=Machine,
 )
 SOMETHING = object()
+
+
+class Guarded(FramedDialect):
+    def with_parameters(self, parameters):
+        if not parameters.get("slot", "0").isdigit():
+            raise ConfigurationError(f"slot {parameters['slot']!r} is no number")
+        return self
+
+
+LOGIN = Protocol(
+    name="acme",
+    schemes={"acme": Transport.TCP},
+    default_port=4242,
+    models=("ACME1",),
+    dialects={
+        "locked": Guarded(
+            name="locked",
+            header=B16.header,
+            word="H",
+            table=B16.table,
+            about="with a login",
+            source="made for the tests",
+        )
+    },
+    machine=Machine,
+    parameters={"user": "who", "password": "what only he knows", "slot": "which tray"},
+)
 """
 
 
@@ -68,6 +101,18 @@ def provide(
         ("bvs://h:65535/?dialect=handbook", Address("bvs", "bvs", "h", 65535, "handbook")),
         ("bvs://[::1]", Address("bvs", "bvs", "::1", 36701)),
         ("bvs://[fe80::1]:7?dialect=thesis", Address("bvs", "bvs", "fe80::1", 7, "thesis")),
+        ("bvs://h?dialect=b16", Address("bvs", "bvs", "h", 36701, "b16")),
+        ("bvs+udp://h?dialect=bid", Address("bvs", "bvs+udp", "h", 36701, "bid")),
+        (
+            "bvs://h?dialect=b16&quirks=code",
+            Address("bvs", "bvs", "h", 36701, "b16", ("code",)),
+        ),
+        (
+            "bvs://h?quirks=no_id,%20code,,code&dialect=b16",
+            Address("bvs", "bvs", "h", 36701, "b16", ("code", "no_id")),
+        ),
+        ("bvs://h?dialect=thesis&quirks=", Address("bvs", "bvs", "h", 36701, "thesis")),
+        ("bvs://h?quirks", Address("bvs", "bvs", "h", 36701)),
     ],
 )
 def test_parse_address_good_url_is_read_and_written_back(url: str, address: Address) -> None:
@@ -80,6 +125,10 @@ def test_parse_address_good_url_is_read_and_written_back(url: str, address: Addr
     [
         (Address("bvs", "bvs", "h", 36701), "bvs://h:36701"),
         (Address("bvs", "bvs+udp", "::1", 7, "thesis"), "bvs+udp://[::1]:7?dialect=thesis"),
+        (
+            Address("bvs", "bvs", "h", 7, "b16", ("code", "no_id")),
+            "bvs://h:7?dialect=b16&quirks=code,no_id",
+        ),
     ],
 )
 def test_address_url_has_everything_that_is_known(address: Address, url: str) -> None:
@@ -107,7 +156,7 @@ def test_parse_address_bare_host_with_model_is_its_protocols(
     [
         ("", "'' is a bare host: give a URL such as bvs://HOST, or a model"),
         ("camera", "is a bare host: give a URL such as bvs://camera, or a model"),
-        ("bvs://h?dialect=handbook&dialect=thesis", "names two dialects"),
+        ("bvs://h?dialect=handbook&dialect=thesis", "names two dialect"),
         ("http://h", "unknown scheme 'http'; known are bvs://, bvs+udp://"),
         ("://h", "unknown scheme ''; known are"),
         ("bvs://", "has no host"),
@@ -123,22 +172,31 @@ def test_parse_address_bare_host_with_model_is_its_protocols(
         ("bvs://:secret@h", "has a user, which means nothing"),
         ("bvs://h/path", "has a path, which means nothing"),
         ("bvs://h#part", "has a fragment, which means nothing"),
-        ("bvs://h?colour=red", "unknown 'colour'; known is 'dialect'"),
-        ("bvs://h?dialect=latin", "bvs has no dialect 'latin'; it has handbook, thesis"),
+        ("bvs://h?colour=red", "unknown 'colour'; known are 'dialect', 'quirks'"),
+        ("bvs://h?user=me", "unknown 'user'; known are 'dialect', 'quirks'"),
+        ("bvs://h?dialect=latin", "bvs has no dialect 'latin'; it has handbook, thesis, b16, bid"),
+        ("bvs://h?quirks=code", "quirks are a dialect's: name the dialect, too"),
+        ("bvs://h?dialect=b16&quirks=a&quirks=b", "names two quirks"),
+        (
+            "bvs://h?dialect=b16&quirks=loud",
+            "dialect b16 has no quirk 'loud'; it has code, no_id, big_endian_number",
+        ),
+        ("bvs://h?dialect=bid&quirks=code", "dialect bid has no quirk 'code'; it has none"),
         ("bvs://h?dialect", "bvs has no dialect ''"),
     ],
 )
 def test_parse_address_bad_url_says_what_is_wrong(url: str, text: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse_address(url)
-    assert str(caught.value).startswith(f"camera address {url!r}")
+    shown = url.replace("secret", "***")
+    assert str(caught.value).startswith(f"camera address {shown!r}")
     assert text in str(caught.value)
 
 
 def test_parse_address_unknown_model_names_the_known_ones() -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse_address("camera", model="BVS1")
-    assert str(caught.value) == "unknown camera model 'BVS1'; known are BVS002C"
+    assert str(caught.value).startswith("unknown camera model 'BVS1'; known are BVS002C")
 
 
 # ---------------------------------------------------------------------- plug-ins
@@ -171,6 +229,86 @@ def test_parse_address_plugin_with_our_own_name_is_told(
     provide("bvs", "acme_camera:PROTOCOL")
     with pytest.raises(PluginError, match="'bvs' is smartcam's own, but maker-of-bvs also"):
         parse_address("bvs://h")
+
+
+# ---------------------------------------------------------------------- a login
+
+
+@pytest.fixture
+def login(provide: Callable[[str, str], None]) -> None:
+    """A protocol whose cameras have users, passwords and one more parameter."""
+    provide("acme", "acme_camera:LOGIN")
+
+
+@pytest.mark.usefixtures("login")
+@pytest.mark.parametrize(
+    ("url", "parameters", "shown"),
+    [
+        ("acme://h", {}, "acme://h:4242"),
+        ("acme://h?slot=3", {"slot": "3"}, "acme://h:4242?slot=3"),
+        ("acme://me@h", {"user": "me", "password": ""}, "acme://me@h:4242"),
+        ("acme://me:secret@h", {"user": "me", "password": "secret"}, "acme://me@h:4242"),
+        (
+            "acme://m%40e%2F:se%3Acr%40et@h:7?slot=3&dialect=locked",
+            {"slot": "3", "user": "m@e/", "password": "se:cr@et"},
+            "acme://m%40e%2F@h:7?dialect=locked&slot=3",
+        ),
+    ],
+)
+def test_parse_address_parameters_are_kept_and_the_url_has_no_password(
+    url: str, parameters: dict[str, str], shown: str
+) -> None:
+    address = parse_address(url)
+    assert dict(address.parameters) == parameters
+    assert address.url == shown
+    again = parse_address(shown)
+    without = {key: value for key, value in parameters.items() if key != "password"}
+    assert {k: v for k, v in again.parameters if k != "password"} == without
+    assert again.url == shown
+
+
+@pytest.mark.usefixtures("login")
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("acme://me:secret@h?slot=x", "'acme://me:***@h?slot=x': slot 'x' is no number"),
+        ("acme://me:secret@h?slot=1&slot=2", "'acme://me:***@h?slot=1&slot=2' names two slot"),
+        (
+            "acme://me:secret@h?colour=red",
+            "'acme://me:***@h?colour=red': unknown 'colour'; known are 'dialect', 'quirks', 'slot'",
+        ),
+        (
+            "acme://me:secret@h?dialect=latin",
+            "'acme://me:***@h?dialect=latin': acme has no dialect 'latin'; it has locked",
+        ),
+        (
+            "acme://me:secret@h?dialect=locked&quirks=loud",
+            "'acme://me:***@h?dialect=locked&quirks=loud': "
+            "dialect locked has no quirk 'loud'; it has none",
+        ),
+        ("acme://me:secret@h/tray", "'acme://me:***@h/tray' has a path, which means nothing"),
+        ("acme://me:secret@", "'acme://me:***@' has no host"),
+        ("acme://me:secret@h:0", "'acme://me:***@h:0': port 0 is no camera's port"),
+        ("acme://me:secret@h:70000", "'acme://me:***@h:70000': Port out of range 0-65535"),
+        ("acme://me:se[cret@h", "'acme://me:***@h'"),
+        ("bvs://me:secret@h", "'bvs://me:***@h' has a user, which means nothing"),
+        ("other://me:secret@h", "'other://me:***@h': unknown scheme 'other'"),
+        ("me:secret@h", "is a bare host"),
+        ("acme://h?user=me&password=secret", "unknown 'user'"),
+    ],
+)
+def test_parse_address_error_never_shows_a_password(url: str, text: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_address(url)
+    assert text in str(caught.value)
+    assert "cret" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("login")
+def test_settings_show_no_password() -> None:
+    settings = CameraSettings.make("acme://me:secret@h", None, {})
+    assert settings.name == "h:4242"
+    assert "secret" not in repr(settings)
 
 
 # ---------------------------------------------------------------------- options

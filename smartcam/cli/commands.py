@@ -12,8 +12,8 @@ from smartcam.cli import decoding, demo, doctoring, probing
 from smartcam.cli.options import (
     CONNECTS,
     SECONDS,
-    ApplicationName,
     Options,
+    application,
     camera_options,
     output_options,
     result_options,
@@ -186,10 +186,10 @@ async def _watch(url: str, options: Options) -> None:
     f"that; returns when the camera is ready. It runs if the one before ran. {CONNECTS}"
 )
 @click.argument("url")
-@click.argument("application", metavar="ID|FILE", type=ApplicationName())
+@click.argument("id_or_file", metavar="ID|FILE", type=application)
 @camera_options
-def switch(url: str, application: int | str, **shared: Any) -> None:
-    _then_show(url, Options(**shared), lambda camera: camera.switch_application(application))
+def switch(url: str, id_or_file: int | str, **shared: Any) -> None:
+    _then_show(url, Options(**shared), lambda camera: camera.switch_application(id_or_file))
 
 
 @command.command(help=f"Enter run mode; returns when the camera is ready. {CONNECTS}")

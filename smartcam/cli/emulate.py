@@ -71,6 +71,7 @@ PROTOCOLS = (BVS.name, INSIGHT.name)
 @click.pass_context
 def command(
     context: click.Context,
+    /,
     scenario: str | None,
     host: str,
     port: int,
@@ -99,10 +100,9 @@ def command(
 
         def made(index: int) -> EmulatedCamera | EmulatedInSight:
             at = port + index if port else 0
-            name = f"camera{index + 1}" if cameras > 1 else None
+            name = f"camera{index + 1}"
             if in_sight:
-                named = {} if name is None else {"name": name}
-                return EmulatedInSight(BUILTIN_JOBS, host=host, port=at, quirks=chosen, **named)
+                return EmulatedInSight(BUILTIN_JOBS, host=host, port=at, quirks=chosen, name=name)
             return EmulatedCamera(
                 scenario=loaded,
                 host=host,
@@ -110,7 +110,7 @@ def command(
                 dialect=dialect,
                 transport=transport,
                 quirks=chosen,
-                name=name,
+                name=name if cameras > 1 else None,
             )
 
         async with contextlib.AsyncExitStack() as stack:

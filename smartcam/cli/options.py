@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CONNECTS",
-    "ApplicationName",
     "Options",
+    "application",
     "camera_options",
     "camera_url",
     "output_options",
@@ -44,21 +44,6 @@ class _Seconds(click.FloatRange):
         if math.isnan(seconds):
             self.fail(f"{value!r} is not a number.", param, ctx)
         return seconds
-
-
-class ApplicationName(click.ParamType):
-    """An application's id, or the name of its file: whatever is no number."""
-
-    name = "id or file"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> int | str:
-        """Return an int for an id; click's own error for one that is out of range."""
-        if isinstance(value, str) and not value.lstrip("+-").isdecimal():
-            return value
-        number: int = click.IntRange(0, 0xFFFFFFFF).convert(value, param, ctx)
-        return number
 
 
 SECONDS = _Seconds(min=0, min_open=True, max=86_400)
@@ -116,6 +101,21 @@ def camera_options(function: F) -> F:
 def result_options(function: F) -> F:
     """Decorate a command that prints results."""
     return _apply([*_result, *_camera, *_output], function)
+
+
+def application(text: str) -> int | str:
+    """Return an application's id, or the name of its file: whatever is no number.
+
+    Raises:
+        click.BadParameter: an id that none can have.
+        ValueError: signs and digits that make no number.
+    """
+    if not text.lstrip("+-").isdecimal():
+        return text
+    number = int(text)
+    if not 0 <= number <= 0xFFFFFFFF:
+        raise click.BadParameter(f"{text} is not in the range 0<=x<=4294967295.")
+    return number
 
 
 def camera_url(text: str) -> str:

@@ -24,6 +24,8 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.base import UNDOCUMENTED, Code, Dialect, RawRequest, Spelled, Verdict
 from smartcam.protocols.framing import Buffer, Frame, HeaderLayout
 from smartcam.protocols.messages import (
+    Acknowledgement,
+    ConnectAnswer,
     MalformedMessage,
     Message,
     Request,
@@ -126,7 +128,8 @@ class Codec:
     """
 
     __slots__ = (
-        *("_body", "_data", "_fields", "_fill", "_header_size", "_known", "_omitted", "_status"),
+        *("_body", "_code", "_data", "_fields", "_fill", "_header_size"),
+        *("_known", "_meaning", "_omitted", "_status"),
         *("has_data", "message_id", "size", "type"),
     )
 
@@ -144,6 +147,12 @@ class Codec:
         )
         self.size: int = self._body.size
         self.has_data: bool = self._data is not None
+        # where each answer begins with a code, one that refuses may have nothing else; but two
+        # bytes in answer to Connect are the version in another dialect
+        answers = issubclass(row.type, Acknowledgement) and row.type is not ConnectAnswer
+        coded = answers and dialect.coded and "code" in self._fields
+        self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
+        self._meaning = dialect.code
         self._known: dict[bytes, Message] = {}  # bodies that came before: messages are immutable
         # what fills the slots of a frozen message, in half the time of its own constructor
         self._fill = [vars(_owner(row.type, name))[name].__set__ for name, _ in fields]
@@ -158,6 +167,13 @@ class Codec:
         """Whether a body has the documented length."""
         return size >= self.size if self.has_data else size == self.size
 
+    def _refuses(self, payload: bytes) -> bool:
+        """Whether a body that is too short is a result code that is not good."""
+        code = self._code
+        if code is None or len(payload) != code.size:
+            return False
+        return self._meaning(code.unpack(payload)[0]).verdict is not Verdict.DONE
+
     def encode(self, message: Message) -> bytes:
         """Return a message's body."""
         values = [getattr(message, name) for name in self._fields]
@@ -169,17 +185,21 @@ class Codec:
     def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
         """Return the message whose body is at a place; bytes behind it are ignored.
 
+        An answer that is nothing but a refusing code is taken as such: the rest is 0.
+
         Raises:
             MessageError: the body is shorter than its message.
         """
         if end - begin < self.size:
             payload = bytes(buffer[begin:end])
-            raise MessageError(
-                f"{self.type.__name__} ({self.message_id:#04x}) came with {len(payload)} bytes, "
-                f"it needs {self.size}: {hex_excerpt(payload)}",
-                offset=self._header_size,
-                data=payload,
-            )
+            if not self._refuses(payload):
+                raise MessageError(
+                    f"{self.type.__name__} ({self.message_id:#04x}) came with {len(payload)} bytes,"
+                    f" it needs {self.size}: {hex_excerpt(payload)}",
+                    offset=self._header_size,
+                    data=payload,
+                )
+            buffer, begin, end = payload.ljust(self.size, b"\0"), 0, self.size
         behind = begin + self.size
         if self.has_data:
             data = bytes(buffer[behind:end])
@@ -334,7 +354,13 @@ class FramedDialect(Dialect):
                 codes=codes[0] if codes else self.codes,
                 applied=key,
             )
+            object.__setattr__(variant, "_variants", self._variants)  # one for all of them
         return variant
+
+    @property
+    def coded(self) -> bool:
+        """Whether each answer begins with a result code."""
+        return any(row.type is ConnectAnswer and "code" not in row.omits for row in self.table)
 
     @property
     def capabilities(self) -> Capabilities:

@@ -474,10 +474,10 @@ class Machine:
         """Make a message of a frame whose payload is at a place of the framer's."""
         counters, framer = self.counters, self._framer
         counters.frames_received += 1
-        if self._trace is not None:
-            self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
         if len(self.kin) > 1 and self._state is State.CONNECTING:
             self._narrow(message_id, end - begin)
+        if self._trace is not None:
+            self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
         codec = self._decoders.get(message_id)
         surplus = 0
         message: Message

@@ -230,11 +230,15 @@ class HandmadeCamera:
             if len(self._buffer) < size:
                 return
             payload, self._buffer = self._buffer[HEADER.size : size], self._buffer[size:]
-            self.received.append((message_id, payload))
-            answer = self.script.get(message_id, _quiet)(payload)
-            if answer:
-                self.send(answer)
-            self.changed()
+            self.hear(message_id, payload)
+
+    def hear(self, message_id: int, payload: bytes) -> None:
+        """Take a whole frame and do what the script says."""
+        self.received.append((message_id, payload))
+        answer = self.script.get(message_id, _quiet)(payload)
+        if answer:
+            self.send(answer)
+        self.changed()
 
     def opened(self, transport: asyncio.BaseTransport) -> None:
         """Note that a connection, or the datagram socket, is open."""

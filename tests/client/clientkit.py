@@ -28,7 +28,7 @@ async def by_hand(
     """A handmade camera and a client in a session with it, which does not reconnect by default."""
     options.setdefault("reconnect", None)
     async with (
-        _nothing_unheard(),
+        nothing_unheard(),
         HandmadeCamera(**(box or {})) as made,
         smartcam.connect(made.url, **options) as camera,
     ):
@@ -46,7 +46,7 @@ async def emulated(
     options.setdefault("reconnect", None)
     clock = ManualClock()
     async with (
-        _nothing_unheard(),
+        nothing_unheard(),
         EmulatedCamera(clock=clock, **(box or {})) as emulator,
         smartcam.connect(emulator.url, **options) as camera,
     ):
@@ -54,7 +54,7 @@ async def emulated(
 
 
 @contextlib.asynccontextmanager
-async def _nothing_unheard() -> AsyncIterator[None]:
+async def nothing_unheard() -> AsyncIterator[None]:
     """Assert that the loop has no error to report that reached nobody."""
     loop = asyncio.get_running_loop()
     reports: list[dict[str, Any]] = []

@@ -107,10 +107,10 @@ async def test_bid_runs_without_a_start_and_has_none(at_21: Rig) -> None:
 
 async def test_bid_clock_is_set_and_told(at_21: Rig) -> None:
     await at_21.asks(
-        # published: I-9
+        # I-9, published
         (frame("3300 0C00 E007 0300 0200 0C00 0E00 0A00"), (frame("3300 0200 0000"),)),
         (GET_CLOCK, (frame("3200 0E00 0600 E007 0300 0200 0C00 0E00 0A00"),)),
-        # published: I-8
+        # I-8, published
         (frame("3300 0C00 E007 0600 1900 0A00 0B00 0C00"), (frame("3300 0200 0000"),)),
         (GET_CLOCK, (frame("3200 0E00 0600 E007 0600 1900 0A00 0B00 0C00"),)),
     )

@@ -56,9 +56,7 @@ def test_table_has_every_fault() -> None:
 
 
 def test_every_message_can_be_named() -> None:
-    assert dict(faults.MESSAGE_NAMES) == {
-        row.type.__name__: row.type for row in MESSAGES
-    } | {
+    assert dict(faults.MESSAGE_NAMES) == {row.type.__name__: row.type for row in MESSAGES} | {
         "DisconnectAnswer": m.DisconnectAnswer,
         "GetStatus": m.GetStatus,
         "ResetErrors": m.ResetErrors,
@@ -280,3 +278,38 @@ def test_record_is_bounded() -> None:
 
 def test_union_and_table_agree() -> None:
     assert set(get_args(get_args(faults.Fault)[0])) == set(faults.FAULTS.values())
+
+
+@pytest.mark.parametrize(
+    ("dialect", "fault", "text"),
+    [
+        ("handbook", faults.Drop(on="ResetErrors"), "drop.on: dialect handbook has no ResetErrors"),
+        ("thesis", faults.Drop(on=m.GetStatus), "drop.on: dialect thesis has no GetStatus"),
+        ("b16", faults.Reboot(on="TriggerAnswer"), "reboot.on: dialect b16 has no TriggerAnswer"),
+        ("bid", faults.NoResult(on="Start"), "no_result.on: dialect bid has no Start"),
+        (
+            "bid",
+            faults.Insert(message="SetSequenceNumber", fields={"number": 1}),
+            "insert.message: dialect bid has no SetSequenceNumber",
+        ),
+        (
+            "b16",
+            faults.Insert(message="SetInputAnswer"),
+            "insert.message: dialect b16 has no SetInputAnswer",
+        ),
+    ],
+)
+def test_fault_on_a_message_that_the_dialect_lacks_is_refused(
+    dialect: str, fault: faults.BaseFault, text: str
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        EmulatedCamera(dialect=dialect, faults=[fault])
+    assert str(caught.value) == f"fault 1: {text}"
+
+
+def test_fault_on_a_message_that_the_dialect_lacks_is_refused_later_too() -> None:
+    emulator = EmulatedCamera(dialect="b16", quirks={"code": True})
+    with pytest.raises(ConfigurationError) as caught:
+        emulator.inject(faults.Drop(on="Query"), faults.Drop(on="ResetErrors"))
+    assert str(caught.value) == ("fault 2: drop.on: dialect b16 with quirk code has no ResetErrors")
+    assert emulator.faults == []

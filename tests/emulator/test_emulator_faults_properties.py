@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from smartcam.emulator import EmulatedCamera, ManualClock, faults
 from smartcam.emulator.parcels import Parcel, mangle
 from smartcam.protocols import messages as m
-from smartcam.protocols.bvs import HANDBOOK, THESIS
+from smartcam.protocols.bvs import HANDBOOK, MESSAGES, THESIS
 from smartcam.protocols.framing import Frame
 
 SECONDS = st.sampled_from([0.0, 0.05, 1.0, 30.0])
-CAMERA = [name for name, kind in faults.MESSAGE_NAMES.items() if kind.sender is m.Sender.CAMERA]
-CLIENT = [name for name in faults.MESSAGE_NAMES if name not in CAMERA]
+CAMERA = [row.type.__name__ for row in MESSAGES if row.type.sender is m.Sender.CAMERA]
+CLIENT = [row.type.__name__ for row in MESSAGES if row.type.sender is m.Sender.CLIENT]
 WHEN = st.sampled_from(["before", "after"])
 EXTRA: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "delay": {"seconds": SECONDS, "overtaken": st.booleans()},

@@ -469,7 +469,9 @@ async def test_debug_log_has_a_line_a_frame(caplog: pytest.LogCaptureFixture) ->
             await client.expect(*HELLO)
     lines = [record.getMessage() for record in caplog.records]
     assert any(line.startswith("<") and "Connect()" in line for line in lines)
-    assert any(line.startswith(">") and "ConnectAnswer(code=0, version=1)" in line for line in lines)
+    assert any(
+        line.startswith(">") and "ConnectAnswer(code=0, version=1)" in line for line in lines
+    )
     assert any(line.startswith("!") and "state idle" in line for line in lines)
 
 

@@ -1,4 +1,4 @@
-"""Bytes of the dialects with 16 bits, written down by hand, and an emulated camera that speaks them.
+"""Bytes of the dialects with 16 bits, written down by hand, and an emulated camera beside them.
 
 Vectors from the published pages are marked *published*, those put together from the published
 layouts *derived*, those of b16's bodies *inferred*.
@@ -71,11 +71,11 @@ class Rig(NamedTuple):
 async def rig(transport: Any, dialect: str, **options: Any) -> AsyncIterator[Rig]:
     """Start a camera and open a plain client's way to it; there is no session yet."""
     clock = ManualClock()
-    async with EmulatedCamera(
-        transport=transport, dialect=dialect, clock=clock, **options
-    ) as emulator:
-        async with _client(emulator) as client:
-            yield Rig(emulator, client, clock)
+    async with (
+        EmulatedCamera(transport=transport, dialect=dialect, clock=clock, **options) as emulator,
+        _client(emulator) as client,
+    ):
+        yield Rig(emulator, client, clock)
 
 
 @contextlib.asynccontextmanager

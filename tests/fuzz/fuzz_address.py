@@ -8,7 +8,8 @@ from __future__ import annotations
 from fuzz_input import Choices, text_of
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols.bvs import BVS
+from smartcam.protocols.base import Protocol
+from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, parse_address
 
 __all__ = ["check"]
@@ -25,13 +26,26 @@ def check(data: bytes) -> None:
     except ConfigurationError as error:
         assert len(str(error)) < 300 + 12 * len(text)
         return
-    assert address.protocol == BVS.name
-    assert address.scheme in BVS.schemes
+    protocol = PROTOCOLS.load(address.protocol)
+    assert isinstance(protocol, Protocol)
+    assert address.scheme in protocol.schemes
     assert address.host
     assert 1 <= address.port <= 65535
-    assert address.dialect is None or address.dialect in BVS.dialects
+    assert address.dialect is None or address.dialect in protocol.dialects
+    assert address.dialect is not None or not address.quirks
+    assert {name for name, _ in address.parameters} <= {*protocol.parameters}
     again = printed(address.url)
-    assert again == address, f"prints as {address.url!r}, which is {again}"
+    if isinstance(again, Address):  # a password is never printed
+        assert dict(again.parameters).get("password", "") == ""
+        again = again._replace(parameters=without_password(again))
+    public = address._replace(parameters=without_password(address))
+    assert again == public, f"prints as {address.url!r}, which is {again}"
+
+
+def without_password(address: Address) -> tuple[tuple[str, str], ...]:
+    """Return the parameters that a URL shows, by their names; one without a value is none."""
+    shown = ((name, value) for name, value in address.parameters if name != "password" and value)
+    return tuple(sorted(shown))
 
 
 def printed(url: str) -> Address | str:

@@ -6,6 +6,7 @@ frame, time, or something that an operator does. What the camera says is heard b
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from fuzz_input import Choices
@@ -13,11 +14,12 @@ from fuzz_input import Choices
 from smartcam.emulator import Application, Device, Quirks
 from smartcam.emulator.application import BUILTIN_APPLICATIONS
 from smartcam.emulator.device import Mode
-from smartcam.exceptions import FrameError
+from smartcam.emulator.manner import manner_of
+from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Policy, Role, Transport
-from smartcam.protocols.bvs import BVS
+from smartcam.protocols.base import POLICIES, Policy, Role, Transport
+from smartcam.protocols.bvs import B16, BID, CODES, HANDBOOK, THESIS, ResultCode
 from smartcam.protocols.machine import Machine, State
 
 if TYPE_CHECKING:
@@ -27,15 +29,16 @@ if TYPE_CHECKING:
 
 __all__ = ["check"]
 
-DIALECTS = tuple(BVS.dialects.values())
+DIALECTS = (HANDBOOK, THESIS, B16, BID, B16.with_quirks(["code"]))
 QUIRKS = (
     Quirks(),
     Quirks(switch_while_running="allow", waiting_before_result=True, reboot_time=0.5),
     Quirks(switch_while_running="ignore", busy_while_processing=True, input_queue_depth=1),
     Quirks(switch_answer="before_status", bad_frame="close", overtriggered_time=0, reboot_time=0),
+    Quirks(push_status=True, disconnect_answer="silent", bad_message="ignore"),
 )
 POLICIES_ON_A_BAD_FRAME = {
-    "skip": None,
+    "skip": POLICIES[Role.CAMERA, Transport.TCP],
     "close": Policy(fatal=(FrameError,), exact_length=True),
 }
 ECHO = Application(
@@ -50,6 +53,9 @@ APPLICATIONS = {application.id: application for application in (*BUILTIN_APPLICA
 TIMES = (0.0, 0.001, 0.05, 0.3, 0.5, 2.0)
 ENDIANS = (0, 1, 7)
 LIMIT = 256
+DROPS = Policy(fatal=(), exact_length=False)
+BY_ITSELF = (m.StatusReport, m.ResultContainer, m.DisconnectAnswer, m.UnknownMessage)
+"""What a client hears that has asked nothing."""
 
 
 class Camera:
@@ -58,10 +64,17 @@ class Camera:
     def __init__(
         self, dialect: FramedDialect, quirks: Quirks, active: int, *, running: bool
     ) -> None:
-        self.device = Device(APPLICATIONS.values(), active=active, quirks=quirks, running=running)
-        policy = POLICIES_ON_A_BAD_FRAME[quirks.bad_frame]
+        manner = manner_of(dialect, quirks)
+        self.device = Device(
+            APPLICATIONS.values(), active=active, quirks=quirks, running=running, manner=manner
+        )
+        policy = dataclasses.replace(
+            POLICIES_ON_A_BAD_FRAME[quirks.bad_frame], tells=manner.tells_bad_messages
+        )
+        self.dialect = dialect
         self.machine = Machine(dialect, Role.CAMERA, Transport.TCP, max_length=LIMIT, policy=policy)
-        self.client = Machine(dialect, Role.CLIENT, Transport.TCP)
+        # a code alone, where an answer has more, is dropped and counted
+        self.client = Machine(dialect, Role.CLIENT, Transport.TCP, policy=DROPS)
         self.client.state = State.CONNECTED
         self.status: m.StatusReport | None = None
 
@@ -77,7 +90,10 @@ class Camera:
         """Let the client hear what the camera says, and look at it."""
         device = self.device
         output = device.take_output()
-        assert device.connected or not output, "it speaks without a session"
+        said = [one for one in output if not isinstance(one, m.DisconnectAnswer)]
+        assert device.connected or not said, "it speaks without a session"
+        if self.machine.state is State.FAILED:
+            return  # the link ended behind what it answers
         for message in output:
             self.machine.send(message)
             self.look_at(message)
@@ -86,15 +102,24 @@ class Camera:
         assert self.client.error is None, self.client.error
         assert self.client.buffered == 0
         heard = self.client.events()
-        told = (m.StatusReport, m.ResultContainer)
-        assert heard == [message for message in output if isinstance(message, told)]
+        carried = [self.on_the_wire(message) for message in output]
+        assert heard == [message for message in carried if isinstance(message, BY_ITSELF)]
+        if device.connected and device.manner.reports_changes:
+            assert self.status is not None or not device.manner.status_with_session
+            if self.status is not None:
+                assert (self.status.status, self.status.endian) == (device.status, device.endian)
         if device.connected:
-            assert self.status is not None
-            assert (self.status.status, self.status.endian) == (device.status, device.endian)
             assert bool(device.status & Status.RUNNING) == device.running
             assert device.status & Status.BUSY or device.mode is not Mode.SWITCHING
         due = device.next_event_in()
         assert due is None or due >= 0
+
+    def on_the_wire(self, message: m.Message) -> m.Message | None:
+        """Return what a client takes a message for, None where its body is too short for that."""
+        try:
+            return self.dialect.decode(m.Sender.CAMERA, self.dialect.to_frame(message))
+        except MessageError:
+            return None
 
     def look_at(self, message: m.Message) -> None:
         """Each message of a camera makes sense by itself."""
@@ -102,7 +127,8 @@ class Camera:
             case m.ConnectAnswer():
                 self.status = None
             case m.StatusReport():
-                assert message != self.status, "the same status twice"
+                asked = not self.device.manner.status_with_session
+                assert message != self.status or asked, "the same status twice"
                 assert not message.status & ~sum(Status), "a bit without a name"
                 both = Status.BUSY | Status.WAITING_FOR_TRIGGER
                 assert message.status & both != both
@@ -114,10 +140,16 @@ class Camera:
                 assert layout is not None
                 orders: dict[int, Any] = {1: "big"}
                 layout.parse(message.data, orders.get(self.device.endian, "little"))
-            case m.QueryAnswer() | m.SwitchAnswer():
-                assert message.application in APPLICATIONS
             case m.ClockAnswer():
                 assert 1 <= message.month <= 12
+            case m.QueryAnswer(code=ResultCode.BUSY, application=0):
+                assert self.device.mode is Mode.SWITCHING
+            case m.QueryAnswer() | m.SwitchAnswer():
+                assert message.application in APPLICATIONS
+            case m.Acknowledgement(code=code) if self.dialect.has(type(message)):
+                assert code in CODES
+            case m.UnknownMessage(payload=payload) if self.device.manner.tells_bad_messages:
+                assert int.from_bytes(payload, "little") in CODES
             case _:
                 raise AssertionError(f"a camera says no {message}")
 
@@ -161,8 +193,12 @@ def _request(camera: Camera, choices: Choices) -> None:
         m.Query(),
         m.GetClock(),
         m.Reboot(),
+        m.GetStatus(),
+        m.ResetErrors(),
     )
-    camera.take(camera.machine.dialect.encode(choices.pick(requests)))
+    request = choices.pick(requests)
+    if camera.dialect.has(type(request)):
+        camera.take(camera.dialect.encode(request))
 
 
 def _switch(camera: Camera, choices: Choices) -> None:

@@ -20,7 +20,13 @@ from fuzz_input import Choices
 from fuzz_wire import check_decoding
 from machines import DIALECTS, EXAMPLES, one_by_one
 
-from smartcam.exceptions import FrameError, LocalProtocolError, MessageError, RemoteProtocolError
+from smartcam.exceptions import (
+    FrameError,
+    LocalProtocolError,
+    MessageError,
+    RemoteProtocolError,
+    UnsupportedError,
+)
 from smartcam.protocols import framing
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Policy, Role, Transport
@@ -38,6 +44,7 @@ CHOSEN_POLICIES = (
     OWN_POLICY,
     Policy(fatal=(FrameError,), exact_length=True),  # of an emulator that hangs up
     Policy(fatal=(), exact_length=False),
+    Policy(fatal=(), exact_length=True, tells=True),  # of a camera that answers with codes
 )
 ANSWERED = (None, True, False)
 ENDED = {State.FAILED, State.CLOSED}
@@ -114,6 +121,9 @@ class Link:
         dialect, sender = self.machine.dialect, self.machine.role.receives
         message = check_decoding(dialect, sender, frame)
         surplus = dialect.surplus(sender, frame)
+        if self.policy.tells and (message is None or surplus):
+            message = m.MalformedMessage(message_id=frame.message_id, payload=frame.payload)
+            surplus = 0
         if message is None or (surplus and self.policy.exact_length):
             return False
         following = TRANSITIONS.get((self.state, sender, type(message)))
@@ -129,7 +139,10 @@ class Link:
         for event in fresh:
             if isinstance(event, m.Message):
                 answers = self.machine.dialect.message_id(event)
-                unasked = (m.StatusReport, m.ResultContainer, m.UnknownMessage)
+                unasked = (
+                    *(m.StatusReport, m.ResultContainer, m.DisconnectAnswer),
+                    m.UnknownMessage,
+                )
                 assert answers in self.owed or isinstance(event, unasked), f"unasked: {event}"
                 self.owed.discard(answers)
 
@@ -140,7 +153,7 @@ class Link:
         before = (machine.state, counters.frames_sent, counters.bytes_sent, len(self.traced))
         try:
             machine.send(message, answered=answered)
-        except LocalProtocolError:
+        except (LocalProtocolError, UnsupportedError):
             after = (machine.state, counters.frames_sent, counters.bytes_sent, len(self.traced))
             assert after == before
             assert machine.data_to_send() == []
@@ -231,7 +244,7 @@ def answer_to(message: m.Message, answered: bool | None, dialect: FramedDialect)
     """Return the id of the answer that a request asks for, None where none is expected."""
     if answered is None:
         answered = isinstance(message, m.UnknownMessage) or (
-            isinstance(message, m.Request) and message.answer is not None
+            isinstance(message, m.Request) and dialect.answers(type(message))
         )
     return dialect.message_id(message) if answered else None
 

@@ -15,7 +15,6 @@ from machines import DIALECTS
 from smartcam.models import jsonable
 from smartcam.protocols import messages as m
 from smartcam.protocols._layouts import view_fields
-from smartcam.protocols.bvs import MESSAGES
 from smartcam.protocols.framing import Frame
 
 if TYPE_CHECKING:
@@ -24,11 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["check"]
 
 ANY_ID = 0xFF
-NAMES: dict[type[m.Message], tuple[str, ...]] = {
-    m.UnknownMessage: ("payload",),
-    **{row.type: tuple(name for name, _ in m.wire_fields(row.type)) for row in MESSAGES},
-}
-"""What the body of each message holds."""
 
 
 def check(data: bytes) -> None:
@@ -68,4 +62,10 @@ def _check_view(dialect: FramedDialect, sender: m.Sender, frame: Frame, message:
     assert seen.pop("message_id") == frame.message_id
     assert seen.pop("length") == len(frame.payload) + dialect.header.length_includes
     assert seen.pop("magic", b"") == dialect.header.magic
-    assert seen == {name: getattr(message, name) for name in NAMES[type(message)]}
+    names = dialect.fields(type(message)) or (
+        ("payload",) if isinstance(message, m.UnknownMessage) else ()
+    )
+    expected = {name: getattr(message, name) for name in names}
+    if isinstance(message, m.StatusReport):  # the view has the wire's bits
+        expected["status"] = dialect.status_bits.write(message.status)
+    assert seen == expected

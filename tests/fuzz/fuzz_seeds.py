@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fuzz_interpreters import SPECS
+from machines import DIALECTS
 
 from smartcam.emulator.application import BUILTIN_APPLICATIONS, LOCALIZATIONS
 from smartcam.exceptions import LayoutError
 from smartcam.layout import Layout
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.bvs import BVS, MESSAGES
 from smartcam.protocols.machine import State
 
 if TYPE_CHECKING:
@@ -78,18 +78,21 @@ def seeds(name: str) -> list[bytes]:
 
 def vectors() -> Iterator[tuple[int, m.Sender, bytes]]:
     """Yield dialect's place, sender and bytes of every golden vector."""
-    for place, dialect in enumerate(BVS.dialects):
-        path = ROOT / "tests" / "vectors" / f"bvs_{dialect}.toml"
+    for place, dialect in enumerate(DIALECTS):
+        name = "_".join((dialect.name, *dialect.quirks))
+        path = ROOT / "tests" / "vectors" / f"bvs_{name}.toml"
         given: list[dict[str, Any]] = tomllib.loads(path.read_text(encoding="utf-8"))["vector"]
         for one in given:
             yield place, m.Sender(one["sender"]), bytes.fromhex(one["hex"])
 
 
-def broken_lengths(frame: bytes, limit: int) -> Iterator[bytes]:
+def broken_lengths(place: int, frame: bytes, limit: int) -> Iterator[bytes]:
     """Yield a frame with lengths that are impossible, too large, or one too small or too large."""
-    length = int.from_bytes(frame[4:8], "little")
-    for wrong in {0, 3, length - 1, length + 1, limit + 1, limit + 5, 0xFFFFFFFF} - {-1, length}:
-        yield frame[:4] + wrong.to_bytes(4, "little") + frame[8:]
+    begin, end = (4, 8) if DIALECTS[place].header.magic else (2, 4)
+    most = (1 << 8 * (end - begin)) - 1
+    length = int.from_bytes(frame[begin:end], "little")
+    for wrong in {0, 3, length - 1, length + 1, limit + 1, limit + 5, most} - {-1, length}:
+        yield frame[:begin] + wrong.to_bytes(end - begin, "little") + frame[end:]
 
 
 def documents() -> str:
@@ -111,17 +114,19 @@ def _framing() -> Iterator[bytes]:
         if turn % 4 == 0:
             yield bytes((place, limit, turn % 3)) + cuts[1] + frame[3:] + frame + frame[:7]
     for place, _, frame in vectors():
-        for broken in broken_lengths(frame, limit):
+        for broken in broken_lengths(place, frame, limit):
             yield bytes((place, limit, as_bytes, 0)) + broken + frame
 
 
 def _messages() -> Iterator[bytes]:
     for place, sender, frame in vectors():
-        number = int.from_bytes(frame[8:12], "little")
-        row = next((i for i, row in enumerate(MESSAGES) if row.message_id == number), None)
+        dialect = DIALECTS[place]
+        begin, end = (8, 12) if dialect.header.magic else (0, 2)
+        number = int.from_bytes(frame[begin:end], "little")
+        row = next(i for i, row in enumerate(dialect.table) if row.message_id == number)
         sent_by = list(m.Sender).index(sender)
-        chosen = b"\xff" + frame[8:12] if row is None else bytes((row,))
-        yield bytes((place, sent_by)) + chosen + frame[12:]
+        yield bytes((place, sent_by, row)) + frame[dialect.header.size :]
+        yield bytes((place, sent_by, 0xFF)) + frame[begin:end] + frame[dialect.header.size :]
 
 
 def _machine() -> Iterator[bytes]:
@@ -132,7 +137,7 @@ def _machine() -> Iterator[bytes]:
             for state in (0, connecting, connected):
                 start = bytes((place, role, transport, 0, state, 64))
                 yield start + bytes((0, len(frame))) + frame
-                for broken in broken_lengths(frame, 64):
+                for broken in broken_lengths(place, frame, 64):
                     yield start + bytes((0, len(frame))) + broken + bytes((0, len(frame))) + frame
     # a session in the client's role: what it says, and what comes to that
     says = [bytes((5, place, 0)) for place in range(18)]
@@ -179,7 +184,7 @@ def _camera() -> Iterator[bytes]:
     requests = [bytes((2, place)) for place in range(8)]
     for application in range(len(BUILTIN_APPLICATIONS) + 1):
         for place in range(8):
-            start = bytes((place % 2, place % 4, application, place // 4))
+            start = bytes((place % 5, place % 5, application, place // 4))
             yield start + requests[0] + b"\x05ab\xff" + requests[1] + b"\x07\x07" + requests[place]
             yield start + bytes((8, place, 1)) + requests[place] + b"\x03\x01\x07" + requests[0]
     for place, sender, frame in vectors():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from smartcam.emulator.generators import generator_names
 from smartcam.interpreters.localizations import Localizations
 from smartcam.layout.text import TYPES, UNITS
-from smartcam.protocols.bvs import BVS, MESSAGES
+from smartcam.protocols.bvs import B16, BVS, MESSAGES, MessageId
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,8 +50,9 @@ def _words(*texts: str) -> tuple[bytes, ...]:
 
 
 _HEADERS = (
-    *(dialect.header.magic for dialect in BVS.dialects.values()),
+    *(one.header.magic for one in BVS.dialects.values() if one.header.magic),
     *sorted({row.message_id.to_bytes(4, "little") for row in MESSAGES}),
+    *(bytes((int(number), 0, 2, 0)) for number in MessageId),
     *(bytes.fromhex(one) for one in ("00000000", "04000000", "08000000", "ffffffff", "0100")),
 )
 _LAYOUT = (
@@ -103,8 +104,9 @@ _LAYOUT_FILE = _words(
     *("group: ", "lenient: true\n", "repeat: 3", "repeat: n", "{name: x, type: int32}"),
 )
 _ADDRESS = _words(
-    *(f"{scheme}://" for scheme in BVS.schemes),
+    *(f"{scheme}://" for scheme in (*BVS.schemes, "insight")),
     *("127.0.0.1", "[::1]", "[fe80::1%25eth0]", "localhost", ":36701", "?dialect=", "&", "#", "@"),
+    *("&quirks=", *B16.wire_quirks, ",", "me:secret@", "?user=", "&timeout="),
     *(*BVS.dialects, "%5B", "xn--", "ⓑ", "[v1.a]", "/", "\\", "\u3002", "\uff0f", "\u200b"),
 )
 _SPEC = _words(

@@ -29,7 +29,7 @@ def body_of(dialect: FramedDialect, sender: m.Sender, message_id: int) -> Body:
     sizes = {m.Wire.WORD: word, m.Wire.UINT32: 4, m.Wire.DATA: 0}
     for row in dialect.table:
         if row.message_id == message_id and row.type.sender is sender:
-            wires = [wire for _, wire in m.wire_fields(row.type)]
+            wires = [wire for name, wire in m.wire_fields(row.type) if name not in row.omits]
             return Body(sum(sizes[wire] for wire in wires), m.Wire.DATA in wires)
     return Body(0, open_end=True)
 

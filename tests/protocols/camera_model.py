@@ -51,6 +51,9 @@ class Options(NamedTuple):
     switch_answer: Literal["after_status", "before_status"] = "after_status"
     waiting_before_result: bool = False
     busy_while_processing: bool = False
+    disconnect_answer: Literal["code", "silent"] = "code"
+    bad_message: Literal["code", "ignore"] = "code"
+    push_status: bool = False
 
 
 class Run(NamedTuple):
@@ -73,12 +76,19 @@ class CameraModel:
     """The camera: what it is doing, and what it must say.
 
     What falls on one instant happens in the order of ``ORDER``, as the emulator documents it.
+
+    Args:
+        options: the open questions.
+        is_bid: it is a BVS ID: it always runs, and every request is answered.
+        coded: answers have result codes.
     """
 
     ORDER = ("inspected", "calm", "loaded", "booted", "next run")
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: Options, *, is_bid: bool, coded: bool) -> None:
         self.options = options
+        self.is_bid = is_bid
+        self.coded = coded
         self.now = 0
         self.due: dict[str, int] = {}
         self.mode: Literal["stopped", "running", "switching", "rebooting"] = "stopped"
@@ -94,6 +104,8 @@ class CameraModel:
         self.clock_set: tuple[datetime, int] = (LOST, 0)
         self._said: list[m.Message] = []
         self._told: tuple[Status, int] | None = None
+        if is_bid:
+            self.start()
 
     # ------------------------------------------------------------------ what shows
 
@@ -106,11 +118,12 @@ class CameraModel:
         running = self.mode == "running"
         waits = running and self.run is None and self.program.period is None and not self.error
         busy = self.options.busy_while_processing and self.run is not None
+        not_ready = self.is_bid and (not running or self.error)
         bits = {
             0x001: self.overheat,
             0x002: self.error,
-            0x004: self.out_of_step,
-            0x010: self.mode == "switching" or busy,
+            0x004: self.out_of_step and not self.is_bid,
+            0x010: self.mode == "switching" or busy or not_ready,
             0x080: running,
             0x100: self.over,
             0x200: waits,
@@ -135,11 +148,15 @@ class CameraModel:
             self._said.append(message)
 
     def _report(self) -> None:
-        """After every change a status."""
-        now = (self.status, self.endian)
-        if now != self._told:
-            self._told = now
-            self._say(m.StatusReport(status=now[0], endian=now[1]))
+        """After every change a status; a BVS ID only if it is told to."""
+        if (self.status, self.endian) != self._told and (
+            not self.is_bid or self.options.push_status
+        ):
+            self._tell_status()
+
+    def _tell_status(self) -> None:
+        self._told = (self.status, self.endian)
+        self._say(m.StatusReport(status=self.status, endian=self.endian))
 
     # ------------------------------------------------------------------ the client
 
@@ -151,30 +168,54 @@ class CameraModel:
             self.session, self._told = True, None
             self._forget_asker()
             self._say(m.ConnectAnswer(version=1))
-            self._report()
+            if self.is_bid:
+                self._told = (self.status, self.endian)
+            else:
+                self._report()
         elif isinstance(message, m.Disconnect):
-            self.session = False
-            self._forget_asker()
+            if self.is_bid and self.options.disconnect_answer == "code":
+                self._say(m.DisconnectAnswer(code=0))
+            self.end_session()
         elif self.session:
             self._obey(message)
 
+    def end_session(self) -> None:
+        """The client is gone."""
+        self.session = False
+        self._forget_asker()
+
+    def _acknowledge(self, answer: type[m.Acknowledgement], *, done: bool) -> None:
+        if self.is_bid:
+            self._say(answer(code=0x00 if done else 0x10))
+
+    def _complain(self, message_id: int, code: int) -> None:
+        if self.is_bid and self.options.bad_message == "code":
+            self._say(m.UnknownMessage(message_id=message_id, payload=bytes((code, 0))))
+
     def _obey(self, message: m.Message) -> None:
         match message:
+            case m.Query() if self.is_bid and self.mode == "switching":
+                self._say(m.QueryAnswer(code=0x16, application=0))
             case m.Query():
-                self._say(m.QueryAnswer(application=self.active))
+                self._say(m.QueryAnswer(code=2 * self.coded, application=self.active))
             case m.SwitchApplication(application=application):
                 self._switch(application)
             case m.GetClock():
                 parts = self.clock.timetuple()[:6]
-                names = [field.name for field in fields(m.ClockAnswer)]
-                self._say(m.ClockAnswer(**dict(zip(names, parts, strict=True))))
+                names = [field.name for field in fields(m.SetClock)]
+                named = dict(zip(names, parts, strict=True))
+                self._say(m.ClockAnswer(code=6 * self.coded, **named))
             case m.SetClock():
-                self._set_clock([getattr(message, field.name) for field in fields(message)])
+                done = self._set_clock([getattr(message, field.name) for field in fields(message)])
+                self._acknowledge(m.SetClockAnswer, done=done)
             case m.SetInput(data=data):
-                self._take_input(data)
+                done = self._take_input(data)
+                self._acknowledge(m.SetInputAnswer, done=done)
             case m.SetSequenceNumber(number=number):
                 self.number = number
             case m.Trigger():
+                if self.is_bid:
+                    self._say(m.TriggerAnswer(code=0x16 if self.status & 0x010 else 0x00))
                 self.trigger()
             case m.Start():
                 self.start()
@@ -182,34 +223,51 @@ class CameraModel:
                 self.stop()
             case m.Reboot():
                 self.reboot()
+            case m.GetStatus():
+                self._tell_status()
+            case m.ResetErrors():
+                self.over = self.out_of_step = False
+                self._acknowledge(m.ResetErrorsAnswer, done=True)
+                self._tell_status()
+            case m.UnknownMessage(message_id=message_id):
+                self._complain(message_id, 0x13)
+            case m.MalformedMessage(message_id=message_id):
+                self._complain(message_id, 0x10)
             case _:
                 pass
 
     def _switch(self, target: int) -> None:
-        how = self.options.switch_while_running if self.mode == "running" else "allow"
+        if self.is_bid and self.status & 0x010:
+            self._say(m.SwitchAnswer(code=0x16, application=self.active))
+            return
+        must_stop = self.mode == "running" and not self.is_bid
+        how = self.options.switch_while_running if must_stop else "allow"
         if self.mode == "switching":
             return
         if target not in PROGRAMS or how == "refuse":
-            self._say(m.SwitchAnswer(code=1, application=self.active))
+            code = 0x1A if self.coded else 1
+            self._say(m.SwitchAnswer(code=code, application=self.active))
         elif how == "allow":
             self._begin_load(Load(target, answer=True, running=False))
 
-    def _set_clock(self, parts: list[int]) -> None:
+    def _set_clock(self, parts: list[int]) -> bool:
         year, month, day, hour, minute, second = parts
         try:
             time = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
         except (ValueError, OverflowError):
-            return
+            return False
         self.clock_set = (time, self.now)
+        return True
 
-    def _take_input(self, data: bytes) -> None:
+    def _take_input(self, data: bytes) -> bool:
         if self.program.result != "input" or self.mode == "switching" or len(data) != 4:
-            return
-        if len(self.inputs) == DEPTH:
+            return False
+        if len(self.inputs) == (1 if self.is_bid else DEPTH):
             self.inputs.popleft()
             self.out_of_step = True
         self.inputs.append(int.from_bytes(data, self._byte_order, signed=True))
         self._report()
+        return True
 
     @property
     def _byte_order(self) -> Literal["little", "big"]:
@@ -239,7 +297,8 @@ class CameraModel:
             return False
         if self.run is not None:
             self.over = True
-            self.due["calm"] = self.now + CALM_AFTER
+            if not self.is_bid:
+                self.due["calm"] = self.now + CALM_AFTER
             self._report()
             return False
         self._begin_run()
@@ -323,7 +382,7 @@ class CameraModel:
         self._report()
         if load.answer and not early:
             self._say(answer)
-        if load.running:
+        if load.running or self.is_bid:
             self.start()
 
     def _booted(self) -> None:
@@ -332,6 +391,8 @@ class CameraModel:
         self.number = self.turn = 0
         self._forget_inputs()
         self.clock_set = (LOST, self.now)
+        if self.is_bid:
+            self.start()
 
     def _forget_inputs(self) -> None:
         self.inputs.clear()

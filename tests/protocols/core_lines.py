@@ -6,14 +6,13 @@ import dataclasses
 from typing import TYPE_CHECKING, Literal
 
 import pytest
-from core_model import ANSWERED, HEADER, WIRES, CameraEnd, ClientEnd, framed
+from core_model import WIRES, CameraEnd, ClientEnd, framed
 from core_words import LIMIT
-from machines import one_by_one
+from machines import BY_LABEL, one_by_one
 
-from smartcam.exceptions import LocalProtocolError
+from smartcam.exceptions import LocalProtocolError, UnsupportedError
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.bvs import BVS
+from smartcam.protocols.base import POLICIES, Role, Transport
 from smartcam.protocols.machine import LinkFailed, Machine
 
 if TYPE_CHECKING:
@@ -61,18 +60,25 @@ class Pipe:
 
 
 class Line:
-    """A client, the camera's end for it, and the wire between them."""
+    """A client, the camera's end for it, and the wire between them.
 
-    def __init__(self, dialect: str, transport: Transport) -> None:
+    Args:
+        dialect: its label.
+        transport: stream or datagrams.
+        tells: the camera is told of bodies of a wrong length.
+    """
+
+    def __init__(self, dialect: str, transport: Transport, *, tells: bool) -> None:
         self.wire = WIRES[dialect]
         self.transport = transport
-        self.dialect = BVS.dialects[dialect]
+        self.tells = tells
+        self.dialect = BY_LABEL[dialect]
         datagrams = transport is Transport.UDP
         self.client = Machine(self.dialect, Role.CLIENT, transport, max_length=LIMIT)
         self.client_end = ClientEnd(self.wire, datagrams=datagrams, limit=LIMIT)
         self.pipes: dict[Way, Pipe] = {"up": Pipe(), "down": Pipe()}
-        self.asked = dict.fromkeys(ANSWERED, 0)
-        self.answered = dict.fromkeys(ANSWERED, 0)
+        self.asked = dict.fromkeys(self.wire.answered, 0)
+        self.answered = dict.fromkeys(self.wire.answered, 0)
         self.heard: list[m.Message] = []
         self.said: list[m.Message] = []
         self.renew_camera_end()
@@ -80,8 +86,11 @@ class Line:
     def renew_camera_end(self) -> None:
         """Where the camera has forgotten an address, its next datagram meets a new machine."""
         datagrams = self.transport is Transport.UDP
-        self.camera = Machine(self.dialect, Role.CAMERA, self.transport, max_length=LIMIT)
-        self.camera_end = CameraEnd(self.wire, datagrams=datagrams, limit=LIMIT)
+        policy = dataclasses.replace(POLICIES[Role.CAMERA, self.transport], tells=self.tells)
+        self.camera = Machine(
+            self.dialect, Role.CAMERA, self.transport, max_length=LIMIT, policy=policy
+        )
+        self.camera_end = CameraEnd(self.wire, datagrams=datagrams, limit=LIMIT, tells=self.tells)
 
     @property
     def clean(self) -> bool:
@@ -102,8 +111,8 @@ class Line:
         self.client.send(message, answered=answered)
         assert self.client.data_to_send() == [expected]
         self.pipes["up"].put(expected)
-        message_id = framed(message).message_id
-        if message_id in ANSWERED and answered is not False:
+        message_id = framed(self.wire, message).message_id
+        if message_id in self.asked and answered is not False:
             self.asked[message_id] += 1
 
     # ------------------------------------------------------------------ the client hears
@@ -116,8 +125,8 @@ class Line:
         for event in events:
             if isinstance(event, m.Message):
                 self.heard.append(event)
-                message_id = framed(event).message_id
-                if message_id in ANSWERED:
+                message_id = framed(self.wire, event).message_id
+                if message_id in self.answered:
                     self.answered[message_id] += 1
 
     def end_client(self) -> None:
@@ -156,7 +165,7 @@ def check_end(machine: Machine, end: ClientEnd | CameraEnd) -> None:
     """Compare a machine with its model."""
     counters = machine.counters
     assert machine.state.value == end.phase
-    assert machine.buffered == end.rest <= HEADER + LIMIT
+    assert machine.buffered == end.rest <= end.wire.header + LIMIT
     assert (counters.bytes_received, counters.bytes_sent) == (end.bytes_received, end.bytes_sent)
     assert (counters.frames_received, counters.frames_sent) == (
         end.frames_received,
@@ -172,7 +181,7 @@ def check_end(machine: Machine, end: ClientEnd | CameraEnd) -> None:
 def refused(machine: Machine, message: m.Message, answered: bool | None = None) -> None:
     """Say what may not be said: it is refused, and nothing has changed."""
     before = (machine.state, machine.buffered, dataclasses.replace(machine.counters))
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises((LocalProtocolError, UnsupportedError)):
         machine.send(message, answered=answered)
     assert (machine.state, machine.buffered, machine.counters) == before
     assert machine.data_to_send() == []

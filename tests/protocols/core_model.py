@@ -8,66 +8,130 @@ first one each time, so how they were cut cannot matter.
 from __future__ import annotations
 
 import struct
-from dataclasses import fields
 from typing import Any, Literal, NamedTuple
 
 from smartcam.exceptions import FrameError, MessageError
+from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.machine import LinkEnded
 
 __all__ = [
-    "ANSWERED",
-    "BODIES",
     "ENDED",
-    "HEADER",
     "WIRES",
     "CameraEnd",
     "ClientEnd",
     "Wire",
     "framed",
+    "masked",
+    "meaning",
     "packed",
 ]
 
 # ---------------------------------------------------------------------- the wire
 
 
+class Body(NamedTuple):
+    """A message's id and body: a letter for each field, and the fields' names.
+
+    ``W`` is an integer as wide as the wire's, ``I`` one of four bytes, ``*`` every byte to the end.
+    """
+
+    message_id: int
+    form: str = ""
+    names: str = ""
+
+
+_TIME = "year month day hour minute second"
+_WIDE: dict[type[m.Message], Body] = {
+    m.Connect: Body(0x01),
+    m.ConnectAnswer: Body(0x01, "W", "version"),
+    m.Disconnect: Body(0x02),
+    m.StatusReport: Body(0x12, "WW", "status endian"),
+    m.ResultContainer: Body(0x20, "W*", "application data"),
+    m.Query: Body(0x30),
+    m.QueryAnswer: Body(0x30, "W", "application"),
+    m.SwitchApplication: Body(0x31, "W", "application"),
+    m.SwitchAnswer: Body(0x31, "WW", "code application"),
+    m.GetClock: Body(0x32),
+    m.ClockAnswer: Body(0x32, "WWWWWW", _TIME),
+    m.SetClock: Body(0x33, "WWWWWW", _TIME),
+    m.SetInput: Body(0x34, "*", "data"),
+    m.SetSequenceNumber: Body(0x35, "I", "number"),
+    m.Trigger: Body(0x40),
+    m.Start: Body(0x41),
+    m.Stop: Body(0x42),
+    m.Reboot: Body(0x43),
+}
+_NARROW = {**_WIDE, m.StatusReport: Body(0x12, "W", "status")}
+_CODED = {
+    **_NARROW,
+    m.ConnectAnswer: Body(0x01, "WW", "code version"),
+    m.QueryAnswer: Body(0x30, "WW", "code application"),
+    m.ClockAnswer: Body(0x32, "WWWWWWW", f"code {_TIME}"),
+}
+_BID_ALONE: dict[type[m.Message], Body] = {
+    m.DisconnectAnswer: Body(0x02, "W", "code"),
+    m.GetStatus: Body(0x12),
+    m.ResetErrors: Body(0x16),
+    m.ResetErrorsAnswer: Body(0x16, "W", "code"),
+    m.SetClockAnswer: Body(0x33, "W", "code"),
+    m.SetInputAnswer: Body(0x34, "W", "code"),
+    m.TriggerAnswer: Body(0x40, "W", "code"),
+}
+_BID = {
+    **{kind: body for kind, body in _CODED.items() if body.message_id not in range(0x41, 0x44)},
+    **_BID_ALONE,
+}
+del _BID[m.SetSequenceNumber]
+_SC_SILENT = frozenset({0x02, 0x33, 0x34, 0x35, 0x40, 0x41, 0x42, 0x43})
+
+
 class Wire(NamedTuple):
-    """A header: the magic number's bytes, and how many others the length field counts."""
+    """What frames look like, and what is in them.
+
+    Attributes:
+        magic: the magic number's bytes.
+        counted: how many bytes beside the body the length field counts.
+        word: ``struct`` letter of the header's and the bodies' integers.
+        bodies: the messages.
+        silent: ids of the requests that nobody waits for an answer to.
+        is_bid: the status word is that of BVS ID.
+    """
 
     magic: bytes
     counted: int
+    word: Literal["I", "H"]
+    bodies: dict[type[m.Message], Body]
+    silent: frozenset[int]
+    is_bid: bool = False
+
+    @property
+    def header(self) -> int:
+        """Bytes of a header."""
+        return len(self.magic) + 2 * struct.calcsize(f"<{self.word}")
+
+    @property
+    def answered(self) -> set[int]:
+        """Ids of the requests that are answered by a message of their own."""
+        reports = {
+            body.message_id for kind, body in self.bodies.items() if kind.sender is m.Sender.CAMERA
+        }
+        return reports - {0x02, 0x12, 0x20}
+
+    def layout(self, kind: type[m.Message]) -> tuple[struct.Struct, list[str], bool]:
+        """Return what reads a body's integers, the fields' names, and whether data follow."""
+        _, form, names = self.bodies.get(kind) or {**_WIDE, **_BID_ALONE}[kind]
+        code = "<" + form.rstrip("*").replace("W", self.word)
+        return struct.Struct(code), names.split(), form.endswith("*")
 
 
 WIRES = {
-    "handbook": Wire(bytes.fromhex("50535642"), 0),
-    "thesis": Wire(bytes.fromhex("42565350"), 4),
+    "handbook": Wire(bytes.fromhex("50535642"), 0, "I", _WIDE, _SC_SILENT),
+    "thesis": Wire(bytes.fromhex("42565350"), 4, "I", _WIDE, _SC_SILENT),
+    "b16": Wire(b"", 0, "H", _NARROW, _SC_SILENT),
+    "b16 with quirk code": Wire(b"", 0, "H", _CODED, _SC_SILENT),
+    "bid": Wire(b"", 0, "H", _BID, frozenset({0x02}), is_bid=True),
 }
-HEADER = 12
-
-BODIES: dict[type[m.Message], tuple[int, str]] = {
-    m.Connect: (0x01, ""),
-    m.ConnectAnswer: (0x01, "I"),
-    m.Disconnect: (0x02, ""),
-    m.StatusReport: (0x12, "II"),
-    m.ResultContainer: (0x20, "I*"),
-    m.Query: (0x30, ""),
-    m.QueryAnswer: (0x30, "I"),
-    m.SwitchApplication: (0x31, "I"),
-    m.SwitchAnswer: (0x31, "II"),
-    m.GetClock: (0x32, ""),
-    m.ClockAnswer: (0x32, "6I"),
-    m.SetClock: (0x33, "6I"),
-    m.SetInput: (0x34, "*"),
-    m.SetSequenceNumber: (0x35, "I"),
-    m.Trigger: (0x40, ""),
-    m.Start: (0x41, ""),
-    m.Stop: (0x42, ""),
-    m.Reboot: (0x43, ""),
-}
-"""Id and body of each message; ``*`` stands for every byte to the end."""
-
-ANSWERED = {0x01, 0x30, 0x31, 0x32}
-SILENT = {0x02, 0x33, 0x34, 0x35, 0x40, 0x41, 0x42, 0x43}
 
 
 class Frame(NamedTuple):
@@ -78,46 +142,93 @@ class Frame(NamedTuple):
 def packed(wire: Wire, frame: Frame | tuple[int, bytes]) -> bytes:
     """Return a frame's bytes."""
     message_id, payload = frame
-    return wire.magic + struct.pack("<II", len(payload) + wire.counted, message_id) + payload
+    numbers = (len(payload) + wire.counted, message_id)
+    return (
+        wire.magic
+        + struct.pack(f"<2{wire.word}", *(numbers if wire.magic else numbers[::-1]))
+        + payload
+    )
 
 
-def framed(message: m.Message) -> Frame:
-    """Return a message as a frame."""
-    if isinstance(message, m.UnknownMessage):
+def masked(wire: Wire, number: int) -> int:
+    """Return a number that fits the header."""
+    return number % (1 << 8 * struct.calcsize(f"<{wire.word}"))
+
+
+def framed(wire: Wire, message: m.Message) -> Frame:
+    """Return a message as a frame; one that the wire lacks as it is elsewhere."""
+    if isinstance(message, (m.UnknownMessage, m.MalformedMessage)):
         return Frame(message.message_id, message.payload)
-    message_id, form = BODIES[type(message)]
-    values = [getattr(message, field.name) for field in fields(message)]
-    tail = values.pop() if form.endswith("*") else b""
-    return Frame(message_id, struct.pack("<" + form.rstrip("*"), *values) + tail)
+    kind = type(message)
+    layout, names, has_data = wire.layout(kind)
+    values = [getattr(message, name) for name in names]
+    if isinstance(message, m.StatusReport) and wire.is_bid:
+        values[0] = _bid_word(message.status)
+    tail = values.pop() if has_data else b""
+    message_id = (wire.bodies.get(kind) or {**_WIDE, **_BID_ALONE}[kind]).message_id
+    return Frame(message_id, layout.pack(*values) + tail)
 
 
-def known(sender: m.Sender, message_id: int) -> type[m.Message] | None:
+def _bid_word(status: Status) -> int:
+    """Return the word on the wire: Waiting, Ready, Trigger Error, and what has no name here."""
+    word = int(status) >> 32 & ~0x121
+    word |= 0x001 if status & 0x200 else 0
+    word |= 0x020 if not status & 0x010 else 0
+    return word | (0x100 if status & 0x100 else 0)
+
+
+def _bid_status(word: int) -> Status:
+    status = 0x080 | (word & ~0x121) << 32
+    status |= 0x200 if word & 0x001 else 0
+    status |= 0x010 if not word & 0x020 else 0
+    return Status(status | (0x100 if word & 0x100 else 0))
+
+
+def known(wire: Wire, sender: m.Sender, message_id: int) -> type[m.Message] | None:
     """Return what an id means from that sender."""
-    of_id = [one for one, (number, _) in BODIES.items() if number == message_id]
+    of_id = [one for one, body in wire.bodies.items() if body.message_id == message_id]
     return next((one for one in of_id if one.sender is sender), None)
 
 
-def surplus(sender: m.Sender, frame: Frame) -> int:
+def _filled(wire: Wire, sender: m.Sender, frame: Frame) -> Frame:
+    """Return a frame as it is taken: zeros stand behind a refusing code that comes alone.
+
+    Not in answer to Connect, where two bytes are the version of another dialect.
+    """
+    message_type = known(wire, sender, frame.message_id)
+    if message_type is None or len(frame.payload) != 2 or wire.bodies is _WIDE:
+        return frame
+    coded = "code" in wire.layout(m.ConnectAnswer)[1] and message_type is not m.ConnectAnswer
+    layout, names, _ = wire.layout(message_type)
+    if not coded or names[:1] != ["code"] or frame.payload in {b"\0\0", b"\2\0", b"\6\0"}:
+        return frame
+    return Frame(frame.message_id, frame.payload.ljust(layout.size, b"\0"))
+
+
+def surplus(wire: Wire, sender: m.Sender, frame: Frame) -> int:
     """Return how many bytes a body is too long; negative: too short."""
-    message_type = known(sender, frame.message_id)
+    message_type = known(wire, sender, frame.message_id)
     if message_type is None:
         return 0
-    form = BODIES[message_type][1]
-    more = len(frame.payload) - struct.calcsize("<" + form.rstrip("*"))
-    return min(more, 0) if form.endswith("*") else more
+    frame = _filled(wire, sender, frame)
+    layout, _, has_data = wire.layout(message_type)
+    more = len(frame.payload) - layout.size
+    return min(more, 0) if has_data else more
 
 
-def meaning(sender: m.Sender, frame: Frame) -> m.Message:
+def meaning(wire: Wire, sender: m.Sender, frame: Frame) -> m.Message:
     """Return the message of a frame whose body is long enough."""
-    message_type = known(sender, frame.message_id)
+    message_type = known(wire, sender, frame.message_id)
     if message_type is None:
         return m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
-    form = BODIES[message_type][1]
-    layout = struct.Struct("<" + form.rstrip("*"))
+    frame = _filled(wire, sender, frame)
+    layout, names, has_data = wire.layout(message_type)
     values: list[Any] = list(layout.unpack_from(frame.payload))
-    if form.endswith("*"):
+    if has_data:
         values.append(frame.payload[layout.size :])
-    named = dict(zip([field.name for field in fields(message_type)], values, strict=True))
+    named = dict(zip(names, values, strict=True))
+    if message_type is m.StatusReport:
+        named["status"] = (_bid_status if wire.is_bid else Status)(named["status"])
     return message_type(**named)
 
 
@@ -140,7 +251,10 @@ class Reading(NamedTuple):
 
 
 def read_stream(wire: Wire, stream: bytes, limit: int) -> Reading:
-    """Read a stream from its first byte; behind a broken place look for the next magic number."""
+    """Read a stream from its first byte; behind a broken place look for the next magic number.
+
+    Without a magic number everything behind a broken place is skipped.
+    """
     found: list[Frame] = []
     intact = None
     breaks = skipped = at = 0
@@ -151,14 +265,15 @@ def read_stream(wire: Wire, stream: bytes, limit: int) -> Reading:
         if not 0 <= size <= limit:
             intact = len(found) if intact is None else intact
             places = range(at + 1, len(stream))
-            following = next((p for p in places if _may_begin(wire, stream, p)), len(stream))
+            begins = (p for p in places if wire.magic and _may_begin(wire, stream, p))
+            following = next(begins, len(stream))
             breaks, skipped, at = breaks + 1, skipped + following - at, following
             continue
-        end = at + HEADER + size
+        end = at + wire.header + size
         if end > len(stream):
             break
-        message_id = int.from_bytes(stream[at + 8 : at + 12], "little")
-        found.append(Frame(message_id, stream[at + HEADER : end]))
+        message_id, _ = _numbers_at(wire, stream, at)
+        found.append(Frame(message_id, stream[at + wire.header : end]))
         at = end
     return Reading(found, intact, breaks, skipped, len(stream) - at)
 
@@ -171,16 +286,22 @@ def read_datagram(wire: Wire, data: bytes, limit: int) -> Frame | None:
 
 
 def _may_begin(wire: Wire, stream: bytes, at: int) -> bool:
-    return wire.magic.startswith(stream[at : at + 4])
+    return wire.magic.startswith(stream[at : at + len(wire.magic)])
+
+
+def _numbers_at(wire: Wire, stream: bytes, at: int) -> tuple[int, int]:
+    """Return id and length field of a header."""
+    numbers = struct.unpack_from(f"<2{wire.word}", stream, at + len(wire.magic))
+    return (numbers[1], numbers[0]) if wire.magic else (numbers[0], numbers[1])
 
 
 def _size_at(wire: Wire, stream: bytes, at: int) -> int | None:
     """Return what a header announces; -1 for a wrong magic number, None for too few bytes."""
     if not _may_begin(wire, stream, at):
         return -1
-    if len(stream) < at + HEADER:
+    if len(stream) < at + wire.header:
         return None
-    return int.from_bytes(stream[at + 4 : at + 8], "little") - wire.counted
+    return _numbers_at(wire, stream, at)[1] - wire.counted
 
 
 # ---------------------------------------------------------------------- the ends of a link
@@ -225,12 +346,25 @@ class _End:
             return [] if frame is None else [frame], None
         self.stream += data
         reading = read_stream(self.wire, self.stream, self.limit)
+        if not self.wire.magic:  # what is skipped is what was there
+            self.stream = self.stream[len(self.stream) - reading.rest :]
+            self.noise, self.rest = (self.noise[0] + reading.breaks,) * 2, reading.rest
+            return reading.frames, reading.intact
         self.noise, self.rest = (reading.breaks, reading.skipped), reading.rest
         intact = None if reading.intact is None else reading.intact - self.frames_received
         return reading.frames[self.frames_received :], intact
 
+    def fits(self, message: m.Message) -> bool:
+        """Whether the wire has such a message, and room for its values."""
+        raw = isinstance(message, (m.UnknownMessage, m.MalformedMessage))
+        try:
+            packed(self.wire, framed(self.wire, message))
+        except struct.error:
+            return False
+        return raw or type(message) in self.wire.bodies
+
     def _count_sent(self, message: m.Message) -> bytes:
-        data = packed(self.wire, framed(message))
+        data = packed(self.wire, framed(self.wire, message))
         self.frames_sent += 1
         self.bytes_sent += len(data)
         return data
@@ -255,18 +389,18 @@ class ClientEnd(_End):
 
     def may_say(self, message: m.Message, answered: bool | None = None) -> bool:
         """Whether the session allows it and no answer of its id is owed."""
-        if self.phase in ENDED:
+        if self.phase in ENDED or not self.fits(message):
             return False
         in_session = self.phase in {"connecting", "connected"}
         anywhere = isinstance(message, (m.Connect, m.Disconnect))
+        message_id = framed(self.wire, message).message_id
         return (anywhere or in_session) and not (
-            self._is_answered(framed(message).message_id, answered)
-            and framed(message).message_id in self.owed
+            self._is_answered(message_id, answered) and message_id in self.owed
         )
 
     def say(self, message: m.Message, answered: bool | None = None) -> bytes:
         """Say what may be said; return its bytes."""
-        message_id = framed(message).message_id
+        message_id = framed(self.wire, message).message_id
         if self._is_answered(message_id, answered):
             self.owed.add(message_id)
         if isinstance(message, m.Connect) and self.phase != "connected":
@@ -291,26 +425,28 @@ class ClientEnd(_End):
                 return [*heard, self._fail(MessageError)]
         return heard if intact is None else [*heard, self._fail(FrameError)]
 
-    @staticmethod
-    def _is_answered(message_id: int, answered: bool | None) -> bool:
-        return message_id not in SILENT if answered is None else answered
+    def _is_answered(self, message_id: int, answered: bool | None) -> bool:
+        return message_id not in self.wire.silent if answered is None else answered
 
     def _may_come(self, frame: Frame) -> bool:
-        if surplus(self.hears, frame) < 0:
+        if surplus(self.wire, self.hears, frame) < 0:
             return False
+        kind = known(self.wire, self.hears, frame.message_id)
+        if kind is m.DisconnectAnswer:
+            return True
         if self.phase == "connecting":
-            return known(self.hears, frame.message_id) is m.ConnectAnswer
+            return kind is m.ConnectAnswer
         return self.phase in {"connected", "disconnected"}
 
     def _take(self, frame: Frame) -> list[object]:
-        self.long += surplus(self.hears, frame) > 0
-        message = meaning(self.hears, frame)
-        if self.phase == "connecting":
+        self.long += surplus(self.wire, self.hears, frame) > 0
+        message = meaning(self.wire, self.hears, frame)
+        if self.phase == "connecting" and isinstance(message, m.ConnectAnswer):
             self.phase = "connected"
         was_owed = frame.message_id in self.owed
         self.owed.discard(frame.message_id)
         unknown = isinstance(message, m.UnknownMessage)
-        by_itself = isinstance(message, (m.StatusReport, m.ResultContainer))
+        by_itself = isinstance(message, (m.StatusReport, m.ResultContainer, m.DisconnectAnswer))
         self.unknown += unknown
         if was_owed or unknown or by_itself:
             return [message]
@@ -323,9 +459,20 @@ class ClientEnd(_End):
 
 
 class CameraEnd(_End):
-    """The camera's end: what is broken or out of place is ignored."""
+    """The camera's end: what is broken or out of place is ignored.
+
+    Args:
+        wire: what frames look like.
+        datagrams: one frame each, not a stream.
+        limit: most bytes of a body.
+        tells: bodies of a wrong length are told.
+    """
 
     hears = m.Sender.CLIENT
+
+    def __init__(self, wire: Wire, *, datagrams: bool, limit: int, tells: bool) -> None:
+        super().__init__(wire, datagrams=datagrams, limit=limit)
+        self.tells = tells
 
     def hear(self, data: bytes) -> list[m.Message]:
         """Take bytes; return the messages that count."""
@@ -350,14 +497,20 @@ class CameraEnd(_End):
 
     def may_say(self, message: m.Message) -> bool:
         """Whether there is a session for it."""
+        if not self.fits(message):
+            return False
+        if isinstance(message, m.DisconnectAnswer):
+            return self.phase not in ENDED
         if self.phase == "connecting":
             return isinstance(message, m.ConnectAnswer)
         return self.phase in {"connected", "disconnected"}
 
     def _take(self, frame: Frame) -> m.Message | None:
-        if surplus(self.hears, frame):
-            return None
-        message = meaning(self.hears, frame)
+        if surplus(self.wire, self.hears, frame):
+            if not self.tells or self.phase in {"idle", "disconnected"}:
+                return None
+            return m.MalformedMessage(message_id=frame.message_id, payload=frame.payload)
+        message = meaning(self.wire, self.hears, frame)
         match message:
             case m.Connect() if self.phase != "connected":
                 self.phase = "connecting"

@@ -6,8 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from camera_model import CameraModel, Options
 from core_lines import Line, delivery
+from core_model import framed, meaning, surplus
+from machines import BY_LABEL
 
 from smartcam.emulator import Application, Device, Quirks
+from smartcam.emulator.manner import manner_of
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
@@ -55,17 +58,20 @@ class Station:
     """Passes messages from lines to the device and back, as the emulator does.
 
     Args:
+        dialect: the label of what it speaks.
         options: the device's quirks.
         drop: what happens to a line that the camera lets go of.
     """
 
-    def __init__(self, options: Options, drop: Callable[[Line], None]) -> None:
-        self.model = CameraModel(options)
+    def __init__(self, dialect: str, options: Options, drop: Callable[[Line], None]) -> None:
+        self.model = CameraModel(
+            options, is_bid=dialect == "bid", coded=dialect in {"bid", "b16 with quirk code"}
+        )
+        quirks = Quirks(
+            reboot_time=0.3, overtriggered_time=0.1, input_queue_depth=2, **options._asdict()
+        )
         self.device = Device(
-            APPLICATIONS,
-            quirks=Quirks(
-                reboot_time=0.3, overtriggered_time=0.1, input_queue_depth=2, **options._asdict()
-            ),
+            APPLICATIONS, quirks=quirks, manner=manner_of(BY_LABEL[dialect], quirks)
         )
         self.lines: list[Line] = []
         self.served: Line | None = None
@@ -108,7 +114,7 @@ class Station:
         line, self.served = self.served, None
         if line is not None:
             self.device.disconnect()
-            self.model.hear(m.Disconnect())
+            self.model.end_session()
             self._drop(line)
 
     def go_down(self) -> None:
@@ -132,7 +138,11 @@ class Station:
         line.camera.send(message)
         assert line.camera.data_to_send() == [expected]
         line.pipes["down"].put(expected)
-        line.said.append(message)
+        frame = framed(line.wire, message)
+        if surplus(line.wire, m.Sender.CAMERA, frame) < 0:
+            line.said.append(message)  # a code alone, where an answer has more: nobody reads it
+        else:
+            line.said.append(meaning(line.wire, m.Sender.CAMERA, frame))
 
     def check(self) -> None:
         """Compare the device with its model."""

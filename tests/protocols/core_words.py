@@ -6,7 +6,7 @@ import struct
 from typing import Any, NamedTuple
 
 from camera_model import PROGRAMS
-from core_model import BODIES, Wire, framed, packed
+from core_model import WIRES, Wire, framed, masked, packed
 from hypothesis import strategies as st
 from machines import EXAMPLES
 
@@ -39,7 +39,10 @@ TIMES = st.one_of(
 # ---------------------------------------------------------------------- what is said
 
 ORDERS: st.SearchStrategy[m.Message] = st.sampled_from(
-    [m.Start(), m.Trigger(), m.Query(), m.Start(), m.Trigger(), m.GetClock(), m.Stop()]
+    [
+        *(m.Start(), m.Trigger(), m.Query(), m.Start(), m.Trigger(), m.GetClock(), m.Stop()),
+        *(m.GetStatus(), m.ResetErrors()),  # of one dialect; elsewhere they must be refused
+    ]
 )
 SESSIONS: st.SearchStrategy[m.Message] = st.sampled_from([m.Connect(), m.Connect(), m.Disconnect()])
 _CLOCKS = st.builds(
@@ -97,7 +100,7 @@ MISFITS: tuple[m.Message, ...] = (
 
 # ---------------------------------------------------------------------- what is broken
 
-IDS = sorted({message_id for message_id, _ in BODIES.values()})
+IDS = sorted({body.message_id for wire in WIRES.values() for body in wire.bodies.values()})
 _SIZES = st.sampled_from([0, 1, 3, 4, 5, 8, 9, 24, 25, LIMIT, LIMIT + 1])
 PAYLOADS = _SIZES.flatmap(lambda size: st.binary(min_size=size, max_size=size))
 
@@ -154,11 +157,14 @@ def noise(wire: Wire, what: Any) -> bytes:
         case bytes():
             return what
         case Extra(message=message, more=more):
-            message_id, payload = framed(message)
-            return packed(wire, (message_id, payload + more))
+            message_id, payload = framed(wire, message)
+            return packed(wire, (masked(wire, message_id), payload + more))
         case Bomb(length=length, message_id=message_id):
-            return wire.magic + struct.pack("<II", length, message_id)
+            numbers = (masked(wire, length), message_id)
+            numbers = numbers if wire.magic else numbers[::-1]
+            return wire.magic + struct.pack(f"<2{wire.word}", *numbers)
         case Magic(before=before, size=size):
             return before + wire.magic[:size]
         case _:
-            return packed(wire, what)
+            message_id, payload = what
+            return packed(wire, (masked(wire, message_id), payload))

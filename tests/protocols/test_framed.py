@@ -363,13 +363,26 @@ def test_status_bits_of_bid_bits_without_a_place_are_left_out() -> None:
     assert BITS.write(alike) == BITS.write(Status.RUNNING) == BITS.write(Status(0)) == 0x0020
 
 
+def test_status_bits_of_bid_higher_bits_do_not_pass_for_named_ones() -> None:
+    assert BITS.write(Status.RUNNING | Status.BUSY | Status(0x121 << 32)) == 0x0000
+    assert BITS.write(Status.RUNNING | Status(0x121 << 32)) == 0x0020
+
+
 def test_restate_reads_the_word_of_a_kin_as_its_own() -> None:
     frame = Frame(0x12, bytes.fromhex("2001"))
     read = B16.decode(CAMERA, frame)
     assert read == m.StatusReport(status=Status(0x120))
     assert isinstance(read, m.StatusReport)
-    assert BID.restate(read) == BID.decode(CAMERA, frame)
-    assert CODE.restate(read) == read
+    assert BID.restate(read, B16) == BID.decode(CAMERA, frame)
+    assert CODE.restate(read, B16) is not read
+    assert CODE.restate(read, B16) == read
+
+
+def test_restate_there_and_back_keeps_every_word() -> None:
+    for word in range(1 << 16):
+        read = m.StatusReport(status=BITS.read(word))
+        assert B16.restate(read, BID) == m.StatusReport(status=Status(word))
+        assert BID.restate(B16.restate(read, BID), B16) == read
 
 
 # ---------------------------------------------------------------------- quirks
@@ -600,3 +613,35 @@ def test_body_is_an_answers_bytes_behind_the_header(
     dialect: FramedDialect, message: m.Message
 ) -> None:
     assert dialect.body(message) == dialect.encode(message)[dialect.header.size :]
+
+
+@pytest.mark.parametrize("dialect", [BID, CODE], ids=label)
+def test_answer_that_is_only_a_refusing_code_is_taken_for_one(dialect: FramedDialect) -> None:
+    refused = dialect.decode(m.Sender.CAMERA, Frame(0x31, b"\x1a\x00"))
+    assert refused == m.SwitchAnswer(code=ResultCode.INSPECTION_ERROR, application=0)
+    busy = dialect.decode(m.Sender.CAMERA, Frame(0x30, b"\x16\x00"))
+    assert busy == m.QueryAnswer(code=ResultCode.BUSY, application=0)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "frame"),
+    [
+        (BID, Frame(0x31, b"\x00\x00")),  # a good code promises the rest
+        (BID, Frame(0x31, b"\x1a")),
+        (BID, Frame(0x31, b"\x1a\x00\x05")),
+        (BID, Frame(0x01, b"\x01\x00")),  # the version, in another dialect
+        (B16, Frame(0x31, b"\x01\x00")),
+        (HANDBOOK, Frame(0x31, b"\x01\x00\x00\x00")),
+    ],
+)
+def test_answer_that_is_too_short_otherwise_is_an_error(
+    dialect: FramedDialect, frame: Frame
+) -> None:
+    with pytest.raises(MessageError, match="it needs"):
+        dialect.decode(m.Sender.CAMERA, frame)
+
+
+def test_with_quirks_one_after_the_other_is_the_same_object() -> None:
+    both = B16.with_quirks(["code", "no_id"])
+    assert B16.with_quirks(["code"]).with_quirks(["no_id"]) is both
+    assert both.with_quirks([]) is both

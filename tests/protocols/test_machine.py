@@ -61,8 +61,8 @@ QUERY_ANSWER = bytes.fromhex("50535642 04000000 30000000 15000000")
 TRIGGER = bytes.fromhex("50535642 00000000 40000000")
 
 MALFORMED = m.MalformedMessage(message_id=0x40, payload=b"!")
-KIN = (B16, CODE, BID)
-CODE_OR_BID = (CODE, BID)
+KIN = (B16, BID, CODE)
+BID_OR_CODE = (BID, CODE)
 
 each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
 each_state = pytest.mark.parametrize("state", State)
@@ -845,7 +845,7 @@ def test_kin_of_a_machine_that_knows_is_its_dialect() -> None:
 @each_transport
 @pytest.mark.parametrize(
     ("answer", "kin"),
-    [("01000200 0100", (B16,)), ("01000400 0000 0100", CODE_OR_BID)],
+    [("01000200 0100", (B16,)), ("01000400 0000 0100", BID_OR_CODE)],
     ids=["two bytes", "four bytes"],
 )
 def test_kin_are_narrowed_by_the_length_of_the_answer_to_connect(
@@ -860,7 +860,7 @@ def test_kin_are_narrowed_by_the_first_byte_wise_too() -> None:
     made = asking()
     data = bytes.fromhex("01000400 0000 0100")
     assert feed(made, *[bytes([byte]) for byte in data]) == [m.ConnectAnswer(version=1)]
-    assert made.kin == CODE_OR_BID
+    assert made.kin == BID_OR_CODE
 
 
 def test_kin_are_narrowed_by_an_answer_to_disconnect() -> None:
@@ -887,18 +887,31 @@ def test_kin_that_an_answer_of_no_known_length_leaves_are_all(answer: str, taken
         assert "ConnectAnswer (0x01) came with" in str(failure(events))
 
 
+def test_kin_are_narrowed_before_the_trace_sees_the_frame() -> None:
+    """Whoever shows a frame in words shows it in those of the dialect that it narrowed to."""
+    seen: list[str] = []
+
+    def trace(sender: m.Sender, frame: Frame | RemoteProtocolError) -> None:
+        seen.append(made.dialect.name)
+
+    made = Machine(B16, Role.CLIENT, TCP, kin=KIN, trace=trace)
+    made.send(m.Connect())
+    feed(made, bytes.fromhex("01000400 0000 0100"))
+    assert seen == ["b16", "bid"]
+
+
 def test_kin_are_left_alone_by_what_comes_in_the_session() -> None:
     made = asking()
     feed(made, bytes.fromhex("01000400 0000 0100"))
     made.send(m.Query())
     assert feed(made, bytes.fromhex("12000200 2001"), bytes.fromhex("30000400 0200 1500")) == [
-        m.StatusReport(status=Status(0x120)),
+        m.StatusReport(status=Status.RUNNING | Status.OVERTRIGGERED),
         m.QueryAnswer(code=2, application=21),
     ]
-    assert made.kin == CODE_OR_BID
+    assert made.kin == BID_OR_CODE
 
 
-@pytest.mark.parametrize("dialect", CODE_OR_BID, ids=label)
+@pytest.mark.parametrize("dialect", BID_OR_CODE, ids=label)
 def test_adopt_one_of_the_kin_reads_as_it_from_then_on(dialect: FramedDialect) -> None:
     made = asking()
     feed(made, bytes.fromhex("01000400 0000 0100"))
@@ -919,8 +932,8 @@ def test_adopt_a_stranger_is_refused() -> None:
     for stranger in (HANDBOOK, B16, BIG_ENDIAN_NUMBER):
         with pytest.raises(LocalProtocolError) as caught:
             made.adopt(stranger)
-        assert str(caught.value) == f"{stranger.name} is none of ['b16', 'bid']"
-    assert (made.kin, made.dialect) == (CODE_OR_BID, CODE)
+        assert str(caught.value) == f"{stranger.name} is none of ['bid', 'b16']"
+    assert (made.kin, made.dialect) == (BID_OR_CODE, BID)
 
 
 def test_adopt_bid_has_containers_in_bursts_as_before() -> None:

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 from machines import EXAMPLES, label
 
+from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
@@ -46,7 +47,7 @@ def test_wire_fields_of_an_acknowledgement_begin_with_its_code() -> None:
 
 
 def test_fields_that_a_dialect_may_leave_out_have_defaults() -> None:
-    assert m.StatusReport(status=m.Status(0)).endian == 0
+    assert m.StatusReport(status=Status(0)).endian == 0
     assert m.ResultContainer(data=b"").application == m.UNNAMED_APPLICATION == -1
     assert m.ConnectAnswer(version=1).code == m.QueryAnswer(application=1).code == 0
 

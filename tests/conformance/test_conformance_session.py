@@ -1,0 +1,154 @@
+"""A session: made, left, lost, taken."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+from conformancekit import SHORT, SOON, balance, client, number, until, visiting
+from worlds import COUNTER, OTHER, WORLDS
+
+import smartcam
+from smartcam import (
+    Backoff,
+    Connected,
+    ConnectionClosedError,
+    ConnectionLostError,
+    ConnectionTakenError,
+    Disconnected,
+    Reconnected,
+    Status,
+    TriggerTimeoutError,
+)
+
+if TYPE_CHECKING:
+    from worlds import World
+
+    from smartcam import SmartCamera
+
+pytestmark = pytest.mark.parametrize("world", WORLDS, ids=str)
+
+FAST = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
+
+
+async def test_connect_pinned_knows_the_camera(world: World) -> None:
+    async with visiting(world) as (site, camera):
+        assert camera.connected
+        assert camera.url == site.url
+        assert camera.active_application == COUNTER
+        assert Status.RUNNING in camera.status
+        assert f"dialect={camera.capabilities.dialect}" in site.url or "dialect" not in site.url
+        assert await camera.query_application() == COUNTER
+        await camera.wait_ready()
+
+
+async def test_connect_unpinned_finds_out_and_pins_it(world: World) -> None:
+    async with world.open() as site:
+        camera = smartcam.connect(site.unpinned, interpret_as=world.numbers, reconnect=None)
+        events = camera.events()
+        async with camera:
+            assert camera.url == site.url
+            assert await number(camera) == 0
+            async with asyncio.timeout(SOON):
+                event = await anext(events)
+                while not isinstance(event, Connected):
+                    event = await anext(events)
+            assert event.url == site.url
+
+
+async def test_connect_with_an_application_has_it_running(world: World) -> None:
+    async with visiting(world, application=OTHER) as (_, camera):
+        assert camera.active_application == OTHER
+        result = await camera.trigger()
+        assert result.application == OTHER
+
+
+async def test_close_ends_the_session_and_leaves_the_camera_as_it_is(world: World) -> None:
+    async with world.open() as site:
+        camera = await client(world, site)
+        await camera.switch_application(OTHER)
+        assert site.has_session
+        await camera.close()
+        await until(lambda: not site.has_session)
+        await camera.close()
+        with pytest.raises(ConnectionClosedError):
+            await camera.trigger()
+        async with client(world, site) as following:
+            assert following.active_application == OTHER
+            assert Status.RUNNING in following.status
+
+
+async def test_lost_camera_is_told_and_comes_back(world: World) -> None:
+    async with visiting(world, reconnect=FAST, liveness_timeout=0.4) as (site, camera):
+        events = camera.events()
+        await number(camera)
+        await site.restart()
+        await until(lambda: not camera.connected)
+        async with asyncio.timeout(SOON):
+            kinds = [type(await anext(events))]
+            while kinds[-1] is not Reconnected:
+                kinds.append(type(await anext(events)))
+        assert Disconnected in kinds
+        await camera.wait_connected(SOON)
+        assert (await camera.trigger()).application == COUNTER
+        assert camera.statistics().reconnects == 1
+        balance(camera.statistics())
+
+
+async def test_killed_camera_ends_what_waits_for_it(world: World) -> None:
+    async with visiting(world, liveness_timeout=0.4) as (site, camera):
+        waiting = asyncio.create_task(camera.wait_status(lambda _: False, timeout=SOON))
+        results = camera.results()
+        await number(camera)
+        await site.kill()
+        with pytest.raises(ConnectionLostError):
+            await waiting
+        with pytest.raises(ConnectionLostError):
+            await camera.trigger(timeout=SOON)
+        assert not camera.connected
+        async with asyncio.timeout(SOON):
+            assert (await anext(results)).value.n == 0
+            with pytest.raises(ConnectionLostError):
+                await anext(results)
+        balance(camera.statistics())
+
+
+async def test_newcomer_takes_the_camera_or_stands_beside(world: World) -> None:
+    async with visiting(world) as (site, first), client(world, site) as second:
+        assert await number(second) == 0
+        if not world.exclusive:
+            assert await number(first) == 1
+        elif world.datagrams:
+            with pytest.raises(TriggerTimeoutError):
+                await first.trigger(timeout=SHORT)
+        else:
+            with pytest.raises(ConnectionLostError):
+                await first.trigger(timeout=SOON)
+        await number(second)
+
+
+async def test_two_that_want_the_camera_do_not_fight_for_it(world: World) -> None:
+    async with (
+        visiting(world, reconnect=FAST) as (site, first),
+        client(world, site, reconnect=FAST) as second,
+    ):
+        if world.exclusive and not world.datagrams:
+            await until(lambda: is_taken(first) or is_taken(second))
+            left = second if is_taken(first) else first
+            await left.wait_connected(SOON)
+            await number(left)
+            assert not is_taken(left)
+        balance(first.statistics())
+        balance(second.statistics())
+
+
+def is_taken(camera: SmartCamera) -> bool:
+    """Whether a client has given up because another one has the camera."""
+    try:
+        camera.next_result().close()
+    except ConnectionTakenError:
+        return True
+    except ConnectionLostError:
+        pass
+    return False
