@@ -98,6 +98,8 @@ LIMITS = (
     "emulator.insight.MAX_ORDERED",
     "emulator.insight_image.MAX_PIXELS",
     "emulator.insight_job.MAX_CELL_TEXT",
+    "protocols.insight_machine.READ_SIZE",
+    "protocols.insight.MAX_LOGIN",
 )
 """Constants that bound something, below ``smartcam.``."""
 

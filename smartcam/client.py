@@ -494,6 +494,7 @@ class SmartCamera:
         """
         limit = self.settings.switch_timeout if timeout is None else timeout
         async with self._turns.hold(limit) as deadline:
+            await self._fresh_status(deadline)
             await self._talk.switch(application, deadline, start=self._talk.runs)
 
     @contextlib.asynccontextmanager

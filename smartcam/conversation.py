@@ -276,11 +276,12 @@ class Conversation:
             CommandRejectedError: it refused, or is too busy.
         """
         code = answer.code if isinstance(answer, m.Acknowledgement) else 0
-        verdict = self.dialect.code(code).verdict
+        verdict = self.dialect.code(code, request).verdict
         if verdict is Verdict.DONE:
             return
         said = (
-            f"{self.name}: {request.__name__}: the camera answered {code_text(self.dialect, code)}"
+            f"{self.name}: {request.__name__}: "
+            f"the camera answered {code_text(self.dialect, code, request)}"
         )
         if verdict is Verdict.UNKNOWN:
             raise UnsupportedError(said)
@@ -470,9 +471,13 @@ class Conversation:
     async def catch_up(self, deadline: float) -> None:
         """Know the status again where a start or stop was interrupted.
 
-        What these two have caused comes before the answer to a Query that was sent after them.
+        What these two have caused comes before the answer to a Query that was sent after them, or
+        is to be asked for.
         """
-        await self._fence(deadline)
+        if self._poll is not None:
+            await self.refresh_status(deadline)
+        else:
+            await self._fence(deadline)
         self.unconfirmed = False
 
     async def _fence(self, deadline: float) -> None:
@@ -541,6 +546,8 @@ class Conversation:
 
     async def query_loaded(self, deadline: float) -> int:
         """Return the active application; while one is being loaded a Query tells the old one."""
+        if self._poll is not None:
+            await self.refresh_status(deadline)  # whether it runs is asked next
         await self.until(_is_not_loading, deadline, "the application to be loaded")
         return await self.query(deadline)
 
@@ -611,6 +618,8 @@ class Conversation:
     def _load_request(self, application: int | str) -> m.Request:
         if isinstance(application, str):
             self.require(m.LoadFile)
+            if not application.isprintable():
+                raise ConfigurationError(f"{self.name}: {application!r} is no file's name")
             return m.LoadFile(name=application.encode())
         self.require(m.SwitchApplication)
         ids = self.dialect.application_ids

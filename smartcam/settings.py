@@ -5,6 +5,7 @@ A wrong option is a :exc:`~smartcam.exceptions.ConfigurationError` that names it
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, cast
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit
 
@@ -59,6 +60,12 @@ class Address(NamedTuple):
         )
         return f"{self.scheme}://{user}{host}:{self.port}{'?' if query else ''}{query}"
 
+    def __repr__(self) -> str:
+        """Return all of it but the password, which is not for logs."""
+        shown = tuple((key, "***" if key == PASSWORD else value) for key, value in self.parameters)
+        fields = zip(self._fields, (*self[:-1], shown), strict=True)
+        return f"Address({', '.join(f'{name}={value!r}' for name, value in fields)})"
+
 
 def parse_address(url: str, *, model: str | None = None) -> Address:
     """Read a camera URL such as ``bvs://192.168.0.10?dialect=handbook``.
@@ -71,18 +78,24 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         ConfigurationError: says which part is wrong and what is accepted.
     """
     protocol, full = _pick_protocol(url.strip(), model)
+    shown = _masked(url)
     try:
         parts = urlsplit(full)
         port = parts.port if parts.port is not None else protocol.default_port
     except ValueError as exc:
-        raise ConfigurationError(f"camera address {url!r}: {exc}") from exc
+        if shown != url and "'" in str(exc):  # it quotes the URL, and so the password
+            raise ConfigurationError(
+                f"camera address {shown!r} is no URL; in a password each of / ? # [ ] stands as "
+                "%2F %3F %23 %5B %5D"
+            ) from None
+        raise ConfigurationError(f"camera address {shown!r}: {exc}") from exc
     if not parts.hostname:
-        raise ConfigurationError(f"camera address {url!r} has no host")
+        raise ConfigurationError(f"camera address {shown!r} has no host")
     # urlsplit lets some pass, and which ones differs from Python to Python
     if "[" in parts.hostname or "]" in parts.hostname or parts.netloc.rfind("[") > 0:
-        raise ConfigurationError(f"camera address {url!r} has a bracket inside its host")
+        raise ConfigurationError(f"camera address {shown!r} has a bracket inside its host")
     if port == 0:
-        raise ConfigurationError(f"camera address {url!r}: port 0 is no camera's port")
+        raise ConfigurationError(f"camera address {shown!r}: port 0 is no camera's port")
     has_login = USER in protocol.parameters
     surplus = [
         name
@@ -94,14 +107,14 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         if value
     ]
     if surplus:
-        raise ConfigurationError(f"camera address {url!r} has {surplus[0]}, which means nothing")
-    said = _query(url, parts.query, protocol)
+        raise ConfigurationError(f"camera address {shown!r} has {surplus[0]}, which means nothing")
+    said = _query(shown, parts.query, protocol)
     if has_login and parts.username is not None:
         said[USER], said[PASSWORD] = unquote(parts.username), unquote(parts.password or "")
     dialect, quirks = said.pop("dialect", None), said.pop("quirks", "")
     if dialect is not None and dialect not in protocol.dialects:
         raise ConfigurationError(
-            f"camera address {url!r}: {protocol.name} has no dialect {dialect!r}; "
+            f"camera address {shown!r}: {protocol.name} has no dialect {dialect!r}; "
             f"it has {', '.join(protocol.dialects)}"
         )
     address = Address(
@@ -118,7 +131,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
             raise ConfigurationError("quirks are a dialect's: name the dialect, too")
         protocol.tries(protocol.schemes[address.scheme], dialect, address.quirks, said)
     except ConfigurationError as exc:
-        raise ConfigurationError(f"camera address {_masked(url)!r}: {exc}") from exc
+        raise ConfigurationError(f"camera address {shown!r}: {exc}") from exc
     return address
 
 
@@ -126,18 +139,18 @@ USER, PASSWORD = "user", "password"
 """Parameters that stand before the host in a URL."""
 
 
-def _query(url: str, query: str, protocol: Protocol) -> dict[str, str]:
-    """Return what a URL's query says."""
+def _query(shown: str, query: str, protocol: Protocol) -> dict[str, str]:
+    """Return what a URL's query says; ``shown`` is the URL for error texts."""
     known = ["dialect", "quirks", *(key for key in protocol.parameters if key not in _LOGIN)]
     said: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:
             raise ConfigurationError(
-                f"camera address {_masked(url)!r}: unknown {key!r}; known are "
+                f"camera address {shown!r}: unknown {key!r}; known are "
                 f"{', '.join(map(repr, known))}"
             )
         if key in said:
-            raise ConfigurationError(f"camera address {_masked(url)!r} names two {key}")
+            raise ConfigurationError(f"camera address {shown!r} names two {key}")
         said[key] = value
     return said
 
@@ -147,9 +160,14 @@ _LOGIN = frozenset({USER, PASSWORD})
 
 def _masked(url: str) -> str:
     """Return a URL without its password, for error texts."""
-    before, at, after = url.rpartition("@")
-    user, colon, _ = before.partition("://")[2].partition(":")
-    return f"{before.partition('://')[0]}://{user}:***@{after}" if at and colon else url
+    begin = url.find("://") + 3 if "://" in url else 0
+    login, at, host = url[begin:].rpartition("@")
+    user, colon, _ = login.partition(":")
+    shown = f"{url[:begin]}{user}:***@{host}" if at and colon else url
+    return _PASSWORD_SAID.sub(r"\1***", shown)
+
+
+_PASSWORD_SAID = re.compile(rf"(\b{PASSWORD}=)[^&#]*", re.IGNORECASE)
 
 
 def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
@@ -160,11 +178,12 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
                 return protocol, url
         known = ", ".join(f"{s}://" for p in _protocols() for s in p.schemes)
         raise ConfigurationError(
-            f"camera address {url!r}: unknown scheme {scheme!r}; known are {known}"
+            f"camera address {_masked(url)!r}: unknown scheme {scheme!r}; known are {known}"
         )
     if model is None:
         raise ConfigurationError(
-            f"camera address {url!r} is a bare host: give a URL such as bvs://{url or 'HOST'}, "
+            f"camera address {_masked(url)!r} is a bare host: give a URL such as "
+            f"bvs://{_masked(url) or 'HOST'}, "
             'or a model, such as model="BVS002C"'
         )
     for protocol in _protocols():

@@ -219,7 +219,8 @@ class Supervisor:
             silence = _silence(error, self._settings.liveness_timeout)
             short = asyncio.get_running_loop().time() - silence - made_at < TAKEN_WITHIN
             ordered = session.link.machine.transport is Transport.TCP
-            if again and short and not self._excused and _may_be_taken(error, ordered=ordered):
+            takes = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
+            if again and short and not self._excused and takes:
                 return self._taken(error)
             self._short_lived = self._short_lived + 1 if again and short else 0
             self._excused = restarting

@@ -174,8 +174,8 @@ class Turns:
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""
         talk = self._talk
-        running = talk.runs
         active = await talk.query_loaded(deadline)
+        running = talk.runs
         before = Before(active, running, talk.inbox.expected, talk.wants_running)
         try:
             await talk.ensure(application, deadline)

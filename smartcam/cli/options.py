@@ -33,7 +33,9 @@ __all__ = [
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
-CONNECTS = "Connecting takes the camera from another client: it serves one, and the newcomer wins."
+CONNECTS = (
+    "Connecting takes the camera from another client, where it serves one: the newcomer wins."
+)
 
 
 class _Seconds(click.FloatRange):

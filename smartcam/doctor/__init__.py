@@ -36,7 +36,7 @@ __all__ = ["Exit", "Finding", "Severity", "examine", "summary"]
 NOTICE = Finding(
     check="notice",
     severity="ok",
-    text="connecting takes the camera from another client: it serves one, and the newcomer wins",
+    text="connecting takes the camera from another client, where it serves one: the newcomer wins",
     cure="A program that uses smartcam takes it back by itself.",
 )
 

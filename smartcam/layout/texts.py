@@ -5,49 +5,52 @@ So that every interpreter reads them as it reads a container, in the layout's un
 
 from __future__ import annotations
 
+import math
+import re
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from smartcam.exceptions import InterpretationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from smartcam.layout import Layout
     from smartcam.layout.text import Field
 
 __all__ = ["pack_texts"]
 
-_BOOLS = {"0": 0x00, "1": 0xFF}
+_NUMBER = re.compile(
+    r"(?P<whole>[+-]?[0-9]+)(?:\.0*)?|[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?"
+)
 
 
 def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes:
     """Return the little-endian bytes of a layout whose fields are these texts, in order.
 
-    Numbers are what they are on the wire: in the field's own unit, not in SI.
+    Numbers are what they are on the wire: in the field's own unit, not in SI. In a group that is
+    counted by a field, texts behind the counted records may be anything, or missing.
 
     Args:
-        layout: the fields; a group takes as many records as there are cells for.
+        layout: the fields; ``( ... )*`` and a counted group take as many records as there are
+            cells for.
         cells: the name of each cell and its text; None for one that has none.
 
     Raises:
         InterpretationError: a text is no value of its field, or there are too few or too many.
     """
-    fields = list(_fields(layout, len(cells)))
-    if len(fields) != len(cells):
-        raise InterpretationError(
-            f"{len(cells)} cells came, the layout has {len(fields)} fields: {layout.text}",
-            expected=len(fields),
-            got=len(cells),
-        )
+    fields = _fields(layout, len(cells))
+    used = len(fields)
     parts: list[bytes] = []
     offset = 0
-    for field, (cell, text) in zip(fields, cells, strict=True):
+    for index, (field, (cell, text)) in enumerate(zip(fields, cells, strict=True)):
         try:
-            part = _pack(field, text)
-        except (ValueError, OverflowError, struct.error) as exc:
+            part = _pack(field, text) if index < used else bytes(field.size)
+        except (ValueError, OverflowError) as exc:
             raise InterpretationError(
-                f"{field.label}: cell {cell} holds {text!r:.64}: {exc}",
+                f"{field.label}: cell {cell} holds {text!r:.64}: {exc}"
+                if text is not None
+                else f"{field.label}: cell {cell} has no value",
                 field=field.name,
                 offset=offset,
                 expected=field.type_text,
@@ -55,48 +58,79 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
             ) from exc
         parts.append(part)
         offset += len(part)
+        if index < len(layout.head) and field.name == layout.repeat and text is not None:
+            used = len(layout.head) + _whole(text) * len(layout.fields)
     return b"".join(parts)
 
 
-def _fields(layout: Layout, count: int) -> Iterator[Field]:
-    """Return the field of each cell, where there are ``count`` cells."""
-    yield from layout.head
-    repeat = layout.repeat
-    left = max(0, count - len(layout.head))
-    records = repeat if isinstance(repeat, int) else -(-left // len(layout.fields))
-    for _ in range(1 if repeat is None else records):
-        yield from layout.fields
+def _fields(layout: Layout, count: int) -> Sequence[Field]:
+    """Return the field of each cell, where there are ``count`` cells.
+
+    Raises:
+        InterpretationError: they are not so many.
+    """
+    records = layout.repeat
+    if not isinstance(records, int):
+        left = max(0, count - len(layout.head))
+        records = 1 if records is None else -(-left // len(layout.fields))
+    expected = len(layout.head) + records * len(layout.fields)
+    if expected != count:
+        raise InterpretationError(
+            f"{count} cells came, the layout has {expected} fields: {layout.text}",
+            expected=expected,
+            got=count,
+        )
+    return (*layout.head, *layout.fields * records)
 
 
 def _pack(field: Field, text: str | None) -> bytes:
     """Return one field's bytes.
 
     Raises:
-        ValueError, OverflowError, struct.error: it is no value of the field.
+        ValueError, OverflowError: it is no value of the field.
     """
     if text is None:
         raise ValueError("it has no value")
-    if text.startswith("#ERR"):
-        raise ValueError("its function failed")
     if field.type == "string":
         raw = text.encode()
         if len(raw) > field.size or b"\0" in raw:
-            raise ValueError(f"no text of at most {field.size} bytes in UTF-8")
+            raise ValueError(f"at most {field.size} bytes of UTF-8 were expected")
         return raw.ljust(field.size, b"\0")
-    number: Any = float(text)
     if field.type == "bool":
-        key = f"{number:g}"
-        if key not in _BOOLS:
-            raise ValueError("neither 0 nor 1")
-        number = _BOOLS[key]
-    elif field.wire.is_integer:
         number = _whole(text)
-    return struct.pack("<" + field.wire.code, number)
+        if number not in {0, 1}:
+            raise ValueError("neither 0 nor 1")
+        return b"\xff" if number else b"\0"
+    low, high = field.wire.low, field.wire.high
+    if low is not None and high is not None:
+        number = _whole(text)
+        if not low <= number <= high:
+            raise ValueError(f"{low} to {high} was expected")
+        return struct.pack("<" + field.wire.code, number)
+    return struct.pack("<" + field.wire.code, _real(text))
+
+
+def _real(text: str) -> float:
+    """Return a number.
+
+    Raises:
+        ValueError: it is none, or too large.
+    """
+    if not _NUMBER.fullmatch(text.strip()):
+        raise ValueError("no number")
+    number = float(text)
+    if math.isinf(number):
+        raise ValueError("too large")
+    return number
 
 
 def _whole(text: str) -> int:
-    """Return a whole number, which may be written with decimals that are zeros."""
-    whole, point, decimals = text.strip().partition(".")
-    if point and decimals.strip("0"):
+    """Return a whole number, which may be written with decimals that are zeros.
+
+    Raises:
+        ValueError: it is none.
+    """
+    match = _NUMBER.fullmatch(text.strip())
+    if match is None or match["whole"] is None:
         raise ValueError("no whole number")
-    return int(whole)
+    return int(match["whole"])

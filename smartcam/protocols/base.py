@@ -187,6 +187,11 @@ class Dialect(ABC):
         """
         return False
 
+    @property
+    def exclusive(self) -> bool:
+        """Whether the camera serves one client, and a newcomer takes it."""
+        return True
+
     @abstractmethod
     def code(self, code: int, request: type[Message] | None = None) -> Code:
         """Return what a result code means in the answer to a request."""

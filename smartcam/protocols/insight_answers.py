@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import binascii
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.exceptions import FrameError
 from smartcam.protocols.insight_words import (
-    CHECKSUM_DIGITS,
     ENCODING,
     INFO_LINES,
     AnswerForm,
@@ -22,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["MAX_IMAGE", "Answer", "AnswerReader"]
 
 MAX_IMAGE = 1 << 26
-"""Bytes of an image that are accepted: a camera of 20 million pixels, and then some."""
+"""Bytes of an image that are accepted: 20 million pixels of three bytes, and then some."""
 
 _BMP_MAGIC = b"BM"
 _BMP_SIZE_AT = slice(2, 6)  # of the file, UINT32 little endian
@@ -47,14 +45,22 @@ class AnswerReader:
 
     Args:
         max_length: longest text of an answer that says its length, bytes.
-        on_line: called with each line that came.
+        on_piece: called with each piece that came, and whether a line end stood behind it.
     """
 
-    def __init__(self, *, max_length: int, on_line: Callable[[str], None]) -> None:
-        self.lines: LineReader = LineReader()
+    def __init__(self, *, max_length: int, on_piece: Callable[[str, bool], None]) -> None:
+        self._lines = LineReader()
         self._max_length = max_length
-        self._on_line = on_line
+        self._on_piece = on_piece
         self._reading: Generator[None, None, Answer] | None = None
+
+    def __len__(self) -> int:
+        """Bytes that wait."""
+        return len(self._lines)
+
+    def feed(self, data: bytes) -> None:
+        """Take what came; read until nothing is left to be read, then no more than a line waits."""
+        self._lines.feed(data)
 
     def expect(self, form: AnswerForm) -> None:
         """The next answer has this form."""
@@ -82,10 +88,17 @@ class AnswerReader:
         Raises:
             FrameError: it is too long.
         """
-        line = self.lines.next_line()
+        line = self._lines.next_line()
         if line is not None:
-            self._on_line(line)
+            self._on_piece(line, True)
         return line
+
+    def take_prompt(self, prompt: bytes) -> bool:
+        """Take a prompt, which has no line end, if it is what comes next and all of it is there."""
+        taken = self._lines.take_prompt(prompt)
+        if taken:
+            self._on_piece(prompt.decode(ENCODING), False)
+        return taken
 
     # ------------------------------------------------------------------ forms
 
@@ -115,10 +128,10 @@ class AnswerReader:
         size = _number((yield from self._line()), "a length")
         if not 0 <= size <= self._max_length:
             raise FrameError(f"a text of {size} bytes comes; 0 to {self._max_length} are accepted")
-        while (data := self.lines.take(size)) is None:
+        while (data := self._lines.take(size)) is None:
             yield
         text = data.decode(ENCODING)
-        self._on_line(text)
+        self._on_piece(text, False)
         if end := (yield from self._line()):
             raise FrameError(f"{end[:64]!r} came behind a text of {size} bytes, its end was due")
         return text
@@ -126,23 +139,24 @@ class AnswerReader:
     def _image(self) -> Generator[None, None, bytes]:
         """Read a bitmap; its own header says how long it is, the size may count digits."""
         _number((yield from self._line()), "an image's size")
-        digits: list[bytes] = []
         data = bytearray()
         size = 0
         while not size or len(data) < size:
-            line = (yield from self._line()).encode(ENCODING)
+            line = yield from self._line()
             try:
-                data += binascii.unhexlify(line)
-            except ValueError as exc:
-                raise FrameError(f"{line[:64]!r} is no line of an image: {exc}") from exc
-            digits.append(line)
+                more = bytes.fromhex(line) if line.isalnum() else b""
+            except ValueError:
+                more = b""
+            if not more:
+                raise FrameError(f"{line[:64]!r} came, hexadecimal digits of an image were due")
+            data += more
             if not size and len(data) >= _BMP_SIZE_AT.stop:
                 size = _bitmap_size(data)
         if len(data) > size:
             raise FrameError(f"{len(data)} bytes of a bitmap of {size} bytes came")
         told = yield from self._line()
-        right = checksum(b"".join(digits).upper())
-        if told.strip().upper() != right or len(told.strip()) != CHECKSUM_DIGITS:
+        right = checksum(data.hex().upper().encode(ENCODING))
+        if told.strip().upper() != right:
             raise FrameError(f"the image's checksum is {told[:16]!r}, {right} was expected")
         return bytes(data)
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 __all__ = [
-    "CHECKSUM_DIGITS",
     "COMMANDS",
     "DEFAULT_PORT",
     "ENCODING",
@@ -90,7 +89,8 @@ LAST_ROW = 399
 """Of the spreadsheet, beginning with 0 (manual, published)."""
 
 MAX_CELLS = 1024
-"""Cells that one range may name. A range is of this library: each cell is asked for on its own."""
+"""Cells that a range, or a result, may have; ranges are of this library: each cell is asked for on
+its own, which takes a round trip."""
 
 LAST_JOB_ID = 999
 """Ids of jobs are 0 to this (manual, published)."""
@@ -103,9 +103,6 @@ ERROR_VALUE = "#ERR"
 
 HEX_WIDTH = 80
 """Hexadecimal digits a line of image data (manual, published)."""
-
-CHECKSUM_DIGITS = 4
-"""Hexadecimal digits of a checksum (manual, published)."""
 
 
 class StatusCode(enum.IntEnum):
@@ -336,6 +333,16 @@ COMMANDS: Mapping[str, CommandRow] = {row.mnemonic: row for row in _ROWS}
 """The commands that this library knows, by mnemonic. The camera has more."""
 
 _COMMON_TEXTS = {1: "done", 0: "the camera does not know the command"}
+_GENERAL_TEXTS = {
+    **_COMMON_TEXTS,
+    -1: "the argument is wrong",
+    -2: "not possible",
+    -3: "wrong checksum, or a cell that is read-only",
+    -4: "out of memory, or a value of the wrong type",
+    -5: "accepted, but an operator or an input holds the camera offline",
+    **_NO_ACCESS,
+}
+"""What codes mean where the command is not named."""
 
 
 def code_text(command: str, code: int) -> str:
@@ -346,7 +353,7 @@ def code_text(command: str, code: int) -> str:
         code: the status code.
     """
     row = COMMANDS.get(command[:2].upper())
-    texts = _COMMON_TEXTS if row is None else {**_COMMON_TEXTS, **row.codes}
+    texts = _GENERAL_TEXTS if row is None else {**_COMMON_TEXTS, **row.codes}
     return texts.get(code, "a code that is not documented for this command")
 
 

@@ -205,6 +205,8 @@ async def test_connect_to_something_else_says_what_came() -> None:
         ),
         ("insight://h?cells=a-b", "'a-b' is no name of a cell"),
         ("insight://op:%E2%82%AC@h", "'insight://op:***@h': password: only Latin-1"),
+        ("insight://op:se#cret@h", "'insight://op:***@h' is no URL; in a password each of / ? #"),
+        ("insight://op:cret@h:x", "'insight://op:***@h:x' is no URL"),
         ("insight://op%0A@h", "user: only Latin-1 without line ends can be sent"),
         ("insight://h?dialect=native&quirks=loud", "dialect native has no quirk 'loud'"),
         ("insight://h?dialect=handbook", "insight has no dialect 'handbook'; it has native"),
@@ -215,6 +217,7 @@ def test_url_that_cannot_work_is_refused(url: str, text: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         smartcam.connect(url)
     assert text in str(caught.value)
+    assert "cret" not in f"{caught.value!r} {caught.value.__cause__!r}"
 
 
 def test_url_has_the_telnet_port_by_default() -> None:
