@@ -8,7 +8,7 @@ result. Without it, what comes after a trigger is its result, unless it is known
   after every change: SC manual p. 29, published), so what comes before it drops is older. On TCP
   only, where no status is lost.
 * A trigger that was given up leaves a *debt*; the next trigger settles it first
-  (:meth:`~smartcam.conversation.Conversation.trigger`).
+  (:meth:`~smartcam.triggering.Triggers.trigger`).
 * An inspection that somebody else triggered may still have a result in flight when the camera waits
   again; then :attr:`Attribution.unsettled` asks for a fence before the next trigger.
 """

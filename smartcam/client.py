@@ -12,7 +12,7 @@ import contextlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from smartcam.conversation import Conversation, TriggerRequest, is_ready
+from smartcam.conversation import Conversation, is_ready
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectionClosedError,
@@ -31,6 +31,7 @@ from smartcam.protocols.base import Transport
 from smartcam.settings import CameraOptions, CameraSettings
 from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 from smartcam.supervisor import Supervisor
+from smartcam.triggering import TriggerRequest, Triggers
 from smartcam.turns import Turns
 
 if TYPE_CHECKING:
@@ -107,6 +108,7 @@ class SmartCamera:
         )
         self._inbox.expected = settings.application
         self._talk = Conversation(self._inbox, settings.request_timeout)
+        self._triggers = Triggers(self._talk)
         self._turns = Turns(self._talk, settings.switch_timeout)
         self._supervisor = Supervisor(settings, self._talk, self._turns, self._observers)
 
@@ -467,7 +469,7 @@ class SmartCamera:
         turn = turns.hold(timeout) if application is None else turns.hold_in(application, timeout)
         try:
             async with turn as deadline:
-                return await self._talk.trigger(request, deadline)
+                return await self._triggers.trigger(request, deadline)
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
 

@@ -13,26 +13,17 @@ import asyncio
 import collections
 import contextlib
 import math
-from datetime import UTC, datetime
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from smartcam.alarm import Alarm
-from smartcam.attribution import PendingTrigger
 from smartcam.exceptions import (
-    CameraBusyError,
-    CameraFaultError,
     CommandRejectedError,
     ConfigurationError,
     ConnectionClosedError,
-    InputContainerError,
     LocalProtocolError,
-    NotRunningError,
     RemoteProtocolError,
     ResponseTimeoutError,
     SmartCamError,
-    TriggerTimeoutError,
     UnsupportedError,
-    WrongApplicationError,
 )
 from smartcam.handshake import code_text
 from smartcam.models import Status
@@ -41,16 +32,13 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport, Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
-    from typing import Any
+    from collections.abc import Callable
 
     from smartcam.connection import Link
     from smartcam.inbox import Inbox
-    from smartcam.interpretation import Interpretation
-    from smartcam.models import Result
     from smartcam.protocols.base import Dialect
 
-__all__ = ["Conversation", "TriggerRequest"]
+__all__ = ["Conversation", "is_ready"]
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -60,53 +48,10 @@ TIMER_RESOLUTION = 0.02
 BUSY_PAUSE = 0.02
 """Seconds until a camera that was too busy for a request is asked again."""
 
-_WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
-_SPEAKS_AGAINST = int(
-    Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
-)  # of these Waiting alone is to be set before a trigger
-
-LATE_GRACE = 0.25
-"""Seconds that a late result is waited for before it is made impossible: most are only a little
-late, and stopping and starting an application costs more."""
-
-
-OVERTRIGGERED_GRACE = 1.0
-"""Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set it
-cannot tell that ours was dropped; a camera on which it stays set must not stop the line."""
-
-
-class TriggerRequest(NamedTuple):
-    """What a trigger is to do.
-
-    Attributes:
-        interpretation: how to read its results.
-        input_data: sent right before it, None for none.
-        results: how many results it is to have.
-        wait: wait until the camera takes a trigger; else refuse where it does not.
-    """
-
-    interpretation: Interpretation
-    input_data: bytes | None
-    results: int
-    wait: bool
-
 
 def is_ready(status: Status) -> bool:
     """Running and not BUSY."""
     return Status.RUNNING in status and Status.BUSY not in status
-
-
-def is_stopped(status: Status) -> bool:
-    """Neither Running nor BUSY."""
-    return not status & (Status.RUNNING | Status.BUSY)
-
-
-def takes_trigger(status: Status) -> bool:
-    """The camera waits for a trigger and is not BUSY."""
-    return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
-
-
-_WHY_READY = "; it does not while it inspects, and an application that runs free never does"
 
 
 class Conversation:
@@ -122,42 +67,43 @@ class Conversation:
         self._patience = patience
         self.name: str = inbox.name
         self.link: Link | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self.loop: asyncio.AbstractEventLoop | None = None
         self.wants_running: bool | None = None  # None: neither was asked for
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
-        self._halted_at: int | None = None  # loads by others when a trigger's fence stopped it
+        self.halted_at: int | None = None  # loads by others when a trigger's fence stopped it
         self.unconfirmed: bool = False  # a Start or Stop was sent, its status has not come
-        self._status_in_doubt = False  # over UDP: it may have been lost
-        self._alarm = Alarm(self._expire)
-        self._poll: StatusPoll | None = None  # where the status does not come by itself
-        self._numbered = self._acknowledged = False  # the dialect's triggers
+        self.poll: StatusPoll | None = None  # where the status does not come by itself
+        self.numbered: bool = False  # a trigger may be given a sequence number
+        self.acknowledged: bool = False  # a trigger is answered
+        self.at_end: list[Callable[[], None]] = []  # called when there will be no session any more
 
     def begin(self, link: Link) -> None:
         """A new session: nothing is owed on it, its status is heard."""
         self.link = link
-        self._loop = asyncio.get_running_loop()
+        self.loop = asyncio.get_running_loop()
         self._due.clear()
-        self.unconfirmed = self._status_in_doubt = False
+        self.unconfirmed = False
         self.end_polling()
         dialect = link.machine.dialect
-        self._numbered = dialect.has(m.SetSequenceNumber)
-        self._acknowledged = dialect.has(m.TriggerAnswer)
+        self.numbered = dialect.has(m.SetSequenceNumber)
+        self.acknowledged = dialect.has(m.TriggerAnswer)
         if not dialect.capabilities.status_by_itself:
-            self._poll = StatusPoll(link, self.inbox, self._patience)
-            self.inbox.on_status_wanted = self._poll.wanted
-            self._poll.wanted()
+            self.poll = StatusPoll(link, self.inbox, self._patience)
+            self.inbox.on_status_wanted = self.poll.wanted
+            self.poll.wanted()
 
     def end_polling(self) -> None:
         """The session is over, or none has begun."""
         self.inbox.on_status_wanted = None
-        if self._poll is not None:
-            self._poll.stop()
-            self._poll = None
+        if self.poll is not None:
+            self.poll.stop()
+            self.poll = None
 
     def end(self) -> None:
         """There will be no session any more."""
-        self._alarm.cancel()
+        for end in self.at_end:
+            end()
         self.end_polling()
 
     def require_link(self) -> Link:
@@ -199,12 +145,12 @@ class Conversation:
     @property
     def runs(self) -> bool:
         """Running, or stopped only by a trigger that was interrupted before it started again."""
-        return self._halted or Status.RUNNING in self.status
+        return self.halted or Status.RUNNING in self.status
 
     @property
-    def _halted(self) -> bool:
+    def halted(self) -> bool:
         """A trigger's fence has stopped it and not started it again, nor has anybody loaded it."""
-        return self._halted_at == self.inbox.loads_by_others
+        return self.halted_at == self.inbox.loads_by_others
 
     def deadline(self, timeout: float) -> float:
         """Return the loop time in ``timeout`` seconds.
@@ -214,7 +160,7 @@ class Conversation:
         """
         if not 0 <= timeout < math.inf:
             raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
-        loop = self._loop or asyncio.get_running_loop()  # which is a system call in CPython 3.11
+        loop = self.loop or asyncio.get_running_loop()  # which is a system call in CPython 3.11
         return loop.time() + timeout
 
     # ------------------------------------------------------------------ say and wait
@@ -349,12 +295,18 @@ class Conversation:
         except TimeoutError as exc:
             raise self._unsent(message) from exc
         try:
-            await self._await_owed(key, message, deadline)
+            await self.await_owed(key, message, deadline)
             self.require_link().send(message)
-            self._due[key] = deadline if due is None else due
-            return self.inbox.next_answer(key)
+            return self.expect(key, deadline if due is None else due)
         finally:
             lock.release()
+
+    def expect(
+        self, key: type[m.Message] | int, due: float
+    ) -> asyncio.Future[m.Message | SmartCamError]:
+        """Register for the answer to a request that was just sent; it is owed until ``due``."""
+        self._due[key] = due
+        return self.inbox.next_answer(key)
 
     async def until(
         self,
@@ -379,7 +331,7 @@ class Conversation:
         try:
             if not insist:
                 return await self.inbox.wait_status(predicate, deadline)
-            return await self._wait_status(predicate, deadline)
+            return await self.wait_status(predicate, deadline)
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
@@ -387,31 +339,31 @@ class Conversation:
                 waited=waited,
             ) from exc
 
-    async def _wait_status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
+    async def wait_status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
         """Wait for a status; over UDP, where one may be lost, have it said again half-way.
 
         Raises:
             TimeoutError: at ``deadline``.
         """
-        if not self._ordered and self._poll is None:
+        if not self.ordered and self.poll is None:
             now = asyncio.get_running_loop().time()
             with contextlib.suppress(TimeoutError):
                 return await self.inbox.wait_status(predicate, now + 0.5 * (deadline - now))
-            await self._ask_for_status(deadline)
+            await self.ask_for_status(deadline)
         return await self.inbox.wait_status(predicate, deadline)
 
-    async def _ask_for_status(self, deadline: float) -> None:
+    async def ask_for_status(self, deadline: float) -> None:
         """Have the camera say its status, by Get status where there is that.
 
         Elsewhere Connect brings one (SC manual p. 29, published). A Query goes first: who has lost
         the session must not take it back by this.
         """
         link = self.require_link()
-        if self._poll is not None:
+        if self.poll is not None:
             link.send(m.GetStatus(), answered=False)
             return
         try:
-            await self._fence(deadline)
+            await self.fence(deadline)
             link.send(m.Connect())
         except ResponseTimeoutError:
             pass  # its own time may not be over; liveness sees to the rest
@@ -429,10 +381,10 @@ class Conversation:
         heard = self.inbox.statuses_heard
         while True:  # a datagram may be lost
             self.require_link().send(m.GetStatus(), answered=False)
-            await self._fence(deadline)
+            await self.fence(deadline)
             if self.inbox.statuses_heard != heard:
                 return
-            await self._pause(deadline, "the camera to tell its status")
+            await self.pause(deadline, "the camera to tell its status")
 
     # ------------------------------------------------------------------ run state, application
 
@@ -440,7 +392,7 @@ class Conversation:
         """Enter run mode and wait until the camera reports it."""
         self.require(m.Start)
         self.wants_running = True
-        await self._enter_run_mode(deadline)
+        await self.enter_run_mode(deadline)
 
     async def stop(self, deadline: float) -> None:
         """Leave run mode and wait until the camera reports it."""
@@ -448,15 +400,17 @@ class Conversation:
         self.wants_running = False
         await self._leave_run_mode(deadline)
 
-    async def _enter_run_mode(self, deadline: float) -> None:
+    async def enter_run_mode(self, deadline: float) -> None:
+        """Enter run mode whether it was asked for or not."""
         await self._confirm(m.Start(), is_ready, deadline, "Running and not BUSY after Start")
-        self._halted_at = None
+        self.halted_at = None
 
     async def _leave_run_mode(self, deadline: float) -> None:
-        self._halted_at = None
-        await self._halt(deadline)
+        self.halted_at = None
+        await self.halt(deadline)
 
-    async def _halt(self, deadline: float) -> None:
+    async def halt(self, deadline: float) -> None:
+        """Leave run mode for a moment."""
         await self._confirm(m.Stop(), _is_not_running, deadline, "not Running after Stop")
 
     async def _confirm(
@@ -474,21 +428,21 @@ class Conversation:
         What these two have caused comes before the answer to a Query that was sent after them, or
         is to be asked for.
         """
-        if self._poll is not None:
+        if self.poll is not None:
             await self.refresh_status(deadline)
         else:
-            await self._fence(deadline)
+            await self.fence(deadline)
         self.unconfirmed = False
 
-    async def _fence(self, deadline: float) -> None:
+    async def fence(self, deadline: float) -> None:
         """Have heard everything that the camera said before now.
 
         The deadline may be a trigger's and as short as it likes: it does not cost the link.
         """
-        await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
-        await self.exchange(m.Query(), m.QueryAnswer, deadline, due=self._due_after(deadline))
+        await self.await_owed(m.SwitchAnswer, m.Query(), deadline)
+        await self.exchange(m.Query(), m.QueryAnswer, deadline, due=self.due_after(deadline))
 
-    def _due_after(self, deadline: float) -> float:
+    def due_after(self, deadline: float) -> float:
         """Return until when an answer may come that a trigger waits for, however short that is."""
         return max(deadline, asyncio.get_running_loop().time() + self._patience)
 
@@ -497,7 +451,7 @@ class Conversation:
         if m.QueryAnswer in self.inbox.answers:
             return False
         link = self.require_link()
-        if self._poll is not None:
+        if self.poll is not None:
             link.send(m.GetStatus(), answered=False)  # so that it does not grow old
         link.send(m.Query())
         self._due[m.QueryAnswer] = due
@@ -519,18 +473,19 @@ class Conversation:
         Raises:
             ResponseTimeoutError: no answer, or none but that the camera is busy.
         """
-        await self._await_owed(m.SwitchAnswer, m.Query(), deadline)
+        await self.await_owed(m.SwitchAnswer, m.Query(), deadline)
         while True:
             answer = await self.ask(m.Query(), m.QueryAnswer, deadline)
-            if not self._is_busy(answer):
+            if not self.is_busy(answer):
                 self.check(m.Query, answer)
                 return answer.application
-            await self._pause(deadline, "the busy camera to name its application")
+            await self.pause(deadline, "the busy camera to name its application")
 
-    def _is_busy(self, answer: m.Acknowledgement) -> bool:
+    def is_busy(self, answer: m.Acknowledgement) -> bool:
+        """Whether an answer says that the camera was too busy."""
         return self.dialect.code(answer.code).verdict is Verdict.BUSY
 
-    async def _pause(self, deadline: float, what: str) -> None:
+    async def pause(self, deadline: float, what: str) -> None:
         """Wait a moment before the camera is asked again.
 
         Raises:
@@ -546,7 +501,7 @@ class Conversation:
 
     async def query_loaded(self, deadline: float) -> int:
         """Return the active application; while one is being loaded a Query tells the old one."""
-        if self._poll is not None:
+        if self.poll is not None:
             await self.refresh_status(deadline)  # whether it runs is asked next
         await self.until(_is_not_loading, deadline, "the application to be loaded")
         return await self.query(deadline)
@@ -586,8 +541,8 @@ class Conversation:
             if was_running:
                 await self._leave_run_mode(deadline)
             answer = await self.ask(request, m.SwitchAnswer, deadline)
-            while self._is_busy(answer):
-                await self._pause(deadline, f"the busy camera to load {application}")
+            while self.is_busy(answer):
+                await self.pause(deadline, f"the busy camera to load {application}")
                 answer = await self.ask(request, m.SwitchAnswer, deadline)
             code = answer.code
             told = answer.application in self.dialect.application_ids
@@ -595,7 +550,7 @@ class Conversation:
         done = self.dialect.code(code).verdict is Verdict.DONE
         if not done or (isinstance(application, int) and active != application):
             if was_running and Status.RUNNING not in self.status:
-                await self._enter_run_mode(deadline)
+                await self.enter_run_mode(deadline)
             refusal = (
                 f"the camera refused to switch to application {application}: "
                 f"{code_text(self.dialect, code, type(request))}"
@@ -629,267 +584,14 @@ class Conversation:
             )
         return m.SwitchApplication(application=application)
 
-    # ------------------------------------------------------------------ trigger
-
-    def trigger(
-        self, request: TriggerRequest, deadline: float
-    ) -> Coroutine[Any, Any, list[Result]]:
-        """Wait until the camera takes a trigger, send it, return its results.
-
-        Raises:
-            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
-        """
-        if self._acknowledged:
-            return self._trigger_until_taken(request, deadline)
-        return self._trigger_once(request, deadline)
-
-    async def _trigger_until_taken(self, request: TriggerRequest, deadline: float) -> list[Result]:
-        """Trigger again where the camera says that it was too busy for it."""
-        while True:
-            try:
-                return await self._trigger_once(request, deadline)
-            except CameraBusyError as exc:
-                if not request.wait:
-                    raise
-                try:
-                    await self._pause(deadline, "the camera to take a trigger")
-                except ResponseTimeoutError as timeout:
-                    raise TriggerTimeoutError(f"{timeout}; {exc}") from exc
-
-    async def _trigger_once(self, request: TriggerRequest, deadline: float) -> list[Result]:
-        """Send one trigger as soon as the camera takes it, return its results.
-
-        Raises:
-            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
-        """
-        attribution, loop = self.inbox.attribution, self._loop or asyncio.get_running_loop()
-        if self._poll is not None:
-            await self.refresh_status(deadline)
-        self._raise_fault()
-        if request.input_data is not None and self.inbox.input_in_doubt:
-            raise InputContainerError(
-                f"{self.name}: input data of an earlier trigger, which had no result, may still be "
-                "queued in the camera and would be taken for this one's; switch_application() "
-                "empties the queue"
-            )
-        if self.inbox.expected is not None and self.inbox.active != self.inbox.expected:
-            await self._check_application(deadline)
-        if self._status_in_doubt:
-            await self._ask_for_status(deadline)
-            await self._fence(deadline)  # it has come by then, or is lost again
-            self._status_in_doubt = False
-        interpretation = request.interpretation
-        numbering = interpretation.numbering(self.inbox.active) if self._numbered else None
-        # an older result shows by its number where each container has one
-        decided = numbering is not None and numbering.always
-        if self._halted or (attribution.debt is not None and not decided):
-            await self._settle_debt(deadline, wait=request.wait)
-        if int(self.status) & _SPEAKS_AGAINST != _WAITING:
-            await self._wait_for_trigger(deadline, wait=request.wait)
-        if int(self.status) & _OVERTRIGGERED:
-            await self._clear_overtriggered(deadline)
-            await self._wait_for_trigger(deadline, wait=request.wait)
-        while attribution.unsettled and not decided and self._ordered:
-            await self._settle_others(deadline)
-            await self._wait_for_trigger(deadline, wait=request.wait)
-        pending = PendingTrigger(
-            loop.create_future(),
-            request.interpretation,
-            request.input_data is not None,
-            loop.time(),
-            datetime.now(UTC),
-            wanted=request.results,
-            number=attribution.take_number(numbering.highest) if numbering is not None else None,
-            # where each application has its own interpreter none is read with another's layout
-            application=None if request.interpretation.by_application else self.inbox.active,
-        )
-        return await self._await_results(pending, request.input_data, deadline)
-
-    async def _await_results(
-        self, pending: PendingTrigger, input_data: bytes | None, deadline: float
-    ) -> list[Result]:
-        inbox, outcome, link = self.inbox, pending.outcome, self.require_link()
-        words: list[m.Message] = []
-        if pending.number is not None:
-            words.append(m.SetSequenceNumber(number=pending.number))
-        if self._acknowledged:
-            await self._await_owed(m.TriggerAnswer, m.Trigger(), deadline)
-        if input_data is not None and link.machine.dialect.answers(m.SetInput):
-            due = self._due_after(deadline)
-            await self.command(m.SetInput(data=input_data), deadline, due=due)
-        elif input_data is not None:
-            words.append(m.SetInput(data=input_data))
-        inbox.attribution.send(pending)
-        self._alarm.set(deadline)
-        try:
-            link.send(*words, m.Trigger())
-            if self._acknowledged:
-                self._expect_acknowledgement(pending, deadline)
-            else:
-                inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
-            if self._poll is not None:
-                self._poll.wanted()
-            if not link.writable:
-                with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
-                    async with asyncio.timeout_at(deadline):
-                        await link.drain()
-            return await outcome
-        except TimeoutError as exc:
-            inbox.attribution.give_up(pending)
-            # it may have been stopped: then Waiting did not drop for this trigger
-            self._status_in_doubt = not (self._ordered or pending.dropped_waiting)
-            waited = deadline - pending.sent_at
-            came = f"{len(pending.results)} of {pending.wanted} results"
-            raise TriggerTimeoutError(
-                f"{self.name}: {came if pending.results else 'no result'} within "
-                f"{round(waited, 2):g} s of the trigger; status: {self.status}",
-                waited=waited,
-            ) from exc
-        except asyncio.CancelledError:
-            if not outcome.done() or outcome.cancelled():
-                inbox.attribution.give_up(pending)
-            else:
-                outcome.exception()  # nobody will look at it
-            raise
-        finally:
-            self._alarm.clear()
-            inbox.attribution.pending = None
-
-    def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
-        """Have the trigger end at once where the camera says that it took none."""
-
-        def on_answer(answer: asyncio.Future[m.Message | SmartCamError]) -> None:
-            got = answer.result()
-            if isinstance(got, SmartCamError) or pending.outcome.done():
-                return
-            try:
-                self.check(m.Trigger, got)
-            except (CommandRejectedError, UnsupportedError) as exc:
-                busy = isinstance(got, m.Acknowledgement) and self._is_busy(got)
-                if not self._ordered:  # it may be the answer to an earlier one
-                    self.inbox.attribution.give_up(pending)
-                pending.outcome.set_exception(CameraBusyError(str(exc)) if busy else exc)
-            except SmartCamError as exc:  # the link is over
-                pending.outcome.set_exception(exc)
-
-        self._due[m.TriggerAnswer] = self._due_after(deadline)
-        self.inbox.next_answer(m.TriggerAnswer).add_done_callback(on_answer)
-
-    def _expire(self) -> None:
-        """The trigger's deadline: from this moment on its result is late."""
-        pending = self.inbox.attribution.pending
-        if pending is not None and not pending.outcome.done():
-            self.inbox.attribution.give_up(pending)
-            pending.outcome.set_exception(TimeoutError())
-
-    async def _check_application(self, deadline: float) -> None:
-        """See to it that the application that was named is the active one.
-
-        Raises:
-            WrongApplicationError: somebody else has switched; nothing was sent but a Query.
-        """
-        inbox = self.inbox
-        await self._fence(deadline)  # what is known may be old
-        if inbox.active != inbox.expected:
-            raise WrongApplicationError(
-                f"{self.name}: application {inbox.active} is active, somebody else has switched; "
-                f"{inbox.expected} was expected",
-                expected=inbox.expected,
-                got=inbox.active,
-            )
-
-    async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
-        """Wait until the camera takes a trigger, or say why it never will."""
-        begin = asyncio.get_running_loop().time()
-        while True:
-            self._raise_fault()
-            status = self.status
-            if takes_trigger(status):
-                return
-            if is_stopped(status):
-                raise NotRunningError(
-                    f"{self.name}: application {self.inbox.active} is stopped: start it, or name "
-                    f"it so that it is started; status: {status}"
-                )
-            if not wait:
-                raise CameraBusyError(
-                    f"{self.name}: the camera does not wait for a trigger: {status}"
-                )
-            try:
-                await self._wait_status(_is_decided, deadline)
-            except TimeoutError as exc:
-                free = _WHY_READY if is_ready(status) else ""
-                waited = max(0.0, deadline - begin)
-                raise TriggerTimeoutError(
-                    f"{self.name}: the camera did not wait for a trigger within "
-                    f"{round(waited, 2):g} s; status: {self.status}{free}",
-                    waited=waited,
-                ) from exc
-
-    def _raise_fault(self) -> None:
-        if Status.SYSTEM_ERROR in self.status:
-            raise CameraFaultError(f"{self.name}: the camera reports System Error")
-
     @property
-    def _ordered(self) -> bool:
+    def ordered(self) -> bool:
+        """Whether messages come in order and none is lost."""
         return self.require_link().machine.transport is Transport.TCP
-
-    async def _settle_debt(self, deadline: float, *, wait: bool) -> None:
-        """Await the result of an earlier trigger, or make it impossible.
-
-        Stop voids the inspection under way, a Query is the fence: what comes before its answer
-        came from before. Without a Stop the inspection's end is awaited: the camera waits for a
-        trigger again. A camera that does one thing after the other needs the fence only.
-        Source: that Stop voids the inspection is inferred.
-        """
-        if self.dialect.in_order or not self.dialect.has(m.Stop):
-            await self._wait_for_trigger(deadline, wait=wait)
-            await self._fence(deadline)
-            self.inbox.attribution.settled()
-            return
-        attribution, now = self.inbox.attribution, asyncio.get_running_loop().time()
-        if not self._halted and Status.RUNNING in self.status:
-            grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
-            with contextlib.suppress(TimeoutError):
-                await self.inbox.wait_status(_is_decided, grace)
-            if attribution.debt is None:
-                return
-        if self.runs:
-            # interrupted here, the next trigger does all of it again
-            self._halted_at = self.inbox.loads_by_others
-            await self._halt(deadline)
-            await self._fence(deadline)
-            await self._enter_run_mode(deadline)
-        attribution.settled()
-
-    async def _clear_overtriggered(self, deadline: float) -> None:
-        """Reset Overtriggered, or wait a moment for it to fall: only then can it rise for ours.
-
-        Source: it falls by itself (SC manual p. 30, published), when is unknown; on BVS ID it stays
-        until it is reset (BVS ID guide p. 227, published).
-        """
-        if self.dialect.has(m.ResetErrors):
-            await self.command(m.ResetErrors(), deadline, due=self._due_after(deadline))
-            await self.refresh_status(deadline)
-            return
-        now = asyncio.get_running_loop().time()
-        grace = now + min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))
-        with contextlib.suppress(TimeoutError):
-            await self.inbox.wait_status(_is_not_overtriggered, grace)
-
-    async def _settle_others(self, deadline: float) -> None:
-        """Have heard the result of an inspection that somebody else triggered."""
-        attribution = self.inbox.attribution
-        attribution.unsettled = False  # the next one may begin meanwhile
-        try:
-            await self._fence(deadline)
-        except BaseException:
-            attribution.unsettled = True
-            raise
 
     # ------------------------------------------------------------------ answers
 
-    async def _await_owed(
+    async def await_owed(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
     ) -> None:
         """Wait for the answer to an earlier request, which is dropped.
@@ -940,17 +642,9 @@ def _never(_: Status) -> bool:
     return False
 
 
-def _is_not_overtriggered(status: Status) -> bool:
-    return Status.OVERTRIGGERED not in status
-
-
 def _is_not_loading(status: Status) -> bool:
     return not status.loading
 
 
 def _is_not_running(status: Status) -> bool:
     return Status.RUNNING not in status
-
-
-def _is_decided(status: Status) -> bool:
-    return takes_trigger(status) or is_stopped(status) or Status.SYSTEM_ERROR in status

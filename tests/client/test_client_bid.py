@@ -535,7 +535,7 @@ async def test_bid_status_is_asked_for_only_while_somebody_wants_it() -> None:
     async with bid_by_hand() as (box, camera):
         with pytest.raises(ResponseTimeoutError):
             await camera.wait_status(lambda _: False, timeout=2 * SHORT)
-        poll: Any = camera._talk._poll
+        poll: Any = camera._talk.poll
         await until(lambda: poll._timer is None)
         statuses = camera.statuses()
         assert poll._timer is not None

@@ -445,7 +445,7 @@ async def test_bursts_of_many_reads_all_come_in_order() -> None:
 
 def at_the_deadline(camera: SmartCamera, then: Callable[[], object]) -> None:
     """Have something happen in the same turn of the loop, right behind the trigger's deadline."""
-    alarm = camera._talk._alarm
+    alarm = camera._triggers._alarm
     expire = alarm._callback
 
     def both() -> None:
@@ -483,7 +483,7 @@ async def test_deadline_and_cancellation_in_one_turn_of_the_loop_are_one_end(fir
         box.script[TRIGGER] = lambda _: b""
         triggering = asyncio.create_task(camera.trigger(timeout=60))
         await box.wait_for(TRIGGER)
-        expire = camera._talk._expire
+        expire = camera._triggers._expire
         if first == "deadline":
             expire()
         if first == "result":
@@ -523,7 +523,7 @@ async def test_deadline_then_cancellation_of_a_trigger_that_is_stuck_are_one_end
         triggering = asyncio.create_task(camera.trigger(input=bytes(1 << 25), timeout=60))
         await until(lambda: camera._inbox.attribution.pending)
         await steps(3)
-        camera._talk._expire()
+        camera._triggers._expire()
         await steps(1)
         await cancelled(triggering)
         del triggering
@@ -536,6 +536,6 @@ async def test_closed_client_leaves_no_timer_of_a_trigger() -> None:
     async with by_hand() as (_, camera):
         await camera.trigger(timeout=60)
         await camera.trigger(timeout=90)
-        alarm = camera._talk._alarm
+        alarm = camera._triggers._alarm
         assert alarm._timer is not None
     assert alarm._timer is None
