@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import construct as c
 
 from smartcam.exceptions import MessageError, hex_excerpt
+from smartcam.protocols.base import Verdict
 from smartcam.protocols.messages import Wire
 
 if TYPE_CHECKING:
@@ -58,6 +59,11 @@ def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
         for row in dialect.table
         if row.type.sender is sender
     }
+    good = [code for code, (_, verdict) in dialect.codes.items() if verdict is Verdict.DONE]
+    refusal = c.Struct("code" / c.RawCopy(c.NoneOf(integer[dialect.word], good)), c.Terminated)
+    for row in dialect.table:
+        if row.type.sender is sender and dialect.encoder(row.type).may_be_a_code:
+            bodies[row.message_id] = c.Select(bodies[row.message_id], refusal)
     header = dialect.header
     size = c.this.length.value - header.length_includes
     names = ("length", "message_id") if header.order == "length, id" else ("message_id", "length")

@@ -163,6 +163,11 @@ class Codec:
             if one.name not in on_the_wire
         ]
 
+    @property
+    def may_be_a_code(self) -> bool:
+        """Whether a result code that refuses may come alone."""
+        return self._code is not None and self._code.size < self.size
+
     def fits(self, size: int) -> bool:
         """Whether a body has the documented length."""
         return size >= self.size if self.has_data else size == self.size
