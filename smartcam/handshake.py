@@ -26,7 +26,7 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.protocols.base import Dialect, Protocol, Transport, Verdict
+from smartcam.protocols.base import UNDOCUMENTED, Dialect, Protocol, Transport, Verdict
 from smartcam.protocols.machine import LinkEnded, LinkFailed
 from smartcam.protocols.messages import (
     Connect,
@@ -151,11 +151,13 @@ class _Collector:
         for event in chunk.events:
             match event:
                 case ConnectAnswer(code=code, version=version):
-                    if dialect.code(code).verdict is not Verdict.DONE:
-                        raise CommandRejectedError(
-                            f"the camera refused the session: {code_text(dialect, code, Connect)}",
-                            code=code,
-                        )
+                    meaning = dialect.code(code, Connect)
+                    if meaning.verdict is not Verdict.DONE:
+                        said = "the camera refused the session: "
+                        said += code_text(dialect, code, Connect)
+                        if meaning.verdict is Verdict.BUSY or meaning is UNDOCUMENTED:
+                            raise RemoteProtocolError(said)  # it may not say so again
+                        raise CommandRejectedError(said, code=code)
                     if version < 1:
                         raise RemoteProtocolError(f"the camera speaks protocol version {version}")
                     self.version = version

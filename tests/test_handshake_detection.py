@@ -225,16 +225,25 @@ async def test_establish_camera_that_answers_connect_only_is_named_and_no_other_
     assert step in second
 
 
-async def test_establish_refused_code_is_named(transport: Any) -> None:
-    refused = bytes.fromhex("01000400 1600 0100")
+@pytest.mark.parametrize(
+    ("code", "meaning", "attempts"),
+    [
+        ("1000", "0x10 (NOK Error: transfer or execution failed, e.g. wrong format or length)", 1),
+        ("1600", "0x16 (NOK Busy: Ready status is not set)", 2),  # it may not be busy next time
+        ("5500", "0x55 (not documented)", 2),
+    ],
+)
+async def test_establish_refused_code_is_named_and_final_where_it_is_a_refusal(
+    transport: Any, code: str, meaning: str, attempts: int
+) -> None:
+    refused = bytes.fromhex(f"01000400 {code} 0100")
     answer = table(connect=[refused], status=[BID_STATUS], query=[CODED_ACTIVE])
     async with talks(transport, answer) as camera:
         with pytest.raises(ConnectFailedError) as caught:
-            await establish(settings(camera.port, transport, "?dialect=bid", connect_attempts=1))
-    assert "the camera refused the session: code 0x16 (NOK Busy: Ready status is not set)" in str(
-        caught.value
-    )
-    assert isinstance(caught.value.__cause__, CommandRejectedError)
+            await establish(settings(camera.port, transport, "?dialect=bid", connect_attempts=2))
+    assert f"the camera refused the session: code {meaning}" in str(caught.value)
+    assert len(caught.value.attempts) == attempts
+    assert isinstance(caught.value.__cause__, CommandRejectedError) is (attempts == 1)
 
 
 # ---------------------------------------------------------------------- garbage, and time

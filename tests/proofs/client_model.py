@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from smartcam.emulator.traffic import LogEntry
+    from smartcam.emulator.traffic import Log, LogEntry
 
 __all__ = ["CameraModel", "Program", "Run", "TimedLoop"]
 
@@ -110,12 +108,14 @@ class CameraModel:
 
     Sources: bvs.md 2.4, 2.5 (published); 8.9 (decided): Stop and a switch void the inspection under
     way, a trigger while one is under way is dropped, a switch while running is refused, a reboot
-    comes up stopped with number 0.
+    comes up stopped with number 0. One that always runs (``bid``; 5.2, published, and 8.9): it is
+    switched while it runs, and runs when it has loaded an application or come up.
     """
 
     programs: dict[int, Program]
     active: int
     reboot_time: float
+    always_runs: bool = False
     mode: Literal["stopped", "running", "switching", "rebooting"] = "stopped"
     faulty: bool = False
     next_number: int = 0
@@ -129,7 +129,6 @@ class CameraModel:
     _target: tuple[int, bool] = (0, False)
     _free_since: float = 0.0
     _free_count: int = 0
-    _read: int = 0
 
     @property
     def program(self) -> Program:
@@ -138,16 +137,16 @@ class CameraModel:
 
     # ------------------------------------------------------------------ what happened
 
-    def read(self, log: Iterable[LogEntry]) -> None:
-        """Take what was said since the last call; ``log`` is all of it, from the beginning."""
-        entries = list(log)
-        for entry in entries[self._read :]:
+    def read(self, log: Log) -> None:
+        """Take what was said out of a camera's log."""
+        assert len(log) < (log.maxlen or 0), "something may have gone by"
+        while log:
+            entry = log.popleft()
             self.advance(entry.time)
             if entry.direction == "in":
                 self._hear(entry)
             elif isinstance(entry.message, m.ResultContainer):
                 self._note_result(entry)
-        self._read = len(entries)
 
     def advance(self, now: float) -> None:
         """Let everything happen that is due until ``now``."""
@@ -231,12 +230,18 @@ class CameraModel:
             case m.Stop():
                 self.stop(now)
             case m.SwitchApplication(application=application):
-                if self.mode == "stopped" and application in self.programs:
+                if self._takes_switch and application in self.programs:
                     self.switch(now, application)
             case m.Reboot():
                 self.reboot(now)
             case _:
                 pass
+
+    @property
+    def _takes_switch(self) -> bool:
+        if self.always_runs:
+            return self.mode == "running" and not self.faulty
+        return self.mode == "stopped"
 
     def _note_result(self, entry: LogEntry) -> None:
         container = entry.message
@@ -281,9 +286,9 @@ class CameraModel:
 
     def _come_up(self, now: float) -> None:
         if self.mode == "rebooting":
-            self.mode, self.faulty, self.next_number = "stopped", False, 0
-            return
-        self.active, running = self._target
+            self.faulty, self.next_number, running = False, 0, False
+        else:
+            self.active, running = self._target
         self.mode = "stopped"
-        if running:
+        if running or self.always_runs:
             self.start(now)

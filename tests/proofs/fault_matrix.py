@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 from matrix_camera import device_cells, frame_cells, request_cells
 from matrix_cells import datagram_cells, link_cells, places
-from matrix_ops import OPS, TRIGGER_OUTCOMES, prepare
+from matrix_ops import OPS, TRIGGER_OUTCOMES, ends_of, ops_of, prepare
 from matrix_process import PROCESS_OPS, SIGNALS, ProcessCamera, process_bench, process_cells
 from matrix_world import Bench, Probe, World, bench, caring_for_tasks, come_true
 
@@ -76,30 +76,38 @@ MISLED = tuple(
 )
 """What a trigger may end with whose client was told wrong of the camera's state."""
 
-TCP = tuple(World(d, "tcp", n) for d in ("handbook", "thesis") for n in (True, False))
-UDP = tuple(World(d, "udp", True) for d in ("handbook", "thesis"))
-"""Worlds. Over UDP a result without a number is best effort, so there is nothing to prove."""
+NUMBERED = ("handbook", "thesis", "b16")
+TCP = (*(World(d, "tcp", n) for d in NUMBERED for n in (True, False)), World("bid", "tcp", False))
+UDP = (*(World(d, "udp", True) for d in NUMBERED), World("bid", "udp", False))
+"""Worlds. Over UDP a result without a number is best effort, so there is nothing to prove of it;
+``bid`` has no numbers, and there all else is proved."""
 
-BOTH = (TCP[0], TCP[3])
-"""Each dialect, with a number and without: enough for what has nothing to do with results."""
+ONCE = (TCP[0], TCP[3], TCP[4], TCP[6])
+"""Each dialect, some with a number and some without: enough for what has nothing to do with
+results."""
+
+AWAY_ONCE = frozenset({TCP[1], TCP[2], TCP[5]})
+"""Worlds whose way to another application is taken in another world of the same dialect."""
 
 
 async def cells() -> list[Cell]:
     """Return every cell, in a fixed order."""
     made: list[Cell] = []
     for world in (*TCP, *UDP):
-        for name, op in OPS.items():
-            if world.transport == "tcp" and not op.triggers and world not in BOTH:
+        for name, op in ops_of(world).items():
+            if world.transport == "tcp" and not op.triggers and world not in ONCE:
                 continue
             found = await places(world, name)
             link = link_cells if world.transport == "tcp" else datagram_cells
             made += link(world, name, found)
-            if name == "visit" or (name == "elsewhere" and world in {TCP[1], TCP[2]}):
+            if name == "visit" or (name == "elsewhere" and world in AWAY_ONCE):
                 continue  # the same messages as others have
             for family in (frame_cells, request_cells, device_cells):
                 made += family(world, name, found)
-    for world in (TCP[0], TCP[2]):
+    for world in (TCP[0], TCP[2], TCP[4], TCP[6]):
         for name in PROCESS_OPS if SIGNALS else ():
+            if name not in ops_of(world):
+                continue
             made += process_cells(world, name, await places(world, name))
     return made
 
@@ -190,10 +198,13 @@ class Judge:
         self.verdict.outcome = "value" if error is None else type(error).__name__
         if error is not None:
             self._told = True
-            self._allow(error, (*self.fault.allowed, *self.fault.repairs), self.op.ends)
+            self._allow(error, (*self.fault.allowed, *self.fault.repairs), self._ends())
             if self.fault.at_once is not None:
                 self._in_time(begun, self.fault.at_once)
         return error
+
+    def _ends(self, name: str = "") -> tuple[type[BaseException], ...]:
+        return ends_of(name or self.cell.op, self.cell.world)
 
     def _allow(
         self,
@@ -228,7 +239,7 @@ class Judge:
             await self._working()
         except e.SmartCamError as error:
             self.verdict.tries[type(error).__name__] += 1
-            self._allow(error, MISLED, OPS["trigger"].ends)
+            self._allow(error, MISLED, self._ends("trigger"))
             return False
         return True
 
@@ -241,7 +252,7 @@ class Judge:
                 break
             except e.SmartCamError as error:
                 self.verdict.tries[f"open: {type(error).__name__}"] += 1
-                self._allow(error, self.fault.allowed, OPS["open"].ends)
+                self._allow(error, self.fault.allowed, self._ends("open"))
                 await asyncio.sleep(0.01)
         while self._loop.time() < end:
             try:
@@ -275,7 +286,7 @@ class Judge:
         repairs += self.op.mends if self._told and self.fault.at_once is None else ()
         self._told = True
         if type(error) not in repairs:
-            self._allow(error, self.fault.allowed, OPS["trigger"].ends)
+            self._allow(error, self.fault.allowed, self._ends("trigger"))
             return
         camera, bench = self.bench.camera, self.bench
         try:
@@ -429,6 +440,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sample", type=int, default=1, metavar="K", help="every K-th cell")
     parser.add_argument("--family", default="", help="cells whose family begins so")
+    parser.add_argument("--world", default="", help="cells whose world's name contains this")
     parser.add_argument("--only", metavar="NAME", help="one cell, with its log")
     parser.add_argument("--jobs", type=int, default=JOBS, help="cells at once")
     parser.add_argument("--show", type=int, default=10, help="failures told in full")
@@ -442,6 +454,7 @@ async def _main(options: argparse.Namespace) -> int:
     if me is not None and sys.platform != "win32":  # so that cameras that are processes end, too
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, me.cancel)
     chosen = [cell for cell in await cells() if cell.family.startswith(options.family)]
+    chosen = [cell for cell in chosen if options.world in str(cell.world)]
     chosen = sample(chosen, options.sample)
     if options.only:
         chosen = [cell for cell in chosen if cell.name == options.only]

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from matrix_cells import AT_ONCE, LOST, NONE, SILENT, TWICE, Cell, Fault, Place
-from matrix_ops import OPS, TRIGGER_OUTCOMES
+from matrix_ops import OPS, REFUSED, TRIGGER_OUTCOMES
 from matrix_world import AWAY, HOME, PATIENT, SHORT, STRAY
 
 from smartcam import exceptions as e
 from smartcam.emulator import faults as f
 from smartcam.models import Status
+from smartcam.protocols.bvs import ResultCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -29,17 +30,31 @@ GARBAGE = bytes.fromhex("000102 80feff 0d")
 MAX_LENGTH = 1 << 20
 """The client's limit, by default."""
 
-HEADER = 12
-LENGTH_AT, ID_AT = 4, 8
-"""Size of a header, and where the length and the id stand in it, in both dialects."""
+MISTAKES = (
+    ResultCode.ERROR,
+    ResultCode.INVALID_COMMAND,
+    ResultCode.BUSY,
+    ResultCode.INSPECTION_ERROR,
+    0x55,
+)
+"""Codes that say that something was not done; the last one has no meaning."""
 
 ANSWERS: Mapping[str, Mapping[str, int | str]] = {
     "ConnectAnswer": {"version": 1},
     "QueryAnswer": {"application": AWAY},
     "SwitchAnswer": {"code": 0, "application": AWAY},
     "ClockAnswer": {"year": 1999, "month": 1, "day": 1, "hour": 1, "minute": 1, "second": 1},
+    "TriggerAnswer": {},
+    "SetClockAnswer": {},
+    "SetInputAnswer": {},
+    "ResetErrorsAnswer": {},
+    "DisconnectAnswer": {},
 }
-"""Answers, with what would be wrong values."""
+"""Answers, with what would be wrong values; codes say that all is well."""
+
+LIES = frozenset({"QueryAnswer", "ClockAnswer"})
+"""Those that are believed if they come while their request is open: nothing tells them from the
+true one, which comes behind them."""
 
 
 def by_camera(given: Sequence[f.Fault], allowed: Errors = SILENT, **more: Any) -> Fault:
@@ -58,14 +73,32 @@ def by_camera(given: Sequence[f.Fault], allowed: Errors = SILENT, **more: Any) -
 # ---------------------------------------------------------------------- frames
 
 
-def _length(place: Place, change: int | None, value: int | None = None) -> list[f.Fault]:
+def _length(
+    world: World, place: Place, change: int | None, value: int | None = None
+) -> list[f.Fault]:
     """Return what writes another length into a frame's header."""
-    now = int.from_bytes(place.frame.wire[LENGTH_AT:ID_AT], "little")
-    length = (value if value is not None else now + (change or 0)).to_bytes(4, "little")
+    at, size = _length_at(world), world.word
+    length = value if value is not None else _told(world, place) + (change or 0)
     return [
-        f.Corrupt(**_on(place), offset=LENGTH_AT + index, value=byte)
-        for index, byte in enumerate(length)
+        f.Corrupt(**_on(place), offset=at + index, value=byte)
+        for index, byte in enumerate(length.to_bytes(size, "little"))
     ]
+
+
+def _told(world: World, place: Place) -> int:
+    """Return the length that a frame's header tells."""
+    at = _length_at(world)
+    return int.from_bytes(place.frame.wire[at : at + world.word], "little")
+
+
+def _length_at(world: World) -> int:
+    header = world.spoken.header
+    return len(header.magic) + (world.word if header.id_first else 0)
+
+
+def _id_at(world: World) -> int:
+    header = world.spoken.header
+    return len(header.magic) + (0 if header.id_first else world.word)
 
 
 def _on(place: Place) -> dict[str, Any]:
@@ -92,38 +125,46 @@ class _Mangling(NamedTuple):
     garbled: bool = False
 
 
-def _broken(place: Place) -> Iterator[_Mangling]:
+def _broken(world: World, place: Place) -> Iterator[_Mangling]:
     """Frames that are none, or not the one they say they are."""
-    on = _on(place)
+    on, header, word = _on(place), world.header, world.word
     container = place.frame.message == "ResultContainer"
-    over = MAX_LENGTH + 1 + (place.size - HEADER < _told(place)) * 4
     unread = UNREAD if container else NONE
-    any_error: dict[str, Any] = {"allowed": (*TRIGGER_OUTCOMES, *SILENT, *DENIED), "garbled": True}
-    for offset in range(4):
+    any_error: dict[str, Any] = {
+        "allowed": (*TRIGGER_OUTCOMES, *SILENT, *DENIED),
+        "garbled": True,
+    }
+    # without a magic number a wrong length shows by nothing but what is missing afterwards, and
+    # what is read instead may refuse the session
+    shown = {} if world.has_magic else any_error
+    any_error["allowed"] += () if world.has_magic else (e.ConnectFailedError,)
+    for offset in range(len(world.spoken.header.magic)):
         yield _Mangling(f"magic {offset}", [f.Corrupt(**on, offset=offset, xor=0x20)])
-    for change in (-4, -1, 1, 4, 100):
-        yield _Mangling(f"length {change:+}", _length(place, change), **any_error)
-    for value, name in ((0, "0"), (0xFFFFFFFF, "bomb"), (over, "over the limit")):
-        yield _Mangling(f"length {name}", _length(place, None, value))
-    yield _Mangling("unknown id", [f.Corrupt(**on, offset=ID_AT, value=UNKNOWN_ID)])
-    short = f.Truncate(**on, keep=place.size - 4, then="continue")
-    yield _Mangling("short body", [short, *_length(place, -4)], (*SILENT, *unread))
-    longer = f.Insert(**on, data=bytes(4), where="after")
-    yield _Mangling("long body", [*_length(place, 4), longer], unread, harmless=True)
-    for keep in (1, HEADER - 1, HEADER, place.size - 1):
+    for change in (-word, -1, 1, word, 100):
+        yield _Mangling(f"length {change:+}", _length(world, place, change), **any_error)
+    lengths = {"0": 0, "bomb": (1 << 8 * word) - 1}
+    if world.has_magic:
+        lengths["over the limit"] = MAX_LENGTH + 1 + (place.size - header < _told(world, place)) * 4
+    for name, value in lengths.items():
+        yield _Mangling(f"length {name}", _length(world, place, None, value), **shown)
+    yield _Mangling("unknown id", [f.Corrupt(**on, offset=_id_at(world), value=UNKNOWN_ID)])
+    short = f.Truncate(**on, keep=place.size - word, then="continue")
+    yield _Mangling("short body", [short, *_length(world, place, -word)], (*SILENT, *unread))
+    longer = f.Insert(**on, data=bytes(word), where="after")
+    # four bytes are the answer to Connect of b16 with the quirk "code", and say no
+    taken = place.frame.message == "ConnectAnswer" and not world.has_magic
+    allowed: Errors = (*unread, e.ConnectFailedError) if taken else unread
+    yield _Mangling("long body", [*_length(world, place, word), longer], allowed, harmless=True)
+    for keep in (1, header - 1, header, place.size - 1):
         cut = f.Truncate(**on, keep=keep, then="continue")
         yield _Mangling(f"only {keep} bytes", [cut], **any_error)
     for where in ("before", "after"):
-        for name, data in (("garbage", GARBAGE), ("half a frame", place.frame.wire[:HEADER])):
+        for name, data in (("garbage", GARBAGE), ("half a frame", place.frame.wire[:header])):
             noise = f.Insert(**on, data=data, where=where)
             yield _Mangling(f"{name} {where}", [noise], **any_error)
 
 
-def _told(place: Place) -> int:
-    return int.from_bytes(place.frame.wire[LENGTH_AT:ID_AT], "little")
-
-
-def _wrong_words(place: Place) -> Iterator[_Mangling]:
+def _wrong_words(world: World, place: Place) -> Iterator[_Mangling]:
     """Whole frames that should not come, or not now."""
     on = _on(place)
     name = place.frame.message
@@ -132,27 +173,52 @@ def _wrong_words(place: Place) -> Iterator[_Mangling]:
     yield _Mangling("twice", [twice], NONE, harmless=True, copies=2)
     yield _Mangling("soon", [f.Delay(**on, seconds=0.02)], NONE, harmless=True)
     yield _Mangling("late", [f.Delay(**on, seconds=0.25)])
-    for other, fields in ANSWERS.items():
+    for other, fields in _answers_of(world).items():
         if other != name:
             wrong = f.Insert(**on, message=other, fields=dict(fields), where="instead")
             # while a switch is open, a SwitchAnswer is an answer to it, and not the right one
             answers = other == "SwitchAnswer"
             denied = (*SILENT, *DENIED) if answers else SILENT
-            yield _Mangling(f"{other} instead", [wrong], denied)
+            lie = other in LIES and other in place.owed
+            denied = (*denied, *DENIED, e.WrongApplicationError) if lie else denied
+            yield _Mangling(f"{other} instead", [wrong], denied, garbled=lie)
             for where in ("before", "after"):
                 more = f.Insert(**on, message=other, fields=dict(fields), where=where)
-                allowed = denied if answers else NONE
-                yield _Mangling(f"{other} {where}", [more], allowed, harmless=not answers)
-    yield from _stray_statuses(place)
+                allowed = denied if answers or lie else NONE
+                harmless = not (answers or lie)
+                yield _Mangling(f"{other} {where}", [more], allowed, harmless, garbled=lie)
+    yield from _refusals(world, place)
+    yield from _stray_statuses(world, place)
     yield from _stray_containers(place)
 
 
-def _stray_statuses(place: Place) -> Iterator[_Mangling]:
-    on = _on(place)
+def _answers_of(world: World) -> dict[str, Mapping[str, int | str]]:
+    spoken = world.spoken
+    return {name: one for name, one in ANSWERS.items() if spoken.has(f.MESSAGE_NAMES[name])}
+
+
+def _refusals(world: World, place: Place) -> Iterator[_Mangling]:
+    """Answers that say that nothing was done, where there are codes for that."""
+    name = place.frame.message
+    fields = ANSWERS.get(name)
+    if fields is None or not world.spoken.capabilities.result_codes:
+        return
+    for code in MISTAKES:
+        no = f.Insert(
+            **_on(place), message=name, fields={**fields, "code": int(code)}, where="instead"
+        )
+        allowed = (*SILENT, *REFUSED)
+        allowed += (e.ConnectFailedError,) if name == "ConnectAnswer" else ()
+        yield _Mangling(f"code {code:#04x}", [no], allowed, garbled=name in LIES)
+
+
+def _stray_statuses(world: World, place: Place) -> Iterator[_Mangling]:
+    on, header = _on(place), world.header
     # what is said is true, but need not be said
     after = place.status
     if place.frame.message == "StatusReport":
-        after = Status(int.from_bytes(place.frame.wire[HEADER : HEADER + 4], "little"))
+        told = int.from_bytes(place.frame.wire[header : header + world.word], "little")
+        after = world.spoken.status_bits.read(told)
     where: Literal["before", "after", "instead"]
     for where, status in (("before", place.status), ("after", after), ("instead", place.status)):
         for name, bits in (("status", status), ("warm status", status | Status.OVERHEAT)):
@@ -190,7 +256,8 @@ def frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cel
     for place in found:
         if place.way == "up":
             continue
-        for family, manglings in (("frame", _broken(place)), ("word", _wrong_words(place))):
+        families = {"frame": _broken(world, place), "word": _wrong_words(world, place)}
+        for family, manglings in families.items():
             for one in manglings:
                 if one.name in {"soon", "late"} and world.transport == "udp":
                     continue  # there others overtake it: the cells of the link have it
@@ -205,6 +272,7 @@ def frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cel
                     strays=one.strays and not world.numbered,
                     garbled=one.garbled,
                     blind=world.transport == "tcp"
+                    and not world.is_asked
                     and (one.garbled or (status and one.name in WITHHELD)),
                 )
                 yield Cell(
@@ -215,6 +283,8 @@ def frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cel
 def request_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cell]:
     """Give what can become of what the client says before the camera hears it."""
     udp = world.transport == "udp"
+    coded = world.spoken.capabilities.result_codes
+    wrong_length = (*SILENT, *DENIED) if coded else SILENT
     for place in found:
         if place.way == "down":
             continue
@@ -225,13 +295,18 @@ def request_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[C
             # a datagram alone is late, and others overtake it
             "soon": ([f.Delay(**on, seconds=0.02)], SILENT if udp else NONE, not udp),
             "late": ([f.Delay(**on, seconds=0.25)], SILENT, False),
-            "magic": ([f.Corrupt(**on, offset=1, xor=0x20)], SILENT, False),
-            "unknown id": ([f.Corrupt(**on, offset=ID_AT, value=UNKNOWN_ID)], SILENT, False),
-            "length +1": (_length(place, 1), SILENT, False),
-            "length bomb": (_length(place, None, 0xFFFFFFFF), SILENT, False),
+            "unknown id": (
+                [f.Corrupt(**on, offset=_id_at(world), value=UNKNOWN_ID)],
+                SILENT,
+                False,
+            ),
+            "length +1": (_length(world, place, 1), wrong_length, False),
+            "length bomb": (_length(world, place, None, (1 << 8 * world.word) - 1), SILENT, False),
         }
-        if place.size > HEADER:
-            flipped = f.Corrupt(**on, offset=HEADER, xor=0x40)
+        if world.has_magic:
+            asked["magic"] = ([f.Corrupt(**on, offset=1, xor=0x20)], SILENT, False)
+        if place.size > world.header:
+            flipped = f.Corrupt(**on, offset=world.header, xor=0x40)
             asked["other body"] = ([flipped], (*SILENT, *DENIED), False)
         for label, (faults, allowed, harmless) in asked.items():
             # what breaks one frame may cost the next, and then an inspection has no input
@@ -253,6 +328,8 @@ def request_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[C
 def _end_faults(bench: Bench) -> None:
     bench.box.clear_faults()
     bench.box.device.set_condition(Status.SYSTEM_ERROR, on=False)
+    if bench.world.spoken.status_bits.always & Status.RUNNING:  # no client can start it
+        bench.box.device.start()
 
 
 STOPPED: Errors = (e.NotRunningError,)
@@ -318,7 +395,8 @@ def _operator_cells(world: World, name: str, place: Place, on: dict[str, Any]) -
         if world.transport == "udp" and name == "query" and what != "system error":
             # the client has nothing to do, and does not hear of it
             unheard = [one, *(f.Drop(on="StatusReport", nth=number) for number in (1, 2, 3))]
-            fault = by_camera(unheard, allowed, repairs=repairs)
+            heal = _end_faults if world.is_asked else None
+            fault = by_camera(unheard, allowed, repairs=repairs, heal=heal)
             yield Cell("udp operator", world, name, f"{label}{what}, unheard", fault)
 
 
@@ -339,10 +417,15 @@ def _run_cells(world: World, name: str, place: Place) -> Iterator[Cell]:
         yield Cell(f"{world.transport} run", world, name, f"{place.name}: {what}", fault)
     if name in {"trigger", "input"}:
         # it comes when the next trigger is under way. That the camera says all in order is what
-        # holds without a number
+        # holds without a number; over UDP that is nobody's to say
         late = f.Delay(
             on="ResultContainer", nth=place.number, seconds=0.13, overtaken=world.numbered
         )
         slow = f.LateResult(on="Trigger", nth=place.number + 1, seconds=0.07)
-        fault = by_camera([late, slow], SILENT, bounds=SHORT._replace(trigger=0.1))
+        fault = by_camera(
+            [late, slow],
+            SILENT,
+            bounds=SHORT._replace(trigger=0.1),
+            strays=world.transport == "udp" and not world.numbered,
+        )
         yield Cell(f"{world.transport} run", world, name, f"{place.name}: overtaken", fault)

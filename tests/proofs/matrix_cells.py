@@ -14,6 +14,7 @@ from matrix_world import PATIENT, SHORT, Bounds, World
 
 from smartcam import exceptions as e
 from smartcam.models import Status
+from smartcam.protocols import messages as m
 from smartcam.testing import rules
 
 if TYPE_CHECKING:
@@ -96,6 +97,7 @@ class Place(NamedTuple):
         nth: of all frames of its side, from 1.
         status: what the camera said last before it.
         following: bytes of the next frame of its side, 1 where there is none.
+        owed: answers that the camera owes then, its own among them.
     """
 
     frame: Heard
@@ -104,6 +106,7 @@ class Place(NamedTuple):
     nth: int
     status: Status
     following: int
+    owed: frozenset[str]
 
     @property
     def name(self) -> str:
@@ -124,6 +127,13 @@ class Place(NamedTuple):
 async def places(world: World, op: str) -> list[Place]:
     """Return the frames of a command."""
     frames = await scout(world, op)
+    spoken, header = world.spoken, world.header
+    answers = {
+        row.type.__name__: row.type.answer.__name__
+        for row in spoken.table
+        if issubclass(row.type, m.Request) and row.type.answer and spoken.has(row.type.answer)
+    }
+    owed: set[str] = set()
     kinds: Counter[str] = Counter()
     sizes: Counter[str] = Counter()
     counts: Counter[str] = Counter()
@@ -134,12 +144,19 @@ async def places(world: World, op: str) -> list[Place]:
         key = way + frame.message
         kinds[key] += 1
         counts[way] += 1
+        if frame.message in answers:
+            owed.add(answers[frame.message])
         rest = [len(one.wire) for one in frames[index + 1 :] if one.direction == way]
         following = rest[0] if rest else 1
-        found.append(Place(frame, kinds[key], sizes[way], counts[way], status, following))
+        place = Place(
+            frame, kinds[key], sizes[way], counts[way], status, following, frozenset(owed)
+        )
+        found.append(place)
         sizes[way] += len(frame.wire)
+        owed.discard(frame.message)
         if frame.message == "StatusReport":
-            status = Status(int.from_bytes(frame.wire[12:16], "little"))
+            word = int.from_bytes(frame.wire[header : header + world.word], "little")
+            status = spoken.status_bits.read(word)
     return found
 
 
@@ -170,7 +187,7 @@ def _byte_cells(
     """Give every byte position of every frame: before the first to behind the last."""
     op = OPS[name]
     for one in found:
-        inner = range(1, one.size) if all_bytes else (4, one.size - 1)
+        inner = range(1, one.size) if all_bytes else (world.header // 3, one.size - 1)
         outer = {0, one.size} if one.at == 0 else {one.size}
         for position in sorted({*inner, *outer}):
             at, label = one.at + position, f"{one.name}@{position}"

@@ -7,16 +7,18 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING
 
-from matrix_world import AWAY, HOME, PATIENT, READING, bench
+from matrix_world import AWAY, HOME, PATIENT, READING, Bench, bench, come_true
 
 from smartcam import exceptions as e
+from smartcam.models import Status
+from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from matrix_world import BenchBase, Bounds, Heard, World
 
-__all__ = ["OPS", "TRIGGER_OUTCOMES", "Op", "scout"]
+__all__ = ["OPS", "TRIGGER_OUTCOMES", "Op", "ends_of", "ops_of", "scout"]
 
 TOKEN = (4711).to_bytes(4, "little")
 
@@ -44,6 +46,8 @@ REQUEST: Errors = (e.ResponseTimeoutError, *LINK)
 CLOCK: Errors = (e.InterpretationError, *REQUEST)
 SWITCH: Errors = (e.CommandRejectedError, *REQUEST)
 HALFWAY: Errors = (e.NotRunningError, e.WrongApplicationError)
+REFUSED: Errors = (e.CommandRejectedError, e.UnsupportedError)
+"""What any answer may say in a dialect with result codes."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class Op:
         stops: the camera may be stopped afterwards because it was told so.
         closes: the client is closed afterwards.
         mends: errors that a user mends who was told that this command failed.
+        needs: messages that a dialect must have for it.
     """
 
     run: Callable[[BenchBase], Awaitable[object]]
@@ -73,6 +78,7 @@ class Op:
     stops: bool = False
     closes: bool = False
     mends: Errors = ()
+    needs: tuple[type[m.Message], ...] = ()
 
 
 async def _switch(bench: BenchBase) -> None:
@@ -98,6 +104,31 @@ async def _stopped(bench: BenchBase) -> None:
     bench.stop_camera()
 
 
+async def _failing(bench: BenchBase) -> None:
+    """Have a trigger dropped, which its camera shows until it is told not to."""
+    assert isinstance(bench, Bench)
+    device = bench.box.device
+    assert [device.trigger(), device.trigger()] == [True, False]
+    await come_true(lambda: not device.processing)
+
+
+async def _reset_errors(bench: BenchBase) -> None:
+    assert isinstance(bench, Bench)
+    told = await bench.camera.reset_errors()
+    for status in (told, bench.box.device.status):
+        bench.demand_value(Status.OVERTRIGGERED not in status, f"not reset: {status}")
+
+
+async def _ask_status(bench: BenchBase) -> None:
+    assert isinstance(bench, Bench)
+    bits, device = bench.world.spoken.status_bits, bench.box.device
+    right = [device.status]
+    told = await bench.camera.query_status()
+    right.append(device.status)
+    words = [bits.read(bits.write(status)) for status in right]
+    bench.demand_value(told in words, f"status {told}, {words} is right")
+
+
 async def _visit(bench: BenchBase) -> None:
     async with bench.camera.application(AWAY):
         await bench.trigger()
@@ -116,6 +147,7 @@ OPS: dict[str, Op] = {
         (e.ConnectFailedError, *SWITCH),
         before=_stopped,
         opened=False,
+        needs=(m.Start,),
     ),
     "trigger": Op(lambda b: b.trigger(), lambda t: t.trigger, TRIGGER_OUTCOMES, triggers=True),
     "input": Op(
@@ -143,11 +175,43 @@ OPS: dict[str, Op] = {
     "query": Op(lambda b: b.ask_application(), lambda t: t.request, REQUEST),
     "clock": Op(lambda b: b.ask_clock(), lambda t: t.request, CLOCK),
     "set clock": Op(_set_clock, lambda t: 2 * t.request, CLOCK),
-    "start": Op(_start, lambda t: t.switch, REQUEST, before=_stop, mends=HALFWAY),
-    "stop": Op(_stop, lambda t: t.switch, REQUEST, stops=True),
-    "reboot": Op(lambda b: b.camera.reboot(), lambda t: t.request + t.close, REQUEST),
+    "start": Op(_start, lambda t: t.switch, REQUEST, before=_stop, mends=HALFWAY, needs=(m.Start,)),
+    "stop": Op(_stop, lambda t: t.switch, REQUEST, stops=True, needs=(m.Stop,)),
+    "reboot": Op(
+        lambda b: b.camera.reboot(),
+        lambda t: t.request + t.close,
+        REQUEST,
+        needs=(m.Reboot,),
+    ),
+    "status": Op(_ask_status, lambda t: t.request, REQUEST, needs=(m.GetStatus,)),
+    "reset errors": Op(
+        _reset_errors,
+        lambda t: t.request,
+        REQUEST,
+        before=_failing,
+        needs=(m.ResetErrors,),
+    ),
+    "set input": Op(
+        lambda b: b.camera.set_input(TOKEN),
+        lambda t: t.request,
+        REQUEST,
+        home=READING,
+        needs=(m.SetInputAnswer,),
+    ),
     "close": Op(lambda b: b.close(), lambda t: t.switch + t.close, (), closes=True),
 }
+
+
+def ops_of(world: World) -> dict[str, Op]:
+    """Return the commands that a dialect has."""
+    spoken = world.spoken
+    return {name: op for name, op in OPS.items() if all(spoken.has(one) for one in op.needs)}
+
+
+def ends_of(name: str, world: World) -> Errors:
+    """Return the errors that a command may ever end with in a dialect."""
+    ends = OPS[name].ends
+    return (*ends, *REFUSED) if ends and world.spoken.capabilities.result_codes else ends
 
 
 async def scout(world: World, name: str) -> list[Heard]:

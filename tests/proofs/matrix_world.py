@@ -23,6 +23,7 @@ from smartcam.emulator import Application, EmulatedCamera
 from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.observers import Observer
 from smartcam.protocols import messages as m
+from smartcam.protocols.bvs import BVS, ResultCode
 from smartcam.testing import LinkProxy
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from smartcam.connection import TraceEntry
     from smartcam.emulator import LogEntry, Run
     from smartcam.models import CameraEvent, Result
+    from smartcam.protocols.framed import FramedDialect
 
 __all__ = [
     "AWAY",
@@ -77,6 +79,31 @@ class World(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.transport}-{self.dialect}-{'number' if self.numbered else 'plain'}"
+
+    @property
+    def spoken(self) -> FramedDialect:
+        """The dialect."""
+        return BVS.dialects[self.dialect]
+
+    @property
+    def header(self) -> int:
+        """Bytes of a frame's header."""
+        return self.spoken.header.size
+
+    @property
+    def word(self) -> int:
+        """Bytes of a message's ordinary integers."""
+        return {"I": 4, "H": 2}[self.spoken.word]
+
+    @property
+    def has_magic(self) -> bool:
+        """Whether a frame shows where it begins."""
+        return bool(self.spoken.header.magic)
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether the status comes when it is asked for, and not by itself."""
+        return not self.spoken.status_by_itself
 
     @property
     def layout(self) -> str:
@@ -268,6 +295,9 @@ class Heard(NamedTuple):
 class Ear(Observer):
     """Hears what one client says and what it is told.
 
+    Args:
+        world: what is spoken.
+
     Attributes:
         frames: every whole frame.
         number: the sequence number that was set last.
@@ -275,7 +305,8 @@ class Ear(Observer):
         hook: called with each frame.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, world: World) -> None:
+        self._world = world
         self.frames: list[Heard] = []
         self.number: int | None = None
         self.got: Counter[int] = Counter()
@@ -308,8 +339,9 @@ class Ear(Observer):
         """A frame was refused: a container where there is no session is none."""
         last = self.frames[-1] if self.frames else None
         container = last is not None and last.message == "ResultContainer"
-        if last is not None and container and last.wire[12:].hex() == payload:
-            self.now[serial_of(last.wire[16:])] -= 1
+        header, word = self._world.header, self._world.word
+        if last is not None and container and last.wire[header:].hex() == payload:
+            self.now[serial_of(last.wire[header + word :])] -= 1
 
     def on_state(self, event: CameraEvent) -> None:
         if isinstance(event, (Connected, Reconnected)):
@@ -342,12 +374,12 @@ class BenchBase:
         self.strays = self.garbled = self.happened = False
         self.taken_in = 0
         self._url = url
-        self.ear = Ear()
+        self.ear = Ear(world)
         self.camera: SmartCamera = self._connect()
 
     def _connect(self) -> SmartCamera:
         bounds = self.bounds
-        self.ear = Ear()
+        self.ear = Ear(self.world)
         return smartcam.connect(
             self._url,
             observers=[self.ear],
@@ -396,13 +428,17 @@ class BenchBase:
 
     @contextlib.contextmanager
     def _one_trigger(self) -> Iterator[None]:
-        """A call sends one trigger at most."""
-        ear, before = self.ear, len(self.ear.frames)
+        """A call sends one trigger at most, and one more for each that the camera refused."""
+        ear, before, header = self.ear, len(self.ear.frames), self.world.header
         try:
             yield
         finally:
-            said = sum(one.message == "Trigger" for one in ear.frames[before:])
-            self.demand(said <= 1, f"one call sent {said} triggers")
+            frames = ear.frames[before:]
+            said = sum(one.message == "Trigger" for one in frames)
+            answers = [one.wire[header:] for one in frames if one.message == "TriggerAnswer"]
+            refused = answers.count(ResultCode.BUSY.to_bytes(2, "little"))
+            text = f"one call sent {said} triggers, {refused} were refused"
+            self.demand(said <= 1 + refused, text)
 
     def demand(self, true: object, text: str) -> None:
         """Note what is wrong unless something is true."""
@@ -523,7 +559,10 @@ class Bench(BenchBase):
             sessions = self.box.sessions
             missing = self.box.sent_whole(sessions) - self.ear.now
             self.demand(len(sessions) == 1, f"sessions in the end: {sessions}")
-            self.demand(not missing, f"lost without a loss of the link: {missing}")
+            # behind a broken frame without a magic number whole ones are read as its body
+            swallowed = self.garbled and not self.world.has_magic
+            text = f"lost without a loss of the link: {missing}"
+            self.demand(swallowed or not missing, text)
 
 
 @contextlib.asynccontextmanager

@@ -18,15 +18,52 @@ if TYPE_CHECKING:
     from random import Random
     from typing import Self
 
-CONNECT, DISCONNECT, STATUS, RESULT = 0x01, 0x02, 0x12, 0x20
+CONNECT, DISCONNECT, STATUS, RESET, RESULT = 0x01, 0x02, 0x12, 0x16, 0x20
 QUERY, SWITCH, INPUT, NUMBER = 0x30, 0x31, 0x34, 0x35
 TRIGGER, START, STOP = 0x40, 0x41, 0x42
 
 INPUT_CONTAINER, BUSY, RUNNING, OVERTRIGGERED, WAITING = 0x004, 0x010, 0x080, 0x100, 0x200
 
-HEADER = struct.Struct("<4sII")
-MAGIC = {"handbook": bytes.fromhex("50535642"), "thesis": bytes.fromhex("42565350")}
-LENGTH_BEYOND_PAYLOAD = {"handbook": 0, "thesis": 4}  # the thesis counts the message id too
+ID_WAITING, ID_READY, ID_TRIGGER_ERROR = 0x001, 0x020, 0x100
+OK, OK_INSPECTION_ID, NOK_BUSY, NOK_INSPECTION = 0x00, 0x02, 0x16, 0x1A
+"""Status bits and result codes of ``bid``."""
+
+
+class Wire(NamedTuple):
+    """What frames look like: struct code of the integers, magic, what the length counts too."""
+
+    word: str
+    magic: bytes = b""
+    beyond: int = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes of a header."""
+        return len(self.magic) + 2 * struct.calcsize(self.word)
+
+    def words(self, *values: int) -> bytes:
+        """Return integers as they are on the wire."""
+        return struct.pack(f"<{len(values)}{self.word}", *values)
+
+    def frame(self, message_id: int, payload: bytes) -> bytes:
+        """Return a frame."""
+        length = len(payload) + self.beyond
+        numbers = (length, message_id) if self.magic else (message_id, length)
+        return self.magic + self.words(*numbers) + payload
+
+    def read(self, data: bytes) -> tuple[int, int]:
+        """Return the message id and the payload's length that a header tells."""
+        assert data.startswith(self.magic), f"no frame begins with {data[:12].hex()}"
+        first, second = struct.unpack_from(f"<2{self.word}", data, len(self.magic))
+        return (second, first - self.beyond) if self.magic else (first, second)
+
+
+WIRES = {
+    "handbook": Wire("I", bytes.fromhex("50535642")),
+    "thesis": Wire("I", bytes.fromhex("42565350"), 4),
+    "b16": Wire("H"),
+    "bid": Wire("H"),
+}
 
 CONTAINER = struct.Struct("<5i")
 FIELDS = "number: int32{mark}, trigger: int32, run: int32, token: int32, part: int32"
@@ -91,7 +128,7 @@ class StormCamera:
     """One camera on a free port of the loopback; an asynchronous context manager.
 
     Args:
-        dialect: ``handbook`` or ``thesis``.
+        dialect: ``handbook``, ``thesis``, ``b16`` or ``bid``.
         transport: ``tcp`` or ``udp``.
         habits: how it is late.
         chance: decides when, and how much.
@@ -114,8 +151,8 @@ class StormCamera:
         self.overtriggers = 0
         self.voided = 0
         self._chance = chance
-        self._magic = MAGIC[dialect]
-        self._beyond = LENGTH_BEYOND_PAYLOAD[dialect]
+        self._wire = WIRES[dialect]
+        self._coded = dialect == "bid"  # it runs always, tells codes, and its status if asked
         self._active = 1
         self._conditions = 0
         self._running = self._waiting = True
@@ -246,7 +283,7 @@ class StormCamera:
             return
         self.sent.append(Sent(run.trigger, part))
         data = CONTAINER.pack(run.number, run.trigger, run.index, run.token, part)
-        frame = self._frame(RESULT, struct.pack("<I", self._active) + data)
+        frame = self._wire.frame(RESULT, self._wire.words(self._active) + data)
         if self._chance.random() < self.habits.held:
             self._flush()
             self._held += 1
@@ -263,6 +300,8 @@ class StormCamera:
         if not self._conditions & OVERTRIGGERED:
             self.overtriggers += 1
         self._set(OVERTRIGGERED, True)
+        if self._coded:
+            return  # until it is reset
         _cancel(self._overtrigger_ends)
         self._overtrigger_ends = self._later(OVERTRIGGERED_TIME, self._set, OVERTRIGGERED, False)
 
@@ -281,6 +320,10 @@ class StormCamera:
     def _give_input(self, payload: bytes) -> None:
         if not self.habits.reads_input or len(payload) != 4:
             return
+        if self._coded:
+            self._last_input = struct.unpack("<i", payload)[0]
+            self._say(INPUT, OK)
+            return
         self._inputs.append(struct.unpack("<i", payload)[0])
         if len(self._inputs) > QUEUE_DEPTH:
             self._inputs.popleft()
@@ -289,7 +332,7 @@ class StormCamera:
     def _take_input(self) -> int:
         if not self.habits.reads_input:
             return 0
-        self._set(INPUT_CONTAINER, not self._inputs)
+        self._set(INPUT_CONTAINER, not self._inputs and not self._coded)
         if self._inputs:
             self._last_input = self._inputs.popleft()
         return self._last_input
@@ -307,13 +350,13 @@ class StormCamera:
     def _take(self, data: bytes, peer: tuple[str, int] | None) -> None:
         self._peer = peer
         self._buffer += data
-        while len(self._buffer) >= HEADER.size:
-            magic, length, message_id = HEADER.unpack_from(self._buffer)
-            assert magic == self._magic, f"no frame begins with {self._buffer[:12].hex()}"
-            size = HEADER.size + length - self._beyond
+        header = self._wire.size
+        while len(self._buffer) >= header:
+            message_id, length = self._wire.read(self._buffer)
+            size = header + length
             if len(self._buffer) < size:
                 return
-            payload, self._buffer = self._buffer[HEADER.size : size], self._buffer[size:]
+            payload, self._buffer = self._buffer[header:size], self._buffer[size:]
             if message_id == CONNECT:
                 self._connect()
             elif self._session:
@@ -322,30 +365,47 @@ class StormCamera:
 
     def _connect(self) -> None:
         self._session, self._reported = True, None
-        self._out.append(self._frame(CONNECT, struct.pack("<I", 1)))
+        self._say(CONNECT, *([OK] if self._coded else []), 1)
         self._report()
 
     def _obey(self, message_id: int, payload: bytes) -> None:
         match message_id:
             case 0x02:
                 self._session = False
+            case 0x12 if self._coded:
+                self._tell_status()
+            case 0x16 if self._coded:
+                self._say(RESET, OK)
+                self._set(OVERTRIGGERED, False)
+                self._tell_status()
+            case 0x30 if self._coded:
+                busy = self._conditions & BUSY
+                self._say(QUERY, *((NOK_BUSY, 0) if busy else (OK_INSPECTION_ID, self._active)))
             case 0x30:
-                self._out.append(self._frame(QUERY, struct.pack("<I", self._active)))
+                self._say(QUERY, self._active)
             case 0x31:
-                self._switch(struct.unpack("<I", payload)[0])
+                self._switch(int.from_bytes(payload, "little"))
             case 0x34:
                 self._give_input(payload)
-            case 0x35:
+            case 0x35 if not self._coded:
                 (self._number,) = struct.unpack("<I", payload)
             case 0x40:
                 self.triggers += 1
+                if self._coded:
+                    self._say(TRIGGER, NOK_BUSY if self._conditions & BUSY else OK)
                 self._trigger(self.triggers)
-            case 0x41:
+            case 0x41 if not self._coded:
                 self._run(True)
-            case 0x42:
+            case 0x42 if not self._coded:
                 self._run(False)
             case _:
                 raise AssertionError(f"message {message_id:#04x} was not expected")
+
+    def _tell_status(self) -> None:
+        word = ID_READY if not self._conditions & BUSY else 0
+        word |= ID_WAITING if self._running and self._waiting else 0
+        word |= ID_TRIGGER_ERROR if self._conditions & OVERTRIGGERED else 0
+        self._say(STATUS, word)
 
     def _run(self, running: bool) -> None:
         """Start or stop; a stop voids the inspection under way."""
@@ -353,25 +413,36 @@ class StormCamera:
             return
         self._running = self._waiting = running
         if not running:
-            self.voided += len(self._under_way)
-            for run in self._under_way:
-                _cancel(run.timer)
-            self._under_way.clear()
-            self._look_quiet()
+            self._void()
         self._report()
 
+    def _void(self) -> None:
+        self.voided += len(self._under_way)
+        for run in self._under_way:
+            _cancel(run.timer)
+        self._under_way.clear()
+        self._look_quiet()
+
     def _switch(self, application: int) -> None:
-        if self._running or application not in {1, 2}:
-            self._out.append(self._frame(SWITCH, struct.pack("<II", 1, self._active)))
+        if self._coded and self._conditions & BUSY:
+            self._say(SWITCH, NOK_BUSY, self._active)
             return
+        if (self._running and not self._coded) or application not in {1, 2}:
+            self._say(SWITCH, NOK_INSPECTION if self._coded else 1, self._active)
+            return
+        if self._coded:
+            self._running = False
+            self._void()
         self._set(BUSY, True)
         self._later(LOAD_TIME, self._loaded, application)
 
     def _loaded(self, application: int) -> None:
         self._active = application
         self._inputs.clear()
+        if self._coded:
+            self._running = self._waiting = True
         self._set(BUSY | INPUT_CONTAINER, False)
-        self._out.append(self._frame(SWITCH, struct.pack("<II", 0, application)))
+        self._say(SWITCH, 0, application)
 
     # ------------------------------------------------------------------ what goes
 
@@ -384,12 +455,12 @@ class StormCamera:
         status = self._conditions
         status |= RUNNING if self._running else 0
         status |= WAITING if self._running and self._waiting else 0
-        if self._session and status != self._reported:
+        if self._session and status != self._reported and not self._coded:
             self._reported = status
-            self._out.append(self._frame(STATUS, struct.pack("<II", status, 0)))
+            self._say(STATUS, status, *([0] if self._wire.word == "I" else []))
 
-    def _frame(self, message_id: int, payload: bytes) -> bytes:
-        return HEADER.pack(self._magic, len(payload) + self._beyond, message_id) + payload
+    def _say(self, message_id: int, *words: int) -> None:
+        self._out.append(self._wire.frame(message_id, self._wire.words(*words)))
 
     def _flush(self) -> None:
         frames, self._out = self._out, []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 from storm_camera import CONTAINER, EXTERNAL, FIELDS, Habits, Sent, StormCamera
@@ -35,6 +35,7 @@ class Variant:
         narrow: the number has 8 bits only.
         results: asked for per trigger.
         order: of an emulator, whose quirk it is; None is the camera made by hand.
+        pushed: of an emulator with ``bid``: a status comes with every change, too.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Variant:
     results: int | None = None
     habits: Habits = field(default_factory=Habits)
     order: Literal["result first", "waiting first"] | None = None
+    pushed: bool = False
 
     @property
     def layout(self) -> str:
@@ -59,6 +61,10 @@ class Variant:
 
 
 NUMBERED: Literal[" @sequence"] = " @sequence"
+HELD = Habits(held=0.3)
+TIDY = Habits(waiting_first=0.0)
+"""It waits for a trigger again when it has sent everything: what ``bid`` rests on."""
+
 VARIANTS = (
     Variant(
         name="tcp extra slow link",
@@ -107,6 +113,58 @@ VARIANTS = (
     Variant(name="emulator waiting first", order="waiting first"),
     Variant(name="emulator number", mark=NUMBERED, order="waiting first"),
     Variant(name="emulator udp number", mark=NUMBERED, order="result first", transport="udp"),
+    Variant(name="tcp b16", dialect="b16"),
+    Variant(name="tcp b16 number", dialect="b16", mark=NUMBERED),
+    Variant(name="udp b16 number held", dialect="b16", mark=NUMBERED, transport="udp", habits=HELD),
+    Variant(name="tcp bid", dialect="bid", share=0.4, habits=TIDY),
+    Variant(
+        name="tcp bid slow link",
+        dialect="bid",
+        share=0.4,
+        habits=replace(TIDY, latency=0.002),
+    ),
+    Variant(name="tcp bid input", dialect="bid", share=0.4, habits=replace(TIDY, reads_input=True)),
+    Variant(
+        name="tcp bid extra",
+        dialect="bid",
+        share=0.4,
+        exact=False,
+        habits=replace(TIDY, second=0.3, second_apart=True),
+    ),
+    Variant(
+        name="tcp bid two results",
+        dialect="bid",
+        share=0.4,
+        exact=False,
+        results=2,
+        habits=replace(TIDY, second=0.9, second_apart=True),
+    ),
+    Variant(name="emulator bid", dialect="bid", order="result first"),
+    Variant(name="emulator bid pushed", dialect="bid", order="waiting first", pushed=True),
+    Variant(
+        name="best effort: udp bid",
+        dialect="bid",
+        promised=False,
+        exact=False,
+        transport="udp",
+        habits=TIDY,
+    ),
+    Variant(
+        name="best effort: udp bid held",
+        dialect="bid",
+        promised=False,
+        exact=False,
+        transport="udp",
+        habits=replace(TIDY, held=0.3),
+    ),
+    Variant(
+        name="best effort: tcp bid external",
+        dialect="bid",
+        promised=False,
+        exact=False,
+        habits=replace(TIDY, external=3.0),
+    ),
+    Variant(name="best effort: tcp bid waiting first", dialect="bid", promised=False, exact=False),
     Variant(name="best effort: udp", promised=False, exact=False, transport="udp"),
     Variant(
         name="best effort: udp held",
@@ -178,7 +236,10 @@ class TruthfulEmulator(EmulatedCamera):
             transport=variant.transport,
             dialect=variant.dialect,
             running=True,
-            quirks={"waiting_before_result": variant.order == "waiting first"},
+            quirks={
+                "waiting_before_result": variant.order == "waiting first",
+                "push_status": variant.pushed,
+            },
         )
 
     @property

@@ -3,24 +3,39 @@
 from __future__ import annotations
 
 import pytest
-from cancel_sweep import CALLS, WIRES, Wire, missing_calls, run_sweep
+from cancel_sweep import CALLS, ID, SMART, WIRES, Wire, calls_over, missing_calls, run_sweep
 
 STRIDE = 5
 """Steps between two cancellations; the long form has every one."""
 
-SHORT_WIRES = WIRES[:4]
+SHORT_WIRES = (*WIRES[:4], *(wire for wire in WIRES if wire.dialect == "b16"))
+ID_WIRES = tuple(wire for wire in WIRES if wire.dialect in ID)
 
 
-@pytest.mark.parametrize("name", CALLS)
-def test_call_cancelled_at_any_step_leaves_client_and_camera_as_they_were(name: str) -> None:
-    wire = SHORT_WIRES[list(CALLS).index(name) % len(SHORT_WIRES)]
+def short_sweeps() -> list[tuple[str, Wire]]:
+    """Each call over one wire of each kind of camera that has it."""
+    return [
+        (name, wires[number % len(wires)])
+        for number, (name, call) in enumerate(CALLS.items())
+        for wires, dialects in ((SHORT_WIRES, SMART), (ID_WIRES, ID))
+        if call.dialects & dialects
+    ]
+
+
+@pytest.mark.parametrize(("name", "wire"), short_sweeps(), ids=str)
+def test_call_cancelled_at_any_step_leaves_client_and_camera_as_they_were(
+    name: str, wire: Wire
+) -> None:
     sweep = run_sweep(name, wire, STRIDE)
     assert sweep.ends["over"] == 2
     assert sweep.ends["cancelled"] > 0
 
 
-@pytest.mark.parametrize("wire", WIRES, ids=str)
-@pytest.mark.parametrize("name", ["trigger", "reboot"])
+@pytest.mark.parametrize(
+    ("name", "wire"),
+    [(n, wire) for n in ("trigger", "reboot") for wire in WIRES if n in calls_over(wire)],
+    ids=str,
+)
 def test_call_cancelled_at_each_step_leaves_client_and_camera_as_they_were(
     name: str, wire: Wire
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import socket
 import sys
 from dataclasses import replace
@@ -13,12 +14,15 @@ import fault_matrix
 import pytest
 from fault_matrix import Runner, cells, sample
 from matrix_camera import by_camera
-from matrix_cells import LOST, NONE, SILENT, Cell, Fault, by_rule
-from matrix_ops import OPS
+from matrix_cells import LOST, NONE, SILENT, Cell, Fault, by_rule, places
+from matrix_ops import OPS, ops_of
 from matrix_world import PATIENT, BookKeeper, Ear, World
 
+import smartcam
 from smartcam.client import SmartCamera
+from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
+from smartcam.protocols.bvs import BVS, ResultCode
 from smartcam.testing import rules
 
 if TYPE_CHECKING:
@@ -26,11 +30,13 @@ if TYPE_CHECKING:
 
     from smartcam.connection import TraceEntry
 
-STRIDE = 100
+STRIDE = 260
+"""Of some 49,000 cells; the short form takes seconds."""
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="link proxies need add_reader")
 
 TCP = World("handbook", "tcp", numbered=True)
+BID = World("bid", "tcp", numbered=False)
 CUT = by_rule(OPS["trigger"], rules.Cut(at=30), LOST, bounds=PATIENT)
 STALL = by_rule(OPS["trigger"], rules.Stall(at=30), SILENT)
 
@@ -38,14 +44,24 @@ STALL = by_rule(OPS["trigger"], rules.Stall(at=30), SILENT)
 async def test_sample_of_the_fault_matrix_passes(capsys: pytest.CaptureFixture[str]) -> None:
     runner = Runner()
     every = await cells()
-    assert len({cell.name for cell in every}) == len(every) > 20_000
-    for transport in ("tcp", "udp"):
-        assert {one.op for one in every if one.world.transport == transport} == set(OPS)
-    done = await runner.run(sample(every, STRIDE))
+    assert len({cell.name for cell in every}) == len(every) > 40_000
+    for dialect, transport in itertools.product(BVS.dialects, ("tcp", "udp")):
+        here = [one for one in every if one.world[:2] == (dialect, transport)]
+        assert {one.op for one in here} == set(ops_of(here[0].world))
+    chosen = sample(every, STRIDE)
+    assert {one.world.dialect for one in chosen} == set(BVS.dialects)
+    done = await runner.run(chosen)
     with capsys.disabled():
         print(f"\n{fault_matrix.table(done)}")  # noqa: T201
     assert fault_matrix.failures(done, most=5) == ""
     assert runner.reports == []
+
+
+async def test_every_message_of_a_dialect_is_a_place_of_the_fault_matrix() -> None:
+    for world in (TCP, World("b16", "tcp", numbered=True), BID):
+        found = [await places(world, name) for name in ops_of(world)]
+        names = {place.frame.message for some in found for place in some}
+        assert names == {row.type.__name__ for row in world.spoken.table}
 
 
 async def judged(fault: Fault, op: str = "trigger", world: World = TCP) -> str:
@@ -94,6 +110,23 @@ async def test_client_that_does_not_work_again_is_wrong() -> None:
 async def test_result_of_an_earlier_run_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BookKeeper, "time", 1e6)
     assert "a stale result: run" in await judged(CUT)
+
+
+async def test_trigger_that_the_camera_refused_may_be_sent_again() -> None:
+    busy: dict[str, int | str] = {"code": int(ResultCode.BUSY)}
+    refused = f.Insert(on="TriggerAnswer", message="TriggerAnswer", fields=busy, where="instead")
+    assert await judged(by_camera([refused], NONE, bounds=PATIENT), world=BID) == ""
+
+
+async def test_trigger_that_is_sent_twice_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    trigger = SmartCamera.trigger
+
+    async def twice(camera: SmartCamera, *arguments: Any, **options: Any) -> object:
+        await trigger(camera, *arguments, **options)
+        return await trigger(camera, *arguments, **options)
+
+    monkeypatch.setattr(SmartCamera, "trigger", twice)
+    assert "one call sent 2 triggers, 0 were refused" in await judged(CUT)
 
 
 async def test_clock_that_is_not_the_cameras_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,3 +188,21 @@ async def test_report_of_the_loop_is_wrong() -> None:
         asyncio.get_running_loop().call_exception_handler({"message": "lost and found"})
 
     assert "lost and found" in await judged(armed_with(report))
+
+
+# ---------------------------------------------------------------------- what it has found
+
+
+async def test_length_that_swallows_what_follows_ends_the_link_of_who_only_subscribed() -> None:
+    """Without a magic number bytes keep coming, so it does not look dead."""
+    bomb = [f.Corrupt(on="StatusReport", nth=3, offset=at, value=0xFF) for at in (2, 3)]
+    async with EmulatedCamera(dialect="bid", faults=bomb) as emulator:
+        camera = smartcam.connect(emulator.url, request_timeout=0.3, liveness_timeout=None)
+        events = camera.events()
+        reason = ""
+        async with camera, asyncio.timeout(5):
+            while not reason:
+                event = await anext(events)
+                reason = event.reason if isinstance(event, smartcam.Disconnected) else ""
+            await camera.wait_connected()
+    assert "no status within 0." in reason

@@ -12,12 +12,14 @@ from __future__ import annotations
 import asyncio
 import functools
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import pytest
 from client_judge import (
     COMMAND_ERRORS,
     FED,
     FREE,
+    LACKING,
     LINE,
     OTHER,
     TRIGGER_ERRORS,
@@ -36,10 +38,11 @@ from hypothesis.stateful import (
 from smartcam import (
     Result,
     Status,
+    UnsupportedError,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 
 PROFILE = settings()
@@ -49,6 +52,7 @@ turns = st.sampled_from([None, None, None, 0, 1, 2, 3, 5, 8, 13])
 """Steps of the loop after a rule; None until nothing more happens at once."""
 
 patience = st.sampled_from([0.02, 0.05, 0.3, 2.0])
+HANDBOOK, _, _, BID = range(4)
 DEEDS = ["trigger", "trigger", "trigger", "start", "start", "stop", "overheat"]
 applications = st.sampled_from([LINE, OTHER, FED, FREE])
 
@@ -56,11 +60,14 @@ applications = st.sampled_from([LINE, OTHER, FED, FREE])
 class ClientMachine(ClientJudge, RuleBasedStateMachine):
     """What may happen to client and camera."""
 
+    dialects: ClassVar[tuple[str, ...]] = ("handbook", "thesis", "b16", "bid")
+
     def __init__(self) -> None:
         RuleBasedStateMachine.__init__(self)
         ClientJudge.__init__(self)
 
     @initialize(
+        dialect=st.integers(0, 3),
         application=st.sampled_from([None, LINE, FED]),
         restore=st.booleans(),
         quirks=st.fixed_dictionaries(
@@ -73,9 +80,13 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         ),
     )
     def switched_on(
-        self, application: int | None, quirks: dict[str, Any], *, restore: bool
+        self, dialect: int, application: int | None, quirks: dict[str, Any], *, restore: bool
     ) -> None:
-        self.box = self._make_box(quirks)
+        name = self.dialects[dialect % len(self.dialects)]
+        if name == "bid":  # the model does not say when it is too busy for a switch
+            quirks.pop("busy_while_processing", None)
+        self.box = self._make_box(name, quirks)
+        self.model.always_runs = name == "bid"
         self.run(self.box.start())
         self.origin = self.loop.time()
         self.act(None, self.box.device.start, self.model.start)
@@ -202,22 +213,28 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
     @precondition(lambda self: self.can_call)
     @rule(
         what=st.sampled_from(
-            ["start", "stop", "query_application", "get_clock", "wait_ready", "reboot", "set_clock"]
+            [
+                *("start", "stop", "query_application", "get_clock", "wait_ready", "reboot"),
+                *("set_clock", "query_status", "reset_errors"),
+            ]
         ),
         steps=turns,
     )
     def command(self, what: str, steps: int | None) -> None:
         arguments = [datetime(2024, 1, 1)] if what == "set_clock" else []  # noqa: DTZ001
-        self.begin(what, getattr(self.camera, what)(*arguments), COMMAND_ERRORS)
+        self._begin_command(what, *arguments)
         self.go(steps)
+
+    def _begin_command(self, what: str, *arguments: object) -> None:
+        lacking = (UnsupportedError,) if what in LACKING[self.box.dialect] else ()
+        call = getattr(self.camera, what)(*arguments)
+        self.begin(what, call, (*COMMAND_ERRORS, *lacking))
 
     @precondition(lambda self: self.can_call)
     @rule(steps=turns)
     def set_sequence_number(self, steps: int | None) -> None:
-        assert self.camera is not None
         self.numbers += 1
-        number = (1 << 30) + 1_000_003 * self.numbers
-        self.begin("number", self.camera.set_sequence_number(number), COMMAND_ERRORS)
+        self._begin_command("set_sequence_number", (1 << 30) + 1_000_003 * self.numbers)
         self.go(steps)
 
     @precondition(lambda self: self.can_call)
@@ -440,7 +457,6 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
     @invariant()
     def all_is_well(self) -> None:
         self.model.read(self.box.log)
-        assert len(self.box.log) < (self.box.log.maxlen or 0)
         self._settle_calls()
         if self.camera is None:
             return
@@ -470,6 +486,7 @@ class OverTcp(ClientMachine):
 class OverTcpNumbered(ClientMachine):
     """Each container carries its number."""
 
+    dialects = ("handbook", "thesis", "b16")
     numbered = True
 
 
@@ -477,7 +494,15 @@ class OverUdpNumbered(ClientMachine):
     """Datagrams; each container carries its number."""
 
     transport = "udp"
+    dialects = ("handbook", "thesis", "b16")
     numbered = True
+
+
+class OverUdpAsked(ClientMachine):
+    """Datagrams, none of them lost or overtaken; the status comes when it is asked for."""
+
+    transport = "udp"
+    dialects = ("bid",)
 
 
 TestOverTcp = OverTcp.TestCase
@@ -486,3 +511,36 @@ TestOverTcpNumbered = OverTcpNumbered.TestCase
 TestOverTcpNumbered.settings = HISTORIES
 TestOverUdpNumbered = OverUdpNumbered.TestCase
 TestOverUdpNumbered.settings = HISTORIES
+TestOverUdpAsked = OverUdpAsked.TestCase
+TestOverUdpAsked.settings = settings(HISTORIES, max_examples=max(1, HISTORIES.max_examples // 2))
+
+
+# ---------------------------------------------------------------------- histories that were wrong
+
+
+@pytest.fixture
+def history() -> Iterator[ClientMachine]:
+    machine = OverTcp()
+    yield machine
+    machine.teardown()
+
+
+def test_camera_that_somebody_else_loads_while_a_trigger_has_it_stopped_stays_stopped(
+    history: ClientMachine,
+) -> None:
+    history.switched_on(dialect=HANDBOOK, application=None, quirks={}, restore=False)
+    history.loss_of_a_result(seconds=0.0, steps=0, again=True)
+    history.operator_switches(application=LINE, running=False, steps=None)
+    history.there_and_back(application=LINE, how="trigger", ending="done", seconds=0.0, between=0)
+    assert not history.box.device.running
+
+
+def test_switch_of_a_camera_that_is_too_busy_ends_at_once_with_the_client(
+    history: ClientMachine,
+) -> None:
+    history.switched_on(dialect=BID, application=None, quirks={}, restore=False)
+    history.operator("stop", steps=None)
+    history.switch(OTHER, steps=None)
+    history.a_little_time_passes(0.05)
+    history.close()
+    assert history.calls == []
