@@ -153,8 +153,8 @@ class Interpretation:
         """
         interpreter, simple, sequenced, _ = self._known(container.application)
         data = container.data
-        if container.cells is not None and interpreter.layout is not None:
-            data = pack_texts(interpreter.layout, container.cells)
+        if container.cells is not None:
+            data = _from_cells(container, interpreter)
         if simple is not None and not sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(simple, data, context)
@@ -205,6 +205,15 @@ class Interpretation:
         except Exception:  # noqa: BLE001 - one by one it shows, with its place
             return None
         return (values, context.empty_slots) if complete else None
+
+
+def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
+    """Return a container's bytes as its layout describes them, where its values are texts."""
+    if container.fault is not None:
+        raise InterpretationError(container.fault)
+    if interpreter.layout is None or container.cells is None:
+        return container.data
+    return pack_texts(interpreter.layout, container.cells)
 
 
 class _Way(NamedTuple):

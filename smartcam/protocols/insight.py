@@ -89,14 +89,16 @@ class InSightDialect(Dialect):
         user: who logs in.
         password: the user's.
         cells: cells that are read after each trigger, in order, as commands name them.
+        counter: a cell that counts runs, read before and after them; "" for none.
     """
 
     user: str = "admin"
     password: str = field(default="", repr=False)
     cells: tuple[str, ...] = ()
+    counter: str = ""
 
     def with_parameters(self, parameters: Mapping[str, str]) -> InSightDialect:
-        """Return the dialect with user, password and cells of a URL.
+        """Return the dialect with user, password, cells and counter of a URL.
 
         Raises:
             ConfigurationError: a cell is none, or a text cannot be sent.
@@ -105,11 +107,15 @@ class InSightDialect(Dialect):
             problem = unsendable(parameters.get(key, ""), MAX_LOGIN)
             if problem is not None:
                 raise ConfigurationError(f"{key}: {problem}")
+        counter = _cell_names(parameters.get("counter", ""))
+        if len(counter) > 1:
+            raise ConfigurationError(f"counter: one cell, not {len(counter)}")
         return replace(
             self,
             user=parameters.get("user", self.user),
             password=parameters.get("password", self.password),
             cells=tuple(_cell_names(parameters.get("cells", ""))),
+            counter="".join(counter),
         )
 
     @property
@@ -240,6 +246,7 @@ INSIGHT = Protocol(
         "user": "who logs in; default admin",
         "password": "the user's; default none",
         "cells": "cells that are a result's values, such as B2,C2,D4:F6",
+        "counter": "a cell that counts runs: values of several runs are told by it",
     },
 )
 """What the entry point ``insight`` gives."""

@@ -414,15 +414,32 @@ class InSightMachine:
         if code != StatusCode.DONE:
             return
         job = yield from self._name_job()
+        counter = self.dialect.counter
+        before = (yield from self._value(counter)) if counter else None
         said: dict[str, str | None] = {}
-        cells: list[m.CellValue] = []
         for cell in self.dialect.cells:
-            answer = yield f"GV{cell}"
-            text = answer.text if answer.code == StatusCode.DONE else None
-            said[cell] = text
-            cells.append(m.CellValue(cell, None if text == ERROR_VALUE else text))
-        data = json.dumps(said).encode()
-        self._tell(m.ResultContainer(application=job, data=data, cells=tuple(cells)))
+            said[cell] = yield from self._value(cell)
+        after = (yield from self._value(counter)) if counter else None
+        cells = [
+            m.CellValue(cell, None if said[cell] == ERROR_VALUE else said[cell])
+            for cell in self.dialect.cells
+        ]
+        fault = None
+        if before != after:
+            fault = (
+                f"cell {counter}, which counts runs, went from {before} to {after} while the cells "
+                "were read: they may be of more than one run"
+            )
+        self._tell(
+            m.ResultContainer(
+                application=job, data=json.dumps(said).encode(), cells=tuple(cells), fault=fault
+            )
+        )
+
+    def _value(self, cell: str) -> Generator[str, Answer, str | None]:
+        """Return a cell's text, None for one that is empty or does not exist."""
+        answer = yield f"GV{cell}"
+        return answer.text if answer.code == StatusCode.DONE else None
 
     def _read_image(self, _message: m.Message) -> Script:
         answer = yield "RI"

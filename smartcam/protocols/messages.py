@@ -175,11 +175,13 @@ class ResultContainer(Report):
         data: the bytes.
         cells: the values that ``data`` was put together from, where the protocol has them as texts:
             a layout's fields are these, in order.
+        fault: why the values cannot be one inspection's, None where nothing speaks against it.
     """
 
     application: Word = UNNAMED_APPLICATION
     data: Data
     cells: tuple[CellValue, ...] | None = None
+    fault: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -812,3 +812,38 @@ async def test_cancelled_after_any_step_the_camera_goes_on(name: str) -> None:
             pytest.fail(f"{name} did not end in {MOST_STEPS} steps")
         assert camera.statistics().reconnects == 0
         balance(camera.statistics())
+
+
+# ---------------------------------------------------------------------- values of several runs
+
+
+async def speak(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Be a camera whose cell C3 counts to 6 while the cells of the second trigger are read."""
+    counts = iter(["5.000", "5.000", "5.000", "6.000", "6.000", "6.000"])
+    answers = {b"SW8": "1", b"GJ": "1\r\n7", b"GO": "1", b"GVA001": "1\r\n12.5"}
+    writer.write(b"Welcome to In-Sight(tm)\r\nUser: Password: User Logged In\r\n")
+    await reader.readline()
+    await reader.readline()
+    while line := (await reader.readline()).strip():
+        text = f"1\r\n{next(counts)}" if line == b"GVC003" else answers[line]
+        writer.write(text.encode() + b"\r\n")
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_trigger_values_of_more_than_one_run_are_no_result() -> None:
+    server = await asyncio.start_server(speak, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    url = f"insight://127.0.0.1:{port}?cells=A1&counter=C3"
+    async with server, smartcam.connect(url, reconnect=None) as camera:
+        assert (await camera.trigger()).value == b'{"A001": "12.5"}'
+        with pytest.raises(InterpretationError, match=r"C003, which .* from 5\.000 to 6\.000 "):
+            await camera.trigger(interpret_as="x: real32")
+        assert (await camera.trigger(interpret_as="x: real32")).value.x == 12.5
+        balance(camera.statistics())
+
+
+def test_counter_is_one_cell() -> None:
+    assert smartcam.connect("insight://h?counter=C3").url == "insight://h:23?counter=C3"
+    with pytest.raises(ConfigurationError, match="counter: one cell, not 2"):
+        smartcam.connect("insight://h?counter=C3:C4")
