@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shlex
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -131,8 +132,9 @@ async def _trigger(url: str, input_hex: str | None, options: Options) -> None:
                 try:
                     result = await camera.trigger(input=data, timeout=timeout)
                 except NotRunningError as exc:
+                    url = shlex.quote(camera.url)
                     raise NotRunningError(
-                        f"{exc}. To start it: smartcam start {camera.url}, or trigger with "
+                        f"{exc}. To start it: smartcam start {url}, or trigger with "
                         f"--application {camera.active_application}"
                     ) from exc
                 options.show(result, result_text)
@@ -159,7 +161,7 @@ async def _watch(url: str, options: Options) -> None:
             if not camera.capabilities.unasked_results:
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some: "
-                    f"smartcam trigger {camera.url} --count N"
+                    f"smartcam trigger {shlex.quote(camera.url)} --count N"
                 )
             done = 0
             try:

@@ -184,7 +184,7 @@ def test_trigger_stopped_exits_5_and_tells_how_to_start(url: str) -> None:
     run("switch", url, "2").done()
     run("stop", url).done()
     outcome = run("trigger", url)
-    outcome.failed(5, "application 2 is stopped", f"smartcam start {url}", "--application 2")
+    outcome.failed(5, "application 2 is stopped", f"smartcam start '{url}'", "--application 2")
 
 
 # ---------------------------------------------------------------------- not interpretable: 6

@@ -124,7 +124,7 @@ def test_trigger_with_an_application_has_it_online(url: str) -> None:
 
 def test_trigger_of_a_camera_that_is_offline_exits_5_and_says_how_to_start(url: str) -> None:
     run("trigger", f"{url}?cells=A1").failed(
-        5, "application 1 is stopped", f"smartcam start {url}?dialect=native&cells=A1"
+        5, "application 1 is stopped", f"smartcam start '{url}?dialect=native&cells=A1'"
     )
 
 
@@ -183,7 +183,7 @@ def test_switch_to_a_file_is_unsupported_where_there_are_none() -> None:
 
 def test_watch_says_that_nothing_comes_by_itself(online: str) -> None:
     run("watch", online, "--seconds", "10").failed(
-        5, "the camera sends no results by itself; to have some: smartcam trigger insight://"
+        5, "the camera sends no results by itself; to have some: smartcam trigger 'insight://"
     )
 
 
@@ -234,5 +234,5 @@ def test_protocols_lists_it_with_its_parameters() -> None:
         23,
         ["IN-SIGHT"],
     )
-    assert list(line["parameters"]) == ["user", "password", "cells"]
+    assert list(line["parameters"]) == ["user", "password", "cells", "counter"]
     assert "insight (built-in): insight://, port 23" in run("protocols").done().out
