@@ -7,7 +7,13 @@ import random
 from collections.abc import Callable, Iterator  # noqa: TC003 - old pydantic looks them up
 from dataclasses import dataclass, field
 
-from smartcam.exceptions import ConfigurationError, LinkError, PluginError, SmartCamError
+from smartcam.exceptions import (
+    CommandRejectedError,
+    ConfigurationError,
+    LinkError,
+    PluginError,
+    SmartCamError,
+)
 
 __all__ = ["Backoff", "is_transient"]
 
@@ -17,9 +23,11 @@ def is_transient(error: BaseException) -> bool:
 
     What happens to links does pass: nothing listens, no way to the host, a name that does not
     resolve while the name server is away, silence, a peer that breaks the protocol. An error in
-    what the user gave or in a plug-in does not.
+    what the user gave or in a plug-in does not, nor a camera that refuses the session: a wrong
+    password stays wrong, and many tries may lock the account.
     """
-    if isinstance(error, (ConfigurationError, PluginError)):
+    refused = isinstance(error.__cause__, CommandRejectedError)
+    if refused or isinstance(error, (ConfigurationError, PluginError)):
         return False
     return isinstance(error, (LinkError, SmartCamError, OSError))
 

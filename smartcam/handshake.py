@@ -26,7 +26,7 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.protocols.base import UNDOCUMENTED, Dialect, Protocol, Transport, Verdict
+from smartcam.protocols.base import Dialect, Protocol, Transport, Verdict
 from smartcam.protocols.machine import LinkEnded, LinkFailed
 from smartcam.protocols.messages import (
     Connect,
@@ -151,13 +151,12 @@ class _Collector:
         for event in chunk.events:
             match event:
                 case ConnectAnswer(code=code, version=version):
-                    meaning = dialect.code(code, Connect)
-                    if meaning.verdict is not Verdict.DONE:
+                    if dialect.code(code, Connect).verdict is not Verdict.DONE:
                         said = "the camera refused the session: "
                         said += code_text(dialect, code, Connect)
-                        if meaning.verdict is Verdict.BUSY or meaning is UNDOCUMENTED:
-                            raise RemoteProtocolError(said)  # it may not say so again
-                        raise CommandRejectedError(said, code=code)
+                        if dialect.has_login:
+                            raise CommandRejectedError(said, code=code)
+                        raise RemoteProtocolError(said)
                     if version < 1:
                         raise RemoteProtocolError(f"the camera speaks protocol version {version}")
                     self.version = version

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from smartcam import (
     Backoff,
+    CommandRejectedError,
     ConfigurationError,
     ConnectFailedError,
     ConnectionLostError,
@@ -170,3 +171,9 @@ def test_backoff_is_a_value() -> None:
     assert hash(Backoff()) == hash(Backoff())
     with pytest.raises(dataclasses.FrozenInstanceError):
         Backoff().initial = 1.0  # type: ignore[misc]
+
+
+def test_session_that_was_refused_is_not_transient() -> None:
+    error = ConnectFailedError("no session", host="h", port=1)
+    error.__cause__ = CommandRejectedError("the password is wrong", code=-6)
+    assert not is_transient(error)

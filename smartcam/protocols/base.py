@@ -192,6 +192,11 @@ class Dialect(ABC):
         """Whether the camera serves one client, and a newcomer takes it."""
         return True
 
+    @property
+    def has_login(self) -> bool:
+        """Whether a session that is refused is refused for good: a wrong password stays wrong."""
+        return False
+
     @abstractmethod
     def code(self, code: int, request: type[Message] | None = None) -> Code:
         """Return what a result code means in the answer to a request."""

@@ -146,6 +146,11 @@ class InSightDialect(Dialect):
         """Several users may be connected at a time (published)."""
         return False
 
+    @property
+    def has_login(self) -> bool:
+        """A user logs in."""
+        return True
+
     def code(self, code: int, request: type[m.Message] | None = None) -> Code:
         """Return what a status code means in the answer to a request."""
         if request is m.Connect and code != StatusCode.DONE:

@@ -668,6 +668,17 @@ async def test_reconnect_keeps_the_password() -> None:
             assert camera.statistics().reconnects == 1
 
 
+async def test_reconnect_that_is_refused_is_not_tried_for_ever() -> None:
+    quick = Backoff(initial=0.0, maximum=0.0, jitter=0.0)
+    async with insight(reconnect=quick) as (emulator, camera):
+        emulator.refuse_login = True
+        emulator.drop_connections()
+        await until(lambda: not camera.connected)
+        with pytest.raises(ConnectionLostError, match="the user or the password is wrong"):
+            await camera.wait_connected()
+        assert said(emulator).count("***") == 2
+
+
 async def test_silent_camera_is_given_up() -> None:
     async with insight(liveness_timeout=2 * SHORT) as (emulator, camera):
         events = camera.events()
