@@ -268,9 +268,18 @@ class Station:
             await self._one_client()
         for _ in range(5):
             if not self._heard:
+                heal(self)  # a port that is shut would use up every client in a millisecond
+                await self._up()
                 await self._one_client()
         if not self._heard:
             self._complain("not heard to the end")
+
+    async def _up(self) -> None:
+        """Wait until the camera is on the network, two seconds at most."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(2.0):
+                while self.emulator.device.rebooting:
+                    await asyncio.sleep(0.01)
 
     async def _one_client(self) -> None:
         ear = self._ear = ClientEar(self.ledger)
