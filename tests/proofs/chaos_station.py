@@ -276,10 +276,10 @@ class Station:
 
     async def _up(self) -> None:
         """Wait until the camera is on the network, two seconds at most."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(2.0):
-                while self.emulator.device.rebooting:
-                    await asyncio.sleep(0.01)
+        for _ in range(200):
+            if not self.emulator.device.rebooting:
+                return
+            await asyncio.sleep(0.01)
 
     async def _one_client(self) -> None:
         ear = self._ear = ClientEar(self.ledger)
