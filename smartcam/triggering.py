@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from smartcam.connection import Link
     from smartcam.conversation import Conversation
+    from smartcam.inbox import Inbox
     from smartcam.interpretation import Interpretation
     from smartcam.models import Result
 
@@ -92,7 +93,7 @@ class Triggers:
 
     def __init__(self, talk: Conversation) -> None:
         self._talk = talk
-        self.inbox = talk.inbox
+        self.inbox: Inbox = talk.inbox
         self.name: str = talk.name
         self._doubtful: Link | None = None  # over UDP: a status may have been lost on it
         self._alarm = Alarm(self._expire)
