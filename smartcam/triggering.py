@@ -113,16 +113,20 @@ class Triggers:
 
     async def _trigger_until_taken(self, request: TriggerRequest, deadline: float) -> list[Result]:
         """Trigger again where the camera says that it was too busy for it."""
+        busy: CameraBusyError | None = None
         while True:
             try:
+                if busy is not None:
+                    await self._talk.pause(deadline, "the camera to take a trigger")
                 return await self._trigger_once(request, deadline)
             except CameraBusyError as exc:
                 if not request.wait:
                     raise
-                try:
-                    await self._talk.pause(deadline, "the camera to take a trigger")
-                except ResponseTimeoutError as timeout:
-                    raise TriggerTimeoutError(f"{timeout}; {exc}") from exc
+                busy = exc
+            except (ResponseTimeoutError, TriggerTimeoutError) as exc:
+                if busy is None:
+                    raise
+                raise TriggerTimeoutError(f"{exc}; {busy}", waited=exc.waited) from busy
 
     async def _trigger_once(self, request: TriggerRequest, deadline: float) -> list[Result]:
         """Send one trigger as soon as the camera takes it, return its results.
@@ -207,7 +211,7 @@ class Triggers:
             # it may have been stopped: then Waiting did not drop for this trigger
             certain = self._talk.ordered or pending.dropped_waiting
             self._doubtful = None if certain else link
-            waited = deadline - pending.sent_at
+            waited = max(0.0, deadline - pending.sent_at)
             came = f"{len(pending.results)} of {pending.wanted} results"
             raise TriggerTimeoutError(
                 f"{self.name}: {came if pending.results else 'no result'} within "
