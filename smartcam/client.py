@@ -321,7 +321,7 @@ class SmartCamera:
         """
         self._talk.require_link()
         deadline = self._talk.deadline(timeout)
-        await self._fresh_status(deadline)
+        await self._talk.refresh_status(deadline)
         return await self._talk.until(predicate, deadline, "the status wanted", insist=False)
 
     async def wait_ready(self, timeout: float = 10.0) -> Status:
@@ -333,11 +333,10 @@ class SmartCamera:
         Cancellation: safe.
         """
         self._talk.require_link()
-        await self._fresh_status(self._talk.deadline(timeout))
+        deadline = self._talk.deadline(timeout)
+        await self._talk.refresh_status(deadline)
         predicate = is_ready if self._talk.wants_running else _is_not_busy
-        return await self._talk.until(
-            predicate, self._talk.deadline(timeout), "the camera to be ready"
-        )
+        return await self._talk.until(predicate, deadline, "the camera to be ready")
 
     def next_result(
         self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
@@ -496,7 +495,7 @@ class SmartCamera:
         """
         limit = self.settings.switch_timeout if timeout is None else timeout
         async with self._turns.hold(limit) as deadline:
-            await self._fresh_status(deadline)
+            await self._talk.refresh_status(deadline)
             await self._talk.switch(application, deadline, start=self._talk.runs)
 
     @contextlib.asynccontextmanager
@@ -733,11 +732,6 @@ class SmartCamera:
 
     async def _tell(self, message: m.Request) -> None:
         await self._talk.command(message, self._talk.deadline(self.settings.request_timeout))
-
-    async def _fresh_status(self, deadline: float) -> None:
-        """Do not take an old status for the present one, where it does not come by itself."""
-        if not self._talk.dialect.capabilities.status_by_itself:
-            await self._talk.refresh_status(deadline)
 
     def _interpretation(self, spec: object) -> Interpretation:
         known = self._interpretations.get(spec) if isinstance(spec, str) else None

@@ -501,8 +501,7 @@ class Conversation:
 
     async def query_loaded(self, deadline: float) -> int:
         """Return the active application; while one is being loaded a Query tells the old one."""
-        if self.poll is not None:
-            await self.refresh_status(deadline)  # whether it runs is asked next
+        await self.refresh_status(deadline)  # whether it runs is asked next
         await self.until(_is_not_loading, deadline, "the application to be loaded")
         return await self.query(deadline)
 
@@ -630,11 +629,10 @@ class Conversation:
         return self._timeout(message, "could not send", "in time: an earlier answer is owed")
 
     def _timeout(self, message: m.Message, what: str, why: str) -> ResponseTimeoutError:
-        message_id = self.require_link().machine.dialect.message_id(message)
+        dialect = self.dialect
         return ResponseTimeoutError(
-            f"{self.name}: {what} {type(message).__name__} ({message_id:#04x}) {why}; "
-            f"status: {self.status}",
-            message_id=message_id,
+            f"{self.name}: {what} {dialect.called(message)} {why}; status: {self.status}",
+            message_id=dialect.message_id(message),
         )
 
 

@@ -31,8 +31,10 @@ QUICK = [
         id=5, layout="n: int32", constant={"n": 1}, rate=100, load_time=0, processing_time=0
     ),
     Application(id=6, rate=100, load_time=0, processing_time=0),
+    Application(id=10, load_time=0, processing_time=0),
 ]
-"""2 waits for triggers, 4 has no "send results" tool, 5 runs free, 6 does so and sends nothing."""
+"""2 waits for triggers, 4 has no "send results" tool, 5 runs free, 6 does so and sends nothing, 10
+neither sends nor takes any time."""
 
 
 def camera(active: int = 2, **options: Any) -> EmulatedCamera:
@@ -382,10 +384,12 @@ async def test_trigger_that_is_not_taken_is_told() -> None:
 
 
 async def test_trigger_without_result_where_the_status_is_asked_for_is_told() -> None:
-    async with camera(4, dialect="bid") as emulator:
+    async with camera(10, dialect="bid") as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
     assert errors(findings) == [("trigger", Exit.RAN_OUT)]
-    assert "no result came within 0.2 s" in of(findings, "trigger").text
+    found = of(findings, "trigger")
+    assert found.text == "trigger 1 was taken, and no result came within 0.2 s"
+    assert '"Outputs"' in found.cure
 
 
 @pytest.mark.parametrize(

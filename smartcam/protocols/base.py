@@ -213,6 +213,10 @@ class Dialect(ABC):
             UnsupportedError: it has no such message.
         """
 
+    def called(self, message: Message) -> str:
+        """Return what an error calls a message: its name, and its id or command."""
+        return f"{type(message).__name__} ({self.message_id(message):#04x})"
+
     def answers(self, request: type[Request]) -> bool:
         """Whether the camera answers such a request."""
         return request.answer is not None and self.has(request.answer)

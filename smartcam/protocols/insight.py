@@ -68,7 +68,7 @@ _MNEMONICS: Mapping[type[m.Message], str] = {
     m.Start: "SO",
     m.Stop: "SO",
     m.Trigger: "SW",
-    m.ReadImage: "RB",
+    m.ReadImage: "RI",
 }
 """The command behind each of the library's requests."""
 
@@ -172,6 +172,12 @@ class InSightDialect(Dialect):
         if not self.has(kind):
             raise self.unsupported(kind)
         return 0
+
+    def called(self, message: m.Message) -> str:
+        """Return what an error calls a message: its name, and its command."""
+        kind = type(message)
+        command = message.line if isinstance(message, Command) else _MNEMONICS.get(kind, "")
+        return f"{kind.__name__} ({command[:32]})"
 
     def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
         """Return a line in words; the password is not shown."""

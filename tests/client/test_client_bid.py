@@ -503,6 +503,18 @@ async def test_bid_query_status_whose_answer_is_lost_asks_again(transport: str) 
         assert await camera.query_status() == Status.RUNNING
 
 
+async def test_bid_wait_ready_asks_and_waits_within_one_timeout() -> None:
+    async with bid_by_hand() as (box, camera):
+        silences = iter([True] * 4)
+        box.status = 0  # not Ready
+        before = box.script[STATUS]
+        box.script[STATUS] = lambda payload: b"" if next(silences, False) else before(payload)
+        with pytest.raises(ResponseTimeoutError, match="for the camera to be ready") as caught:
+            await camera.wait_ready(timeout=0.3)
+        # the questions that were not answered took four pauses of it
+        assert caught.value.waited < 0.3 - 3 * 0.02
+
+
 async def test_bid_query_status_that_is_never_answered_is_a_timeout() -> None:
     async with bid_by_hand() as (box, camera):
         box.script[STATUS] = quiet

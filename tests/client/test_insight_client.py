@@ -691,7 +691,7 @@ async def test_silent_camera_is_given_up() -> None:
 async def test_silent_camera_costs_a_request_its_link() -> None:
     async with insight() as (emulator, camera):
         emulator.silent = True
-        with pytest.raises(smartcam.ResponseTimeoutError, match="no answer to ReadImage"):
+        with pytest.raises(smartcam.ResponseTimeoutError, match=r"no answer to ReadImage \(RI\) "):
             await camera.read_image(timeout=SHORT)
         await until(lambda: not camera.connected)
 
