@@ -63,6 +63,7 @@ LIMITS = (
     "protocols.framing.MOST_READ",
     "protocols.framed.MAX_KNOWN",
     "connection.MAX_CHUNKS",
+    "connection.MAX_REST",
     "client.DEFAULT_MAX_QUEUE",
     "client.MAX_INTERPRETATIONS",
     "client.DEFAULT_TRIGGER_TIMEOUT",

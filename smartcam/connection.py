@@ -35,6 +35,10 @@ MAX_CHUNKS = 256
 and UDP drops, which is counted."""
 
 
+MAX_REST = 256
+"""Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
+
+
 class Chunk(NamedTuple):
     """Events that one delivery of bytes gave, and the loop time when it came."""
 
@@ -48,7 +52,8 @@ class TraceEntry(NamedTuple):
     Attributes:
         at: when, UTC.
         camera: name of the camera.
-        direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol.
+        direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
+            unfinished frame when the link ended.
         message_id: id on the wire, None for broken bytes and where there are no such ids.
         message: name of the message, or the error's text for broken bytes.
         fields: decoded body, None where it cannot be decoded.
@@ -97,6 +102,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.heard_at: float = self._loop.time()
         self._transport: Any = None
         self._replies = machine.replies
+        self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
         self._receiver: Callable[[Chunk], None] | None = None
         self._wakeup: asyncio.Future[None] | None = None
@@ -268,6 +274,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def eof_received(self) -> None:
         """asyncio: the camera will send no more."""
+        self._show_rest()
         self.machine.receive_eof()
         self._hand_on()
         self._lose(ConnectionResetError("the camera closed the connection"))
@@ -343,9 +350,16 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._paused = False
             self._transport.resume_reading()
 
+    def _show_rest(self) -> None:
+        show, self.on_rest = self.on_rest, None
+        rest = self.machine.pending if show is not None else b""
+        if show is not None and rest:
+            show(rest)
+
     def _lose(self, reason: BaseException) -> None:
         if self._loss is None:
             self._loss = reason
+            self._show_rest()
         self._writable.set()
         self._wake()
 
@@ -385,11 +399,17 @@ async def open_link(
     loop = asyncio.get_running_loop()
     machine: LinkMachine
 
-    def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
-        entry = _trace_entry(name, machine.dialect, sender, frame)
+    def note(entry: TraceEntry) -> None:
         logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
         if trace is not None:
             trace(entry)
+
+    def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
+        note(_trace_entry(name, machine.dialect, sender, frame))
+
+    def on_rest(rest: bytes) -> None:
+        text, shown = f"{len(rest)} bytes that make no whole frame", rest[:MAX_REST].hex()
+        note(TraceEntry(datetime.now(UTC), name, "!", None, text, None, shown))
 
     traced = trace is not None or logger.isEnabledFor(logging.DEBUG)
     machine = protocol.machine(
@@ -401,6 +421,7 @@ async def open_link(
         kin=tuple(dialects),
     )
     link = Link(machine, name=name, host=host, port=port, liveness_timeout=liveness_timeout)
+    link.on_rest = on_rest if traced else None
     if transport is Transport.TCP:
         await loop.create_connection(lambda: link, host, port)
     else:

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import contextlib
 import os
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.connection import TraceEntry
@@ -21,7 +19,7 @@ from smartcam.handshake import Try, attempt, load_protocol, names_of
 from smartcam.models import Status
 from smartcam.protocols.base import Transport
 from smartcam.protocols.framing import DEFAULT_MAX_LENGTH
-from smartcam.protocols.messages import Disconnect, QueryAnswer, StatusReport
+from smartcam.protocols.messages import QueryAnswer, StatusReport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
@@ -34,12 +32,6 @@ __all__ = ["Answer", "Trial", "Way", "trials", "ways"]
 
 MAX_FRAMES = 64
 """Entries that a trial keeps: making a session takes six, and a camera may send results at once."""
-
-MAX_RAW = 256
-"""Bytes shown of what makes no whole frame."""
-
-RAW_PATIENCE = 0.5
-"""Seconds that such bytes are listened for once more."""
 
 CLOSE_TIMEOUT = 1.0
 """Seconds for the orderly end of a session."""
@@ -184,13 +176,6 @@ class _Notes:
         else:
             self.omitted += 1
 
-    @property
-    def unseen_from(self) -> int | None:
-        """How many bytes of whole frames came; None where broken bytes are shown already."""
-        if self.omitted or any(entry.direction == "!" for entry in self.frames):
-            return None
-        return sum(len(entry.hex) // 2 for entry in self.frames if entry.direction == "<")
-
 
 async def _try(
     way: Way,
@@ -227,9 +212,6 @@ async def _try(
         answer = _answer(session)
         notes.ended = True
         await session.link.close(CLOSE_TIMEOUT)
-    whole = notes.unseen_from
-    if error is not None and whole is not None and progress.received > whole:
-        await _look_again(way, notes, progress.received - whole)
     return Trial(
         address=address,
         transport=progress.transport,
@@ -254,63 +236,3 @@ def _answer(session: Session) -> Answer:
         elif isinstance(event, QueryAnswer):
             application = event.application
     return Answer(session.address.url, status or Status(0), application, session.version)
-
-
-async def _look_again(way: Way, notes: _Notes, missing: int) -> None:
-    """Note the bytes that came and made no whole frame.
-
-    A link shows whole frames and broken ones; what waited for its rest when the try ended is seen
-    by saying the same words on a plain socket once more.
-    """
-    said = [entry for entry in notes.frames if entry.direction == ">"]
-    if way.transport is not Transport.TCP or any(entry.message_id is None for entry in said):
-        # a datagram that is no whole frame is broken at once; commands, a login among them, are
-        # not repeated
-        return
-    goodbye = said[1:] and said[-1].message == Disconnect.__name__
-    words = [bytes.fromhex(entry.hex) for entry in said]
-    split = len(words) - 1 if goodbye else len(words)
-    whole = sum(len(entry.hex) // 2 for entry in notes.frames if entry.direction == "<")
-    wanted = whole + min(missing, MAX_RAW)
-    data = b""
-    with contextlib.suppress(OSError, UnicodeError):
-        data = await _overhear(way, b"".join(words[:split]), b"".join(words[split:]), wanted)
-    rest = data[whole:]
-    shown = "seen on a second link" if rest else "which a second link did not bring"
-    notes.take(
-        TraceEntry(
-            datetime.now(UTC),
-            f"{way.address.host}:{way.address.port}",
-            "!",
-            None,
-            f"{missing} bytes that make no whole frame ({shown})",
-            None,
-            rest.hex(),
-        )
-    )
-
-
-async def _overhear(way: Way, words: bytes, goodbye: bytes, wanted: int) -> bytes:
-    """Return what comes on a plain socket; bounded by ``RAW_PATIENCE``."""
-    data = b""
-    writer: asyncio.StreamWriter | None = None
-    try:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(RAW_PATIENCE):
-                reader, writer = await asyncio.open_connection(way.address.host, way.address.port)
-                writer.write(words)
-                while len(data) < wanted:
-                    more = await reader.read(wanted - len(data))
-                    if not more:
-                        break
-                    data += more
-        if writer is not None:
-            writer.write(goodbye)
-            writer.close()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(RAW_PATIENCE):
-                    await writer.wait_closed()
-    finally:
-        if writer is not None:
-            writer.transport.abort()
-    return data

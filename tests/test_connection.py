@@ -610,3 +610,19 @@ async def test_udp_queue_full_drops_and_counts(monkeypatch: pytest.MonkeyPatch) 
         camera.send(BUSY)
         assert await take(link, 1) == [BUSY_REPORT]
         link.abort()
+
+
+@pytest.mark.parametrize("how", ["the camera closes", "the client gives up"])
+async def test_trace_shows_what_is_left_of_an_unfinished_frame(server: Listener, how: str) -> None:
+    entries: list[TraceEntry] = []
+    link, peer = await session(server, entries.append)
+    peer.write(STATUS[:15])
+    await until(lambda: len(link.machine.pending) == 15)
+    if how == "the camera closes":
+        peer.close()
+        await link.wait_lost()
+    link.give_up(TimeoutError("silence"))
+    left = [entry for entry in entries if entry.direction == "!"]
+    assert [(entry.message, entry.hex) for entry in left] == [
+        ("15 bytes that make no whole frame", STATUS[:15].hex())
+    ]

@@ -58,6 +58,11 @@ class AnswerReader:
         """Bytes that wait."""
         return len(self._lines)
 
+    @property
+    def pending(self) -> bytes:
+        """Copy of those bytes."""
+        return self._lines.pending
+
     def feed(self, data: bytes) -> None:
         """Take what came; read until nothing is left to be read, then no more than a line waits."""
         self._lines.feed(data)

@@ -183,6 +183,11 @@ class InSightMachine:
         """Bytes that wait for more: of a line, or of a counted text."""
         return len(self._reader)
 
+    @property
+    def pending(self) -> bytes:
+        """Copy of those bytes."""
+        return self._reader.pending
+
     def room(self) -> memoryview:
         """Return where the next bytes may be written; call :meth:`filled` next."""
         return self._store

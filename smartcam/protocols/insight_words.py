@@ -508,6 +508,11 @@ class LineReader:
         """Bytes that wait."""
         return len(self._buffer)
 
+    @property
+    def pending(self) -> bytes:
+        """Copy of those bytes."""
+        return bytes(self._buffer)
+
     def feed(self, data: bytes) -> None:
         """Take what came. Whoever feeds it bounds what waits, by :func:`len`."""
         self._buffer += data

@@ -203,6 +203,11 @@ class LinkMachine(Protocol):
         """Where the link is."""
         ...
 
+    @property
+    def pending(self) -> bytes:
+        """What came and still waits for its rest."""
+        ...
+
     def adopt(self, dialect: Dialect) -> None:
         """It is this one of its kin."""
         ...
@@ -342,6 +347,11 @@ class Machine:
     def buffered(self) -> int:
         """Bytes of an unfinished frame that are kept; at most one header and one payload."""
         return self._framer.buffered
+
+    @property
+    def pending(self) -> bytes:
+        """Copy of those bytes."""
+        return self._framer.pending
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> None:
         """Take bytes from a stream, or one whole datagram; call :meth:`events` next.

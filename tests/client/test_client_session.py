@@ -469,6 +469,7 @@ def _fail(*_: object) -> None:
 async def test_supervisor_that_fails_tells_everybody(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.WARNING)
     async with by_hand() as (box, camera):
         waiting = asyncio.create_task(camera.wait_status(lambda _: False))
         await steps(1)
