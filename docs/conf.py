@@ -88,7 +88,7 @@ LIMITS = (
     "emulator.traffic.MAX_ENTRIES",
     "emulator.faults.MAX_FAULTS",
     "emulator.faults.MAX_FIRED",
-    "emulator.faults.MAX_BYTES",
+    "emulator.fault_base.MAX_BYTES",
     "protocols.insight_words.MAX_LINE",
     "protocols.insight_words.MAX_CELLS",
     "protocols.insight_answers.MAX_IMAGE",

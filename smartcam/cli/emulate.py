@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib
+import json
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -13,7 +14,7 @@ from click.core import ParameterSource
 import smartcam
 from smartcam.cli.options import Options, output_options
 from smartcam.cli.running import run
-from smartcam.emulator import EmulatedCamera, load_scenario
+from smartcam.emulator import EmulatedCamera, Scenario, load_scenarios, scenario_schema
 from smartcam.emulator.insight import BUILTIN_JOBS, EmulatedInSight
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 from smartcam.layout.files import YAML_ALSO_RAISES
@@ -22,8 +23,6 @@ from smartcam.protocols.insight import INSIGHT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-    from smartcam.emulator import Scenario
 
 __all__ = ["command"]
 
@@ -37,10 +36,8 @@ PROTOCOLS = (BVS.name, INSIGHT.name)
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
-    default=0,
-    show_default=True,
     help="Port; 0 takes a free one, a camera's own is 36701 (BVS) or 23 (In-Sight). Further "
-    "cameras take the next ones.",
+    "cameras take the next ones. Default what the scenario says, else 0.",
 )
 @click.option(
     "--protocol",
@@ -50,10 +47,14 @@ PROTOCOLS = (BVS.name, INSIGHT.name)
     help="Whose cameras; insight takes no scenario, --dialect or --transport.",
 )
 @click.option(
-    "--dialect", type=click.Choice(DIALECTS), default=DIALECTS[0], show_default=True, help="Speak."
+    "--dialect",
+    type=click.Choice(DIALECTS),
+    help=f"Speak; default what the scenario says, else {DIALECTS[0]}.",
 )
 @click.option(
-    "--transport", type=click.Choice(("tcp", "udp")), default="tcp", show_default=True, help="Over."
+    "--transport",
+    type=click.Choice(("tcp", "udp")),
+    help="Over; default what the scenario says, else tcp.",
 )
 @click.option(
     "--cameras", type=click.IntRange(1, 10_000), default=1, show_default=True, help="How many."
@@ -66,6 +67,12 @@ PROTOCOLS = (BVS.name, INSIGHT.name)
     help="Choose what is not known of real cameras; without a value it is on. Repeatable; goes "
     "before the scenario's.",
 )
+@click.option(
+    "--seed",
+    type=int,
+    help="Of all that is left to chance; default what the scenario says, else 0.",
+)
+@click.option("--schema", is_flag=True, help="Print the JSON Schema of scenario files, and end.")
 @output_options
 @click.version_option(smartcam.__version__)
 @click.pass_context
@@ -74,12 +81,14 @@ def command(
     /,
     scenario: str | None,
     host: str,
-    port: int,
+    port: int | None,
     protocol: str,
-    dialect: str,
-    transport: Literal["tcp", "udp"],
+    dialect: str | None,
+    transport: Literal["tcp", "udp"] | None,
     cameras: int,
     quirks: tuple[str, ...],
+    seed: int | None,
+    schema: bool,
     **shared: Any,
 ) -> None:
     """Emulate smart cameras, over real TCP or UDP, until Ctrl-C or SIGTERM.
@@ -90,34 +99,44 @@ def command(
     9 (free-running), and is offline at first.
     """
     options = Options(**shared)
+    if schema:
+        click.echo(json.dumps(scenario_schema(), indent=2))
+        return
     in_sight = protocol == INSIGHT.name
     if in_sight:
         _refuse_what_does_not_fit(context)
 
     async def main() -> None:
-        loaded = None if scenario is None else load_scenario(scenario)
-        chosen = _quirks(loaded, quirks)
-
-        def made(index: int) -> EmulatedCamera | EmulatedInSight:
-            at = port + index if port else 0
-            name = f"camera{index + 1}"
-            if in_sight:
-                return EmulatedInSight(BUILTIN_JOBS, host=host, port=at, quirks=chosen, name=name)
-            return EmulatedCamera(
-                scenario=loaded,
-                host=host,
-                port=at,
-                dialect=dialect,
-                transport=transport,
-                quirks=chosen,
-                name=name if cameras > 1 else None,
-            )
-
+        emulators: list[EmulatedCamera] | list[EmulatedInSight]
+        if in_sight:
+            chosen = _quirks(None, quirks)
+            emulators = [
+                EmulatedInSight(
+                    BUILTIN_JOBS,
+                    host=host,
+                    port=port + index if port else 0,
+                    quirks=chosen,
+                    name=f"camera{index + 1}",
+                )
+                for index in range(cameras)
+            ]
+        else:
+            emulators = [
+                EmulatedCamera(
+                    scenario=plan,
+                    host=host,
+                    port=port + index if port else port,
+                    dialect=dialect,
+                    transport=transport,
+                    quirks=_quirks(plan, quirks),
+                    seed=None if seed is None else seed + index,
+                )
+                for index, plan in enumerate(_scenarios(scenario, dialect, cameras))
+            ]
         async with contextlib.AsyncExitStack() as stack:
-            for index in range(cameras):
-                emulator = made(index)
+            for emulator in emulators:
                 await stack.enter_async_context(emulator)
-                _announce(emulator, options)
+                _announce(emulator, options, named=scenario is not None)
             await asyncio.Event().wait()
 
     run(
@@ -126,6 +145,27 @@ def command(
         debug=options.debug,
         interrupted=0,
         terminated=0,
+    )
+
+
+def _scenarios(path: str | None, dialect: str | None, copies: int) -> tuple[Scenario, ...]:
+    """Return a scenario for each camera.
+
+    Raises:
+        ConfigurationError: the file is wrong, or copies are wanted of several cameras.
+        MissingExtraError: PyYAML is not installed.
+    """
+    loaded = (Scenario(),) if path is None else load_scenarios(path, dialect=dialect)
+    if copies == 1:
+        return loaded
+    if len(loaded) > 1:
+        raise ConfigurationError(
+            f"--cameras {copies}: the scenario {path} has {len(loaded)} cameras already"
+        )
+    (one,) = loaded
+    return tuple(
+        one.model_copy(update={"name": f"camera{index + 1}", "seed": one.seed + index})
+        for index in range(copies)
     )
 
 
@@ -165,13 +205,18 @@ def _refuse_what_does_not_fit(context: click.Context) -> None:
     Raises:
         click.UsageError: names it.
     """
-    said = {"scenario": "scenario", "dialect": "--dialect", "transport": "--transport"}
+    said = {
+        "scenario": "scenario",
+        "dialect": "--dialect",
+        "transport": "--transport",
+        "seed": "--seed",
+    }
     for name, text in said.items():
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise click.UsageError(f"--protocol {INSIGHT.name} takes no {text}")
 
 
-def _announce(emulator: EmulatedCamera | EmulatedInSight, options: Options) -> None:
+def _announce(emulator: EmulatedCamera | EmulatedInSight, options: Options, *, named: bool) -> None:
     if isinstance(emulator, EmulatedInSight):
         transport, dialect = INSIGHT.schemes["insight"].value, next(iter(INSIGHT.dialects))
         ids = [job.id for job in emulator.device.jobs.values() if job.id is not None]
@@ -186,4 +231,11 @@ def _announce(emulator: EmulatedCamera | EmulatedInSight, options: Options) -> N
         "dialect": dialect,
         "applications": sorted(ids),
     }
+    if named:
+        value["name"] = emulator.name
+    if isinstance(emulator, EmulatedCamera) and emulator.scenario.is_random:
+        value["seed"] = emulator.seed
+        click.echo(
+            f"{emulator.name}: what is left to chance has the seed {emulator.seed}", err=True
+        )
     options.show(value, emulator.url)

@@ -11,18 +11,25 @@ from smartcam.emulator.application import Application
 from smartcam.emulator.clock import Clock, ManualClock, RealClock
 from smartcam.emulator.device import Device
 from smartcam.emulator.faults import FiredFault
+from smartcam.emulator.fleet import EmulatedFleet
 from smartcam.emulator.generators import Run, register_generator
 from smartcam.emulator.quirks import Quirks
-from smartcam.emulator.scenario import Scenario, load_scenario
+from smartcam.emulator.scenario import Scenario
+from smartcam.emulator.scenario_file import load_scenario, load_scenarios, scenario_schema
 from smartcam.emulator.scene import TableScene
 from smartcam.emulator.server import EmulatedCamera
-from smartcam.emulator.traffic import LogEntry
+from smartcam.emulator.states import DeviceState
+from smartcam.emulator.timeline import Cue
+from smartcam.emulator.traffic import LogEntry, Visit
 
 __all__ = [
     "Application",
     "Clock",
+    "Cue",
     "Device",
+    "DeviceState",
     "EmulatedCamera",
+    "EmulatedFleet",
     "FiredFault",
     "LogEntry",
     "ManualClock",
@@ -31,7 +38,10 @@ __all__ = [
     "Run",
     "Scenario",
     "TableScene",
+    "Visit",
     "faults",
     "load_scenario",
+    "load_scenarios",
     "register_generator",
+    "scenario_schema",
 ]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from smartcam.emulator import faults as f
+from smartcam.emulator.scene import TablePose
 from smartcam.models import Status
 
 if TYPE_CHECKING:
@@ -26,11 +27,13 @@ class Stage:
         device: the camera.
         refuse: closes the port for so many seconds.
         let_stranger_in: lets another client connect.
+        clear: forgets the faults that wait, and ends those that last.
     """
 
     device: Device
     refuse: Callable[[float], None]
     let_stranger_in: Callable[[], None]
+    clear: Callable[[], None]
 
 
 def _condition(stage: Stage, fault: f.Condition) -> None:
@@ -39,6 +42,10 @@ def _condition(stage: Stage, fault: f.Condition) -> None:
 
 def _switch(stage: Stage, fault: f.SwitchApplication) -> None:
     stage.device.switch_application(fault.application, running=fault.running)
+
+
+def _move(stage: Stage, fault: f.MovePart) -> None:
+    stage.device.scene.pieces[fault.part] = TablePose(fault.x, fault.y, fault.theta)
 
 
 _ACTIONS: Mapping[type[f.DeviceFault], Callable[[Stage, Any], object]] = {
@@ -54,6 +61,11 @@ _ACTIONS: Mapping[type[f.DeviceFault], Callable[[Stage, Any], object]] = {
     f.LateResult: lambda stage, fault: stage.device.change_run(late=fault.seconds),
     f.NoResult: lambda stage, _: stage.device.change_run(silent=True),
     f.ExtraResult: lambda stage, fault: stage.device.change_run(extra=fault.count),
+    f.DigitalInput: lambda stage, _: stage.device.trigger(),
+    f.ByteOrder: lambda stage, fault: stage.device.set_endian(fault.endian),
+    f.MovePart: _move,
+    f.RemovePart: lambda stage, fault: stage.device.scene.pieces.pop(fault.part, None),
+    f.ClearFaults: lambda stage, _: stage.clear(),
 }
 
 

@@ -23,6 +23,7 @@ from smartcam.emulator.manner import SMART_CAMERA, Manner
 from smartcam.emulator.parts import LOST_CLOCK, CalendarClock, InputQueue, RunChange
 from smartcam.emulator.quirks import Quirks
 from smartcam.emulator.scene import TableScene
+from smartcam.emulator.states import DeviceState, risen_states
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
@@ -132,6 +133,9 @@ class Device:
         self.quirks: Quirks = quirks or Quirks()
         self.scene: TableScene = scene or TableScene()
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
+        self._on_entered: Callable[[DeviceState], None] | None = None
+        self._entered: list[DeviceState] = []
+        self._bits = 0  # of the status word, as last seen
         first = next(iter(self._applications)) if active is None else active
         self._take_up(self._applications[self._known(first)])
         self._now = 0
@@ -266,6 +270,7 @@ class Device:
         Source: SC manual p. 28, 29 (published); that in ``bid`` no status comes: inferred.
         """
         self._session, self._owes_switch = True, False
+        self._enter(DeviceState.CONNECTED)
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
         self._reported = None
         if self.manner.status_with_session:
@@ -278,8 +283,26 @@ class Device:
 
         Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
         """
+        if self._session:
+            self._enter(DeviceState.DISCONNECTED)
         self._session = self._owes_switch = False  # an answer is for who asked
         self._output = []
+
+    def watch(self, on_entered: Callable[[DeviceState], None]) -> None:
+        """Have every state told that the device enters from now on.
+
+        It is told right behind the event that brought the device there; behind a message or an
+        operator's action by the next :meth:`tell_entered`.
+        """
+        self._on_entered = on_entered
+        self._bits = self._status_word()
+
+    def tell_entered(self) -> None:
+        """Tell of the states that were entered since the last time."""
+        while self._entered and self._on_entered is not None:
+            states, self._entered = self._entered, []
+            for state in states:
+                self._on_entered(state)
 
     def take_output(self) -> list[m.Message]:
         """Return what the camera said since the last call, in order; the caller owns the list."""
@@ -507,7 +530,7 @@ class Device:
     def _enter_run_mode(self) -> None:
         if self._mode is not Mode.STOPPED:
             return
-        self._mode = Mode.RUNNING
+        self._set_mode(Mode.RUNNING)
         if not self._active.triggered:
             self._plan_free_run(self._now, 0)
         self._report()
@@ -515,7 +538,7 @@ class Device:
     def _leave_run_mode(self) -> None:
         if self._mode is not Mode.RUNNING:
             return
-        self._mode = Mode.STOPPED
+        self._set_mode(Mode.STOPPED)
         self._void_run()
         self._events.pop(_Event.FREE_RUN, None)
         self._report()
@@ -559,7 +582,7 @@ class Device:
         """Begin to load ``target``; the status says BUSY until it is there."""
         self._void_run()
         self._events.pop(_Event.FREE_RUN, None)
-        self._mode = Mode.SWITCHING
+        self._set_mode(Mode.SWITCHING)
         self._owes_switch = answer
         finish = functools.partial(self._finish_load, target, running=running)
         self._after(target.load_time, _Event.LOADED, finish)
@@ -573,7 +596,7 @@ class Device:
         if self._mode is Mode.REBOOTING:
             return
         self.disconnect()
-        self._mode = Mode.REBOOTING
+        self._set_mode(Mode.REBOOTING)
         self._processing = False
         self._events = {}
         self._forget_faults()
@@ -594,6 +617,8 @@ class Device:
             _, action = self._events.pop(event)
             self._now = max(self._now, when)
             action()
+            if self._entered:
+                self.tell_entered()
         self._now = target
 
     def _end_overtrigger(self) -> None:
@@ -610,7 +635,7 @@ class Device:
     def _finish_load(self, target: Application, *, running: bool) -> None:
         self._take_up(target)
         self._forget_inputs()
-        self._mode = Mode.STOPPED
+        self._set_mode(Mode.STOPPED)
         message = m.SwitchAnswer(code=0, application=target.id)
         answer, self._owes_switch = self._owes_switch, False
         before = self.quirks.switch_answer == "before_status"
@@ -628,7 +653,7 @@ class Device:
         Source: newest SC manual p. 48 (numbering) and BVS ID guide p. 231 (clock), published;
         stopped, and a cleared System Error: inferred.
         """
-        self._mode = Mode.STOPPED
+        self._set_mode(Mode.STOPPED)
         self._forget_inputs()
         self._conditions &= _OVERHEAT
         self._next_number = self._runs = 0
@@ -678,6 +703,7 @@ class Device:
         self._next_number = (self._next_number + 1) % _NUMBERS
         self._runs += 1
         self._processing = True
+        self._enter(DeviceState.INSPECTING)
         ends = self._now + _ns(self._active.processing_time) + change.late
         self._events[_Event.INSPECTED] = (ends, functools.partial(self._finish_run, run))
         self._report()
@@ -773,9 +799,24 @@ class Device:
         if self._session:
             self._output.append(message)
 
+    def _enter(self, state: DeviceState) -> None:
+        if self._on_entered is not None:
+            self._entered.append(state)
+
+    def _set_mode(self, mode: Mode) -> None:
+        self._mode = mode
+        self._enter(DeviceState(mode.value))
+
+    def _note_bits(self, word: int) -> None:
+        """Look which bits of the status word have risen."""
+        risen, self._bits = word & ~self._bits, word
+        self._entered += risen_states(risen)
+
     def _report(self) -> None:
         """Send the status if it differs from the one the client has."""
         now = (self._status_word(), self._endian)
+        if self._on_entered is not None:
+            self._note_bits(now[0])
         if now != self._reported and self.manner.reports_changes:
             self._reported = now
             self._say(_status_report(*now))

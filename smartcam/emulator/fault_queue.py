@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from smartcam.protocols.framed import FramedDialect
     from smartcam.protocols.framing import Frame
 
-__all__ = ["FaultQueue", "Row"]
+__all__ = ["FaultQueue", "Row", "misfit"]
 
 _log = logging.getLogger("smartcam.emulator")
 
@@ -167,22 +167,25 @@ class FaultQueue:
 
     def _check(self, number: int, fault: Fault) -> None:
         """Refuse what this camera cannot do."""
-        if isinstance(fault.on, str) and not self._dialect.has(MESSAGE_NAMES[fault.on]):
-            raise ConfigurationError(
-                f"fault {number}: {fault.kind}.on: dialect {self._dialect.label} has no {fault.on}"
-            )
-        if isinstance(fault, Insert) and fault.word is not None:
-            try:
-                self._dialect.encode(fault.word)
-            except LocalProtocolError as exc:
-                raise ConfigurationError(f"fault {number}: insert.fields: {exc}") from exc
-            except UnsupportedError as exc:
-                raise ConfigurationError(
-                    f"fault {number}: insert.message: dialect {self._dialect.label} has no "
-                    f"{fault.message}"
-                ) from exc
-        if isinstance(fault, SwitchApplication) and fault.application not in self._applications:
-            raise ConfigurationError(
-                f"fault {number}: switch_application.application: the camera has no application "
-                f"{fault.application}"
-            )
+        wrong = misfit(fault, self._dialect, self._applications)
+        if wrong is not None:
+            field, text = wrong
+            raise ConfigurationError(f"fault {number}: {fault.kind}.{field}: {text}")
+
+
+def misfit(
+    fault: Fault, dialect: FramedDialect, applications: Container[int]
+) -> tuple[str, str] | None:
+    """Return which field of a fault a camera cannot do and why, None where it can do all."""
+    if isinstance(fault.on, str) and not dialect.has(MESSAGE_NAMES[fault.on]):
+        return "on", f"dialect {dialect.label} has no {fault.on}"
+    if isinstance(fault, Insert) and fault.word is not None:
+        try:
+            dialect.encode(fault.word)
+        except LocalProtocolError as exc:
+            return "fields", str(exc)
+        except UnsupportedError:
+            return "message", f"dialect {dialect.label} has no {fault.message}"
+    if isinstance(fault, SwitchApplication) and fault.application not in applications:
+        return "application", f"the camera has no application {fault.application}"
+    return None

@@ -107,6 +107,10 @@ class Station(Watch, Protocol):
         """A link is gone; harmless when said twice."""
         ...
 
+    def parted(self, link: Link, *, by_client: bool, reset: bool) -> None:
+        """A connection has ended."""
+        ...
+
     def traced(self, link: Link, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
         """A machine saw a frame, or bytes that make none."""
         ...
@@ -288,10 +292,12 @@ class _TcpLink(Link, asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         if self._farewell is not None:
             self._farewell.cancel()
+        by_client = not self.closed
         self._leave()
         self._listener.links.discard(self)
         with self._station.step():
             self._station.lost(self)
+        self._station.parted(self, by_client=by_client, reset=exc is not None)
 
     def write(self, data: bytes) -> bool:
         if self.closed:

@@ -1,30 +1,33 @@
-"""Scenarios: an emulated camera, described in a file."""
+"""Scenarios: emulated cameras as data; files of them are read by :mod:`.scenario_file`."""
 
 from __future__ import annotations
 
-import importlib
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from smartcam.emulator.application import BUILTIN_APPLICATIONS, Application
+from smartcam.emulator.fault_queue import misfit
 from smartcam.emulator.quirks import Quirks
-from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.layout.files import YAML_ALSO_RAISES
+from smartcam.emulator.timeline import Cue
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols.bvs import BVS
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+__all__ = ["MAX_CUES", "Scenario", "ScenarioFile"]
 
-__all__ = ["Scenario", "load_scenario"]
+MAX_CUES = 1000
+"""Cues of a timeline; every state that a camera enters is compared with those that wait for one."""
 
 
 class Scenario(BaseModel):
-    """One camera: its applications, how it stands at first, and its quirks."""
+    """One camera: its applications, how it stands at first, its quirks, and what happens to it."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(default="camera", min_length=1, max_length=200, description="for logs")
+    dialect: str = Field(default="handbook", description="name of the wire dialect")
+    transport: Literal["tcp", "udp"] = Field(default="tcp", description="tcp or udp")
+    port: int = Field(default=0, ge=0, le=65_535, description="port; 0 takes a free one")
     applications: tuple[Application, ...] = Field(
         default=(), description="the programs stored on it"
     )
@@ -37,7 +40,19 @@ class Scenario(BaseModel):
         default=True, description="have the built-in applications, as far as their ids are free"
     )
     quirks: Quirks = Field(default=Quirks(), description="what is unknown of real cameras")
-    seed: int = Field(default=0, description="of the table scene's noise")
+    seed: int = Field(
+        default=0, description="of all that is left to chance: the scene's noise, the timeline"
+    )
+    timeline: tuple[Cue, ...] = Field(
+        default=(), max_length=MAX_CUES, description="what happens to it by itself, and when"
+    )
+
+    @field_validator("dialect")
+    @classmethod
+    def _check_dialect(cls, value: str) -> str:
+        if value not in BVS.dialects:
+            raise ValueError(f"unknown; known are {', '.join(BVS.dialects)}")
+        return value
 
     @model_validator(mode="after")
     def _check(self) -> Scenario:
@@ -54,84 +69,102 @@ class Scenario(BaseModel):
         builtins = BUILTIN_APPLICATIONS if self.builtins else ()
         return (*self.applications, *(app for app in builtins if app.id not in ids))
 
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """The commands of the timeline, sorted."""
+        return tuple(sorted({cue.command for cue in self.timeline if cue.command is not None}))
 
-def load_scenario(path: str | Path) -> Scenario:
-    """Read a scenario file (YAML).
+    @property
+    def is_random(self) -> bool:
+        """Whether chance has a part in the timeline."""
+        return any(cue.is_random for cue in self.timeline)
 
-    Raises:
-        ConfigurationError: the file cannot be read or a field of it is wrong; the text names file,
-            line and field.
-        MissingExtraError: PyYAML is not installed.
-    """
-    try:
-        yaml: Any = importlib.import_module("yaml")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'scenario files need PyYAML: pip install "smartcam[yaml]"', extra="yaml"
-        ) from exc
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as exc:
-        raise ConfigurationError(f"scenario {path}: {exc}") from exc
-    try:
-        root = yaml.compose(text, yaml.SafeLoader)
-        data = yaml.safe_load(text)
-    except yaml.MarkedYAMLError as exc:
-        line = f", line {exc.problem_mark.line + 1}" if exc.problem_mark is not None else ""
-        raise ConfigurationError(f"scenario {path}{line}: {exc.problem or exc}") from exc
-    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
-        raise ConfigurationError(f"scenario {path}: {exc}") from exc
-    if root is not None:
-        _refuse_twice(root, path)
-    if not isinstance(data, dict):
-        raise ConfigurationError(f"scenario {path}: expected fields such as 'applications:'")
-    try:
-        return Scenario.model_validate(data)
-    except ValidationError as exc:
-        findings = [
-            f"line {_line(root, item['loc'])}: "
-            f"{'.'.join(str(part) for part in item['loc'])}: {item['msg']}"
-            for item in exc.errors()
-        ]
-        raise ConfigurationError(f"scenario {path}, {'; '.join(findings)}") from exc
-
-
-def _line(node: Any, loc: Sequence[int | str]) -> int:
-    """Return the line of the deepest node on the way to ``loc`` that is in the file."""
-    for part in loc:
-        found = _child(node, part)
-        if found is None:
-            break
-        node = found
-    return int(node.start_mark.line) + 1
-
-
-def _child(node: Any, part: int | str) -> Any:
-    if node.id == "mapping":
-        return next((value for key, value in node.value if key.value == str(part)), None)
-    if node.id == "sequence" and isinstance(part, int) and part < len(node.value):
-        return node.value[part]
-    return None
-
-
-def _refuse_twice(root: Any, path: str | Path) -> None:
-    """Refuse a key that stands twice in one mapping; YAML would take the last in silence."""
-    seen: set[int] = set()  # aliases may make a circle
-    waiting = [root]
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen or node.id == "scalar":
-            continue
-        seen.add(id(node))
-        if node.id == "sequence":
-            waiting.extend(node.value)
-            continue
-        keys: set[str] = set()
-        for key, value in cast("list[tuple[Any, Any]]", node.value):
-            if str(key.value) in keys:
-                raise ConfigurationError(
-                    f"scenario {path}, line {key.start_mark.line + 1}: "
-                    f"{key.value!r} stands there twice"
+    def mistake(self) -> tuple[tuple[str | int, ...], str] | None:
+        """Return where in it stands what the camera cannot do, and why; None where all is well."""
+        dialect = BVS.dialects[self.dialect]
+        known = [application.id for application in self.all_applications]
+        for number, application in enumerate(self.applications):
+            ids = dialect.application_ids
+            if application.id not in ids:
+                text = (
+                    f"application id {application.id} does not fit dialect {dialect.name}: "
+                    f"{ids.start} to {ids.stop - 1}"
                 )
-            keys.add(str(key.value))
-            waiting.append(value)
+                return ("applications", number, "id"), text
+        if self.active is not None and self.active not in known:
+            there = ", ".join(str(number) for number in known)
+            return ("active",), f"no application has the id {self.active}; there are {there}"
+        try:
+            spoken = dialect.with_quirks(self.quirks.of_the_wire)
+        except ConfigurationError as exc:
+            return ("quirks",), str(exc)
+        for number, cue in enumerate(self.timeline):
+            for place, fault in enumerate(cue.do):
+                found = misfit(fault, spoken, known)
+                if found is not None:
+                    return ("timeline", number, "do", place, found[0]), found[1]
+        return None
+
+
+class ScenarioFile(Scenario):
+    """A scenario file: one camera, or what several have in common, and these."""
+
+    cameras: tuple[Scenario, ...] = Field(
+        default=(),
+        max_length=1000,
+        description=(
+            "several cameras: what stands beside this is what they have in common, and each adds "
+            "its own or puts it in the place of that"
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _check_cameras(self) -> ScenarioFile:
+        if self.cameras and "port" in self.model_fields_set:
+            raise ValueError("port: with several cameras each has its own")
+        names = [camera.name for camera in self.each()]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two cameras are called {twice!r}")
+        return self
+
+    def each(self) -> tuple[Scenario, ...]:
+        """Return the cameras, each with what it has in common with the others."""
+        common = {name: getattr(self, name) for name in self.model_fields_set - {"cameras"}}
+        if not self.cameras:
+            return (Scenario(**common),)
+        return tuple(
+            self._merged(index, camera, common) for index, camera in enumerate(self.cameras)
+        )
+
+    def _merged(self, index: int, camera: Scenario, common: dict[str, Any]) -> Scenario:
+        own = {name: getattr(camera, name) for name in camera.model_fields_set}
+        ids = {application.id for application in camera.applications}
+        quirks = {name: getattr(camera.quirks, name) for name in camera.quirks.model_fields_set}
+        merged = {
+            **common,
+            "name": f"camera{index + 1}",
+            "seed": self.seed + index,
+            **own,
+            "applications": (
+                *camera.applications,
+                *(app for app in self.applications if app.id not in ids),
+            ),
+            "quirks": self.quirks.model_copy(update=quirks),
+            "timeline": (*self.timeline, *camera.timeline),
+        }
+        return Scenario(**merged)
+
+    def place(self, index: int, place: tuple[str | int, ...]) -> tuple[str | int, ...]:
+        """Return where in the file something of a camera stands."""
+        if not self.cameras:
+            return place
+        camera = self.cameras[index]
+        name, *rest = place
+        if name == "timeline" and isinstance(rest[0], int):
+            own = rest[0] - len(self.timeline)
+            return place if own < 0 else ("cameras", index, name, own, *rest[1:])
+        if name == "applications" and isinstance(rest[0], int):
+            own = rest[0] - len(camera.applications)
+            return ("cameras", index, *place) if own < 0 else (name, own, *rest[1:])
+        return ("cameras", index, *place) if name in camera.model_fields_set else place

@@ -10,27 +10,24 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from pydantic import ValidationError
-
 from smartcam.emulator.acting import Stage, act
-from smartcam.emulator.application import Application, make_application
 from smartcam.emulator.clock import Clock, RealClock
 from smartcam.emulator.device import Device
 from smartcam.emulator.fault_queue import FaultQueue
 from smartcam.emulator.faults import DeviceFault
 from smartcam.emulator.links import TcpListener, UdpListener
 from smartcam.emulator.manner import manner_of
+from smartcam.emulator.plan import make_plan
 from smartcam.emulator.port import Port
-from smartcam.emulator.quirks import Quirks
-from smartcam.emulator.scenario import Scenario, load_scenario
 from smartcam.emulator.scene import TableScene
 from smartcam.emulator.stranger import Stranger
-from smartcam.emulator.traffic import TrafficLog
+from smartcam.emulator.timeline import Timeline
+from smartcam.emulator.traffic import TrafficLog, Visit
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
 from smartcam.registry import PROTOCOLS
-from smartcam.settings import Address, validation_text
+from smartcam.settings import Address
 
 if TYPE_CHECKING:
     from collections import deque
@@ -40,11 +37,16 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    from smartcam.emulator.application import Application
     from smartcam.emulator.clock import TimerHandle
     from smartcam.emulator.fault_queue import Row
     from smartcam.emulator.faults import BaseFault, Fault, FiredFault
     from smartcam.emulator.links import Link, Listener
     from smartcam.emulator.parcels import Parcel
+    from smartcam.emulator.quirks import Quirks
+    from smartcam.emulator.scenario import Scenario
+    from smartcam.emulator.states import DeviceState
+    from smartcam.emulator.timeline import Cue
     from smartcam.emulator.traffic import Log
     from smartcam.exceptions import RemoteProtocolError
     from smartcam.protocols.base import Protocol
@@ -113,30 +115,34 @@ class EmulatedCamera:
         applications: programs of the camera: :class:`Application` or mappings of its fields.
         scenario: a scenario or the path of its file; what is given here beside it goes before it.
         host: address to listen on; nothing but this.
-        port: port to listen on, 0 for a free one.
-        transport: ``"tcp"`` or ``"udp"``.
-        dialect: name of the wire dialect: ``handbook``, ``thesis``, ``b16`` or ``bid``. ``bid``
-            is a BVS ID: it runs always, and answers every request with a result code.
+        port: port to listen on, 0 for a free one; default what the scenario says, else 0.
+        transport: ``"tcp"`` or ``"udp"``; default what the scenario says, else ``"tcp"``.
+        dialect: name of the wire dialect: ``handbook``, ``thesis``, ``b16`` or ``bid``; default
+            what the scenario says, else ``handbook``. ``bid`` is a BVS ID: it runs always, and
+            answers every request with a result code.
         clock: its time; a :class:`ManualClock` in tests. Default: real time.
         quirks: what is not known of real cameras: :class:`Quirks` or a mapping of its fields.
         name: for logs.
         active: id of the application that is loaded at first; default the first given, else 1.
         running: in run mode from the beginning.
-        seed: of the scene's noise; default 0.
+        seed: of all that is left to chance, the scene's noise and the timeline; default 0.
         builtins: have the built-in applications.
         faults: exact misbehaviour, in order: faults of :mod:`smartcam.emulator.faults`, or mappings
             of their fields with ``kind``. Those that wait for no message happen when it starts.
+        timeline: what happens by itself, and when: cues of :mod:`smartcam.emulator.timeline`, or
+            mappings of their fields. They come behind the scenario's.
 
     Attributes:
         host: as given.
         transport: as given.
         dialect: as given.
         name: as given.
+        scenario: what all that was given comes to.
         clock: its clock.
         device: the camera behind the wire. Its operator's methods (``trigger()``,
             ``set_condition()``, ...) may be called at any time in the event loop's thread; what
             they cause is sent. Its time is brought up whenever something happens.
-        seed: seed of the scene's noise.
+        seed: seed of all that is left to chance.
 
     Raises:
         ConfigurationError: something given is wrong.
@@ -148,9 +154,9 @@ class EmulatedCamera:
         *,
         scenario: Scenario | str | Path | None = None,
         host: str = "127.0.0.1",
-        port: int = 0,
-        transport: Literal["tcp", "udp"] = "tcp",
-        dialect: str = "handbook",
+        port: int | None = None,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
         clock: Clock | None = None,
         quirks: Quirks | dict[str, Any] | None = None,
         name: str | None = None,
@@ -159,30 +165,32 @@ class EmulatedCamera:
         seed: int | None = None,
         builtins: bool | None = None,
         faults: Iterable[BaseFault | Mapping[str, Any]] = (),
+        timeline: Iterable[Cue | Mapping[str, Any]] = (),
     ) -> None:
-        plan = _plan(
+        plan = make_plan(
             scenario,
             applications,
-            {
-                "quirks": _make_quirks(quirks) if isinstance(quirks, dict) else quirks,
-                "name": name,
-                "active": active,
-                "running": running,
-                "seed": seed,
-                "builtins": builtins,
-            },
+            timeline,
+            port=port,
+            transport=transport,
+            dialect=dialect,
+            quirks=quirks,
+            name=name,
+            active=active,
+            running=running,
+            seed=seed,
+            builtins=builtins,
         )
         self.host = host
-        self.transport: Literal["tcp", "udp"] = transport
-        self.dialect = dialect
+        self.transport: Literal["tcp", "udp"] = plan.transport
+        self.dialect: str = plan.dialect
+        self.scenario: Scenario = plan
         self.name: str = plan.name
         self.clock: Clock = clock if clock is not None else RealClock()
         self.seed: int = plan.seed
         self._protocol = cast("Protocol", PROTOCOLS.load("bvs"))
-        dialects = cast("Mapping[str, FramedDialect]", self._protocol.dialects)
-        spoken: FramedDialect = _known(dialects, "dialect", dialect)
-        self.spoken: FramedDialect = spoken.with_quirks(plan.quirks.of_the_wire)
-        _check_ids(plan.all_applications, spoken)
+        dialect_spoken = cast("FramedDialect", self._protocol.dialects[plan.dialect])
+        self.spoken: FramedDialect = dialect_spoken.with_quirks(plan.quirks.of_the_wire)
         self.device: Device = Device(
             plan.all_applications,
             active=plan.active,
@@ -193,15 +201,19 @@ class EmulatedCamera:
         )
         self._step = _Step(self._begin_step, self._end_step)
         self.device.around = self.step
-        kind = _known({t.value: t for t in Transport}, "transport", transport)
+        kind = Transport(plan.transport)
         self._scheme = next(s for s, t in self._protocol.schemes.items() if t is kind)
         self._listener: Listener = _LISTENERS[kind](self)
-        self._port = Port(self._listener, host, port, self.name)
+        self._port = Port(self._listener, host, plan.port, self.name)
         self._traffic = TrafficLog(self.spoken)
         self.queue: FaultQueue = FaultQueue(self.spoken, self.clock, self.device.applications)
         self._stage = Stage(
-            device=self.device, refuse=self._refuse, let_stranger_in=self._let_stranger_in
+            device=self.device,
+            refuse=self._refuse,
+            let_stranger_in=self._let_stranger_in,
+            clear=self.clear_faults,
         )
+        self._timeline = self._make_timeline()
         self._active: Link | Stranger | None = None
         self._refusal: TimerHandle | None = None
         self._refused_until = 0.0
@@ -261,6 +273,21 @@ class EmulatedCamera:
         return self.queue.waiting
 
     @property
+    def commands(self) -> tuple[str, ...]:
+        """The commands that the timeline knows, sorted."""
+        return self.scenario.commands
+
+    @property
+    def cues_done(self) -> list[int]:
+        """How often each cue of ``scenario.timeline`` has happened since the start."""
+        return self._timeline.done
+
+    @property
+    def visits(self) -> deque[Visit]:
+        """The last connections that have ended, oldest first; over UDP there are none."""
+        return self._traffic.visits
+
+    @property
     def fired(self) -> deque[FiredFault]:
         """The last faults that have happened, oldest first."""
         return self.queue.fired
@@ -318,9 +345,15 @@ class EmulatedCamera:
         self._started = True
         self._down = False
         self._moved_at = self.clock.now
+        self._timeline = self._make_timeline()
+        if self._timeline.watches:
+            self.device.watch(self._entered)
         with self.step():
             self._act_at_once()
+            self._timeline.start()
         _log.info("= %s: listening on %s", self.name, self.url)
+        if self.scenario.is_random:
+            _log.info("= %s: chance has the seed %d", self.name, self.seed)
 
     async def stop(self) -> None:
         """Close the port and every connection; the device stands still. Does nothing if stopped.
@@ -330,6 +363,7 @@ class EmulatedCamera:
         if self._started:
             self._started = False
             self._disarm()
+            self._timeline.stop()
             self._end_refusal()
             if isinstance(self._active, Stranger):
                 self._leave_session()
@@ -349,10 +383,21 @@ class EmulatedCamera:
         Raises:
             ConfigurationError: one is wrong, or too many would wait; none was added.
         """
-        self.queue.add(faults)
-        if self._started:
-            with self.step():
+        with self.step():
+            self._collect()  # what was said before is not changed
+            self.queue.add(faults)
+            if self._started:
                 self._act_at_once()
+
+    def command(self, name: str) -> None:
+        """Give a command: the timeline's cues that wait for it happen.
+
+        Call it in the event loop's thread, while the emulator is started.
+
+        Raises:
+            ConfigurationError: no cue has it.
+        """
+        self._timeline.command(name)
 
     def clear_faults(self) -> None:
         """Forget the faults that wait, and end those that last.
@@ -383,6 +428,15 @@ class EmulatedCamera:
         if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
             return
         self._hand_session(Stranger(self.spoken, self._traced_stranger))
+
+    def _make_timeline(self) -> Timeline:
+        cues, seed = self.scenario.timeline, self.seed
+        return Timeline(cues, clock=self.clock, seed=seed, inject=lambda do: self.inject(*do))
+
+    def _entered(self, state: DeviceState) -> None:
+        """The device has entered a state: what it said before is not changed by what follows."""
+        self._collect()
+        self._timeline.entered(state)
 
     def _act_at_once(self) -> None:
         self._act(self.queue.at_once(), None)
@@ -433,6 +487,7 @@ class EmulatedCamera:
                 self._collect()
                 self._active = None
         self._collect()
+        self.device.tell_entered()
         if faults:
             self._act(faults, "after")
 
@@ -444,6 +499,11 @@ class EmulatedCamera:
         """A link is gone; if it had the session, that is over."""
         if link is self._active:
             self._leave_session()
+
+    def parted(self, link: Link, *, by_client: bool, reset: bool) -> None:
+        """A connection has ended."""
+        by: Literal["client", "camera"] = "client" if by_client else "camera"
+        self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
 
     def traced(self, link: Link, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
         """A machine saw a frame, or bytes that make none."""
@@ -521,6 +581,7 @@ class EmulatedCamera:
             self._act(faults, "after")
 
     def _settle(self) -> None:
+        self.device.tell_entered()
         self._collect()
         if self._active is not None:
             self._active.flush()
@@ -573,47 +634,3 @@ class EmulatedCamera:
     def _wake_port(self) -> None:
         with self.step():
             self._end_refusal()
-
-
-def _known(table: Any, what: str, name: str) -> Any:
-    if name not in table:
-        raise ConfigurationError(
-            f"emulator: {what} {name!r} is unknown; known are {', '.join(table)}"
-        )
-    return table[name]
-
-
-def _check_ids(applications: Iterable[Application], dialect: FramedDialect) -> None:
-    ids = dialect.application_ids
-    for application in applications:
-        if application.id not in ids:
-            raise ConfigurationError(
-                f"emulator: application id {application.id} does not fit dialect {dialect.name}: "
-                f"{ids.start} to {ids.stop - 1}"
-            )
-
-
-def _make_quirks(fields: dict[str, Any]) -> Quirks:
-    try:
-        return Quirks(**fields)
-    except ValidationError as exc:
-        raise ConfigurationError(f"quirks: {validation_text(exc)}") from exc
-
-
-def _plan(
-    scenario: Scenario | str | Path | None,
-    applications: Iterable[Application | dict[str, Any]],
-    given: dict[str, Any],
-) -> Scenario:
-    """Return the scenario with what was given beside it."""
-    if scenario is None:
-        base = Scenario()
-    elif isinstance(scenario, Scenario):
-        base = scenario
-    else:
-        base = load_scenario(scenario)
-    changes = {key: value for key, value in given.items() if value is not None}
-    added = [make_application(application) for application in applications]
-    ids = {application.id for application in added}
-    changes["applications"] = (*added, *(a for a in base.applications if a.id not in ids))
-    return base.model_copy(update=changes)

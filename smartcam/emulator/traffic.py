@@ -18,10 +18,13 @@ if TYPE_CHECKING:
     from smartcam.emulator.parcels import Parcel
     from smartcam.protocols.framed import FramedDialect
 
-__all__ = ["Log", "LogEntry", "TrafficLog"]
+__all__ = ["Log", "LogEntry", "TrafficLog", "Visit"]
 
 MAX_ENTRIES = 10_000
 """Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
+
+MAX_VISITS = 1000
+"""Connections that have ended of which a record is kept; the oldest go first."""
 
 
 Direction = Literal["in", "out"]
@@ -59,6 +62,22 @@ class LogEntry(NamedTuple):
     wire: str | None = None
 
 
+class Visit(NamedTuple):
+    """A TCP connection that has ended.
+
+    Attributes:
+        time: of the emulator's clock when it ended, seconds.
+        peer: address and port of the client.
+        ended_by: which side closed it first.
+        reset: whether it ended by a reset, and not in order.
+    """
+
+    time: float
+    peer: str
+    ended_by: Literal["client", "camera"]
+    reset: bool
+
+
 _Traced: TypeAlias = tuple[float, str, Sender, Frame, str | None]
 """Time, peer, sender, frame, faults: all that an entry is made of."""
 
@@ -83,6 +102,7 @@ class Log(Sequence[LogEntry]):
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque(maxlen=maxlen)
         self._unread: deque[LogEntry | _Traced] = deque(maxlen=maxlen)
+        self._count = 0  # entries that were read
         # called for each frame: the deque's own
         self.append: Callable[[LogEntry | _Traced], None] = self._unread.append
         """Put an entry, or what one is made of, behind the others."""
@@ -109,6 +129,19 @@ class Log(Sequence[LogEntry]):
         entries = self._read()
         return entries[index] if isinstance(index, int) else list(entries)[index]
 
+    def since(self, serial: int) -> tuple[list[LogEntry], int]:
+        """Return the entries behind the first ``serial`` ones, and how many there have been.
+
+        ::
+
+            new, serial = emulator.log.since(serial)
+
+        Entries that are gone by then are missing in the list.
+        """
+        entries = self._read()
+        new = self._count - max(0, serial)
+        return (list(entries)[-new:] if new > 0 else []), self._count
+
     def popleft(self) -> LogEntry:
         """Take the oldest entry away.
 
@@ -119,12 +152,12 @@ class Log(Sequence[LogEntry]):
 
     def clear(self) -> None:
         """Take all away."""
-        self._entries.clear()
-        self._unread.clear()
+        self._read().clear()
 
     def _read(self) -> deque[LogEntry]:
         unread = self._unread
         if unread:
+            self._count += len(unread)
             self._entries.extend(
                 entry if isinstance(entry, LogEntry) else self._entry(*entry) for entry in unread
             )
@@ -146,9 +179,11 @@ class TrafficLog:
 
     Attributes:
         entries: the last ones.
+        visits: the last connections that have ended.
     """
 
     def __init__(self, dialect: FramedDialect) -> None:
+        self.visits: deque[Visit] = deque(maxlen=MAX_VISITS)
         self.entries: Log = Log(dialect)
         self._dialect = dialect
         self._received: Counter[int | type[Message] | None] = Counter()

@@ -233,7 +233,10 @@ async def test_b16_quirks_together_stand_in_the_url() -> None:
 def test_quirk_of_b16_in_another_dialect_is_refused(dialect: str, quirk: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         EmulatedCamera(dialect=dialect, quirks={quirk: True})
-    assert str(caught.value) == f"dialect {dialect} has no quirk {quirk!r}; it has none"
+    assert (
+        str(caught.value)
+        == f"emulator: quirks: dialect {dialect} has no quirk {quirk!r}; it has none"
+    )
 
 
 @pytest.mark.parametrize("dialect", ["b16", "bid"])
@@ -241,5 +244,6 @@ def test_application_whose_id_has_more_than_16_bits_is_refused(dialect: str) -> 
     with pytest.raises(ConfigurationError) as caught:
         EmulatedCamera([{"id": 0x10000}], dialect=dialect)
     assert str(caught.value) == (
-        f"emulator: application id 65536 does not fit dialect {dialect}: 1 to 65535"
+        "emulator: applications.0.id: application id 65536 does not fit "
+        f"dialect {dialect}: 1 to 65535"
     )

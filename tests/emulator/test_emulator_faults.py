@@ -39,6 +39,11 @@ EXAMPLES: list[dict[str, Any]] = [
     {"kind": "late_result", "seconds": 1.0},
     {"kind": "no_result", "when": "after", "on": "Trigger"},
     {"kind": "extra_result", "count": 2},
+    {"kind": "digital_input", "on": "StatusReport", "nth": 2},
+    {"kind": "byte_order", "endian": 1},
+    {"kind": "move_part", "part": "square", "x": 0.1, "y": 0.2},
+    {"kind": "remove_part", "part": "square"},
+    {"kind": "clear_faults", "when": "after", "on": "Disconnect"},
 ]
 
 

@@ -50,6 +50,11 @@ EXTRA: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     },
     "late_result": {"seconds": SECONDS},
     "extra_result": {"count": st.integers(1, 3)},
+    "digital_input": {"when": WHEN},
+    "byte_order": {"when": WHEN, "endian": st.sampled_from([0, 1])},
+    "move_part": {"part": st.sampled_from(["square", "new"]), "x": SECONDS, "y": SECONDS},
+    "remove_part": {"part": st.sampled_from(["square", "no part"])},
+    "clear_faults": {"when": WHEN},
 }
 
 

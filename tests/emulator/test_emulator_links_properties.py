@@ -82,6 +82,9 @@ class Station:
     def serves(self, link: Link) -> bool:
         return True
 
+    def parted(self, link: Link, *, by_client: bool, reset: bool) -> None:
+        pass
+
     def lost(self, link: Link) -> None:
         pass
 

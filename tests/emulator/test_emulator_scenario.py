@@ -80,7 +80,7 @@ def test_scenario_without_builtins(tmp_path: Path) -> None:
         ),
         (
             'applications:\n  - id: 5\n    layout: "n: uint8"\n    constant: [300]\n',
-            "line.yaml, line 2: applications.0: Value error, layout: .*got 300",
+            "line.yaml, line 2: applications.0: layout: .*got 300",
         ),
         ("applications: 5\n", "line.yaml, line 1: applications: Input should be a valid tuple"),
         ("a: &x [*x]\n", "line.yaml, line 1: a: Extra inputs"),
