@@ -122,7 +122,7 @@ class TableScene:
         """Return one observation of each piece, in the order of :attr:`pieces`, with new noise."""
         gauss = self._random.gauss
         found: list[Observation] = []
-        for name, pose in self.pieces.items():
+        for name, pose in list(self.pieces.items()):  # a test may change them in its own thread
             u, v, theta = self.to_pixels(pose)
             turn = gauss(0.0, self.pixel_noise / (_ARM * self.scale))
             found.append(

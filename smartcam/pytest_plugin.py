@@ -1,0 +1,198 @@
+"""The pytest plugin ``smartcam``: emulated cameras as fixtures, for tests of anybody's client.
+
+::
+
+    def test_driver(emulated_camera):
+        my_driver.run(emulated_camera.host, emulated_camera.port)
+        emulated_camera.log.expect("Connect", "Trigger", "Disconnect")
+
+
+    @pytest.mark.smartcam(application=7, interpret_as="localizations", transport="udp")
+    async def test_robot(camera):
+        assert len((await camera.trigger()).value) == 7
+
+It is loaded with every run of pytest where smartcam is installed, so nothing but pytest is imported
+here before a fixture is used.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import inspect
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator
+
+    from smartcam.client import SmartCamera
+    from smartcam.testing.threads import ThreadedCamera, ThreadedFleet
+
+__all__ = ["camera", "emulated_camera", "emulated_fleet"]
+
+EMULATOR = frozenset(
+    {
+        "scenario", "applications", "active", "running", "builtins", "quirks", "faults", "timeline",
+        "seed", "dialect", "transport", "port", "name", "manual_clock",
+    }
+)  # fmt: skip
+"""Options of the marker that the emulated camera takes."""
+
+FLEET = frozenset({"scenario", "quirks", "dialect", "transport"})
+"""Those that an emulated fleet takes, beside ``cameras``."""
+
+CAMERAS = 2
+"""Cameras of a fleet where nothing else is said."""
+
+MARKER = (
+    "smartcam(application=None, interpret_as=None, connect={}, cameras=2, scenario=None, "
+    "dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and emulated_fleet "
+    "are made. application=ID has that application running; connect={...} are further options of "
+    "smartcam.connect(); the rest are options of smartcam.emulator.EmulatedCamera: "
+    f"{', '.join(sorted(EMULATOR))}"
+)
+
+_CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Pytest: say which marker there is."""
+    config.addinivalue_line("markers", MARKER)
+
+
+# ---------------------------------------------------------------------- fixtures
+
+
+@pytest.fixture
+def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
+    """An emulated camera over real TCP or UDP, on a free port of this machine.
+
+    It lives in a thread with an event loop of its own, so it serves synchronous and asynchronous
+    tests, and programs that a test starts. The marker ``smartcam`` says what it is.
+    """
+    from smartcam.testing.threads import ThreadedCamera
+
+    said = _said(request)
+    options = {key: value for key, value in said.items() if key in EMULATOR}
+    application = said.get("application")
+    if application is not None:
+        options = {"active": application, "running": True, **options}
+    with ThreadedCamera(**options) as emulator:
+        yield emulator
+
+
+@pytest.fixture
+def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
+    """Several emulated cameras by name, as :func:`emulated_camera`: two, or those of a scenario."""
+    from smartcam.emulator import Scenario
+    from smartcam.testing.threads import ThreadedFleet
+
+    said = _said(request)
+    options = {key: value for key, value in said.items() if key in FLEET}
+    scenarios = options.pop("scenario", None)
+    if scenarios is None:
+        application = said.get("application")
+        scenarios = [
+            Scenario(
+                name=f"camera{number}",
+                active=application,
+                running=application is not None,
+                seed=number,
+            )
+            for number in range(1, 1 + said.get("cameras", CAMERAS))
+        ]
+    with ThreadedFleet(scenarios, **options) as fleet:
+        yield fleet
+
+
+@pytest.fixture
+def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> SmartCamera:
+    """A client of the emulated camera, connected while an asynchronous test runs.
+
+    It is opened in the task of the test itself, right before it, and closed behind it: so it has
+    the event loop of the test, whatever plugin and settings made that. A fixture that needs it
+    earlier opens it with ``await camera``.
+    """
+    from smartcam.client import connect
+
+    said = _said(request)
+    options = {
+        "interpret_as": said.get("interpret_as"),
+        "application": said.get("application"),
+        **said.get("connect", {}),
+    }
+    client = connect(
+        emulated_camera.url, **{key: one for key, one in options.items() if one is not None}
+    )
+    request.node.stash[_CLIENT] = client
+    return client
+
+
+def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """Return what the markers of a test say; the nearest goes before those of class and module."""
+    said: dict[str, Any] = {}
+    for marker in reversed(list(request.node.iter_markers("smartcam"))):
+        if marker.args:
+            pytest.fail("the marker smartcam takes names only: application=7", pytrace=False)
+        said |= marker.kwargs
+    known = EMULATOR | {"application", "interpret_as", "connect", "cameras"}
+    unknown = sorted(said.keys() - known)
+    if unknown:
+        pytest.fail(
+            f"the marker smartcam has no option {unknown[0]!r}; it has {', '.join(sorted(known))}",
+            pytrace=False,
+        )
+    return said
+
+
+# ---------------------------------------------------------------------- opening the client
+
+
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, None]:
+    """Pytest: have the client of the fixture ``camera`` open while the test runs."""
+    client = item.stash.get(_CLIENT, None)
+    if client is None or not isinstance(item, pytest.Function):
+        yield
+        return
+    test = item.obj
+    if not inspect.iscoroutinefunction(test):
+        pytest.fail(
+            "the fixture camera needs an asynchronous test (async def, run by pytest-asyncio or "
+            "anyio); a synchronous one can use emulated_camera.url",
+            pytrace=False,
+        )
+    item.obj = _with_client(test, client)
+    yield
+    item.obj = test
+
+
+def _with_client(test: Callable[..., Any], client: SmartCamera) -> Callable[..., Any]:
+    """Return the test with the client open around it, in its own event loop and task."""
+
+    @functools.wraps(test)
+    async def with_client(*args: Any, **kwargs: Any) -> Any:
+        if not _in_asyncio():
+            pytest.fail(
+                "the fixture camera needs asyncio, and this test runs on another event loop; it "
+                "can use emulated_camera.url",
+                pytrace=False,
+            )
+        try:
+            if not client.connected:
+                await client
+            return await test(*args, **kwargs)
+        finally:
+            await client.close()
+
+    return with_client
+
+
+def _in_asyncio() -> bool:
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    return True
