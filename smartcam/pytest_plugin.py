@@ -20,6 +20,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import inspect
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -51,7 +52,7 @@ MARKER = (
     "dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and emulated_fleet "
     "are made. application=ID has that application running; connect={...} are further options of "
     "smartcam.connect(); the rest are options of smartcam.emulator.EmulatedCamera: "
-    f"{', '.join(sorted(EMULATOR))}"
+    f"{', '.join(sorted(EMULATOR))}. A scenario is looked for beside the test, then below the root."
 )
 
 _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
@@ -144,7 +145,16 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
             f"the marker smartcam has no option {unknown[0]!r}; it has {', '.join(sorted(known))}",
             pytrace=False,
         )
+    if isinstance(said.get("scenario"), (str, Path)):
+        said["scenario"] = _scenario_path(request, said["scenario"])
     return said
+
+
+def _scenario_path(request: pytest.FixtureRequest, given: str | Path) -> Path:
+    """Return where a scenario is: beside the test, below the project's root, or as given."""
+    folders = (request.path.parent, request.config.rootpath)
+    found = (folder / given for folder in folders)
+    return next((path for path in found if path.exists()), Path(given))
 
 
 # ---------------------------------------------------------------------- opening the client

@@ -214,6 +214,31 @@ def test_wrong_marker_is_told(pytester: pytest.Pytester, marker: str, text: str)
     run(pytester, source, errors=1).stdout.fnmatch_lines([text])
 
 
+def test_scenario_is_looked_for_beside_the_test_and_below_the_root(
+    pytester: pytest.Pytester,
+) -> None:
+    pytester.makeini("[pytest]")
+    (pytester.path / "scenarios").mkdir()
+    (pytester.path / "scenarios" / "a.yaml").write_text("active: 3", encoding="utf-8")
+    folder = pytester.mkpydir("checks")
+    (folder / "b.yaml").write_text("active: 9", encoding="utf-8")
+    (folder / "test_paths.py").write_text(
+        """
+import pytest
+
+@pytest.mark.parametrize("active", [
+    pytest.param(3, marks=pytest.mark.smartcam(scenario="scenarios/a.yaml")),
+    pytest.param(9, marks=pytest.mark.smartcam(scenario="b.yaml")),
+])
+def test_path(emulated_camera, active):
+    assert emulated_camera.device.active_application == active
+""",
+        encoding="utf-8",
+    )
+    result = pytester.runpytest_inprocess("-p", "no:cacheprovider", *LOOP_SCOPE, "checks")
+    result.assert_outcomes(passed=2)
+
+
 def test_fleet_has_two_cameras_or_those_of_a_scenario(pytester: pytest.Pytester) -> None:
     pytester.makefile(".yaml", cell="cameras: [{name: left}, {name: right, dialect: bid}]")
     source = """
