@@ -2,6 +2,8 @@
 
 ``python`` blocks run as scripts of their own. ``console`` blocks run line by line, each block with
 an emulator of its own unless it starts one; what they show must be what is printed, numbers aside.
+A block of any language whose first line is ``# NAME.EXTENSION`` is a file, which the page's
+``console`` blocks find in their folder.
 """
 
 from __future__ import annotations
@@ -63,9 +65,20 @@ def blocks(language: str, pages: list[Path]) -> list[Any]:
     return [pytest.param(block, id=f"{block.page.name}:{block.line}") for block in found]
 
 
+FILE = re.compile(
+    r"^```(?:python|yaml|ini|toml)\n# ([\w-]+\.\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE
+)
+
+
+def files(page: Path) -> dict[str, str]:
+    """Return the files that a page shows."""
+    return dict(FILE.findall(page.read_text(encoding="utf-8")))
+
+
 # ---------------------------------------------------------------------- running
 
 MAINS = {"smartcam": "main", "smartcam-emulator": "emulator_main"}
+MODULES = {"pytest": "pytest"}
 
 
 class Shell:
@@ -86,6 +99,8 @@ class Shell:
         if program in MAINS:
             code = f"from smartcam.cli import {MAINS[program]}; {MAINS[program]}()"
             arguments = [sys.executable, "-c", code, *rest]
+        elif program in MODULES:
+            arguments = [sys.executable, "-m", MODULES[program], *rest]
         process = subprocess.Popen(  # noqa: S603 - what stands in our own documents
             arguments,
             cwd=self.folder,
@@ -171,6 +186,9 @@ def missing_line(shown: list[str], printed: str) -> str | None:
 @pytest.mark.parametrize("block", blocks("python", PAGES))
 def test_python_block_runs(block: Block, shell: Shell) -> None:
     text = block.text
+    if re.match(r"# ([\w-]+\.py)\n", text):
+        compile(text, str(block.page), "exec", dont_inherit=True)
+        return  # a file, which a console block runs
     for name in OPTIONAL:
         if f"from {name}" in text:
             pytest.importorskip(name)
@@ -184,15 +202,18 @@ def test_python_block_runs(block: Block, shell: Shell) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="a POSIX shell's examples")
 @pytest.mark.parametrize("block", blocks("console", PAGES))
 def test_console_block_runs(block: Block, shell: Shell) -> None:
+    for name, text in files(block.page).items():
+        (shell.folder / name).write_text(text, encoding="utf-8")
     todo = list(steps(block.text, block.line))
     for (line, command, shown), (_, following, code) in zip(
         todo, [*todo[1:], (0, "", [])], strict=True
     ):
         arguments = shlex.split(command)
         where = f"{block.page}:{line}: $ {command}\n"
-        if arguments[0] == "smartcam-emulator" and "^C" not in shown and "--help" not in arguments:
+        ends = {"^C", "--help", "--schema", "echo $?"}.intersection([*shown, *arguments, following])
+        if arguments[0] == "smartcam-emulator" and not ends:
             printed, ended = shell.emulate(arguments, len(shown) or 1), 0
-        elif arguments[0] in {*MAINS, "cat", "head", "tail"}:
+        elif arguments[0] in {*MAINS, *MODULES, "cat", "head", "tail"}:
             printed, ended = shell.run(arguments, shown)
         else:
             continue
@@ -212,6 +233,15 @@ def test_sh_block_of_the_readme_runs(block: Block, shell: Shell) -> None:
 
 
 # ---------------------------------------------------------------------- contents
+
+
+def test_file_that_a_page_shows_is_run_by_a_command_of_it() -> None:
+    for page in PAGES:
+        shown = files(page)
+        users = [block.values[0].text for block in blocks("console", [page])]
+        users += shown.values()
+        unused = [name for name in shown if not any(Path(name).stem in text for text in users)]
+        assert unused == []
 
 
 def test_every_page_is_in_the_contents() -> None:
