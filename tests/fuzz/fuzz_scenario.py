@@ -14,12 +14,15 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from smartcam.emulator import Device, Scenario, load_scenario
+from smartcam.emulator import Device, ManualClock, Scenario, load_scenarios
+from smartcam.emulator.timeline import Timeline
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Generator, Sequence
+
+    from smartcam.emulator.faults import Fault
 
 __all__ = ["check"]
 
@@ -58,15 +61,16 @@ def check(data: bytes) -> None:
     path.write_bytes(data)
     try:
         with measured() if any(word in data for word in GREEDY) else nullcontext():
-            scenario = load_scenario(path)
+            scenarios = load_scenarios(path)
     except ConfigurationError as error:
         text = str(error)
         assert text.startswith(f"scenario {path}")
         assert "MemoryError" not in text, "too much memory for one file"
         return
-    assert isinstance(scenario, Scenario)
-    assert Scenario.model_validate(scenario.model_dump(exclude_unset=True)) == scenario
-    check_camera(scenario)
+    for scenario in scenarios[:3]:
+        assert Scenario.model_validate(scenario.model_dump(exclude_unset=True)) == scenario
+        check_camera(scenario)
+        check_timeline(scenario)
 
 
 def check_camera(scenario: Scenario) -> None:
@@ -75,13 +79,7 @@ def check_camera(scenario: Scenario) -> None:
     if not applications:
         return
     active = scenario.active if scenario.active is not None else applications[0].id
-    try:
-        device = Device(
-            applications, active=active, running=scenario.running, quirks=scenario.quirks
-        )
-    except ConfigurationError:
-        assert active not in [application.id for application in applications]
-        return
+    device = Device(applications, active=active, running=scenario.running, quirks=scenario.quirks)
     device.handle(m.Connect())
     for application in scenario.applications[:3]:
         device.handle(m.Stop())
@@ -92,3 +90,27 @@ def check_camera(scenario: Scenario) -> None:
         device.handle(m.Trigger())
         device.tick(min(application.processing_time, 1.0))
         assert device.take_output()
+
+
+def check_timeline(scenario: Scenario) -> None:
+    """Its timeline runs, and does so again in the same way."""
+    first, second = course(scenario), course(scenario)
+    assert first == second
+
+
+def course(scenario: Scenario) -> list[tuple[float, str]]:
+    """Return what happens in half a second, and on every command."""
+    clock = ManualClock()
+    happened: list[tuple[float, str]] = []
+
+    def inject(do: Sequence[Fault]) -> None:
+        happened.extend((clock.now, fault.kind) for fault in do)
+
+    cues = scenario.timeline[:20]
+    timeline = Timeline(cues, clock=clock, seed=scenario.seed, inject=inject)
+    timeline.start()
+    for command in sorted({cue.command for cue in cues if cue.command is not None}):
+        timeline.command(command)
+    clock.advance(0.5)
+    timeline.stop()
+    return happened

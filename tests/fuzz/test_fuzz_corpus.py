@@ -14,7 +14,7 @@ from fuzz_known import KNOWN, describe, known
 from fuzz_seeds import seeds
 from fuzz_targets import CORPUS, TARGETS, Target
 
-import smartcam.emulator.scenario as scenario_module
+import smartcam.emulator.scenario_file as scenario_module
 import smartcam.layout as layout_module
 from smartcam.emulator import Device
 from smartcam.interpreters.localizations import Localizations
