@@ -61,6 +61,7 @@ _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
 def pytest_configure(config: pytest.Config) -> None:
     """Pytest: say which marker there is."""
     config.addinivalue_line("markers", MARKER)
+    pytest.register_assert_rewrite("smartcam.testing.interpreters")
 
 
 # ---------------------------------------------------------------------- fixtures

@@ -92,7 +92,8 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     if not parts.hostname:
         raise ConfigurationError(f"camera address {shown!r} has no host")
     # urlsplit lets some pass, and which ones differs from Python to Python
-    if "[" in parts.hostname or "]" in parts.hostname or parts.netloc.rfind("[") > 0:
+    place = parts.netloc.rpartition("@")[2]
+    if "[" in parts.hostname or "]" in parts.hostname or place.rfind("[") > 0:
         raise ConfigurationError(f"camera address {shown!r} has a bracket inside its host")
     if port == 0:
         raise ConfigurationError(f"camera address {shown!r}: port 0 is no camera's port")

@@ -13,6 +13,7 @@ from click.core import ParameterSource
 
 import smartcam
 from smartcam.cli.options import Options, output_options
+from smartcam.cli.page import Page, page_options
 from smartcam.cli.running import run
 from smartcam.emulator import EmulatedCamera, Scenario, load_scenarios, scenario_schema
 from smartcam.emulator.insight import BUILTIN_JOBS, EmulatedInSight
@@ -73,6 +74,7 @@ PROTOCOLS = (BVS.name, INSIGHT.name)
     help="Of all that is left to chance; default what the scenario says, else 0.",
 )
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of scenario files, and end.")
+@page_options
 @output_options
 @click.version_option(smartcam.__version__)
 @click.pass_context
@@ -89,6 +91,7 @@ def command(
     quirks: tuple[str, ...],
     seed: int | None,
     schema: bool,
+    page: Page,
     **shared: Any,
 ) -> None:
     """Emulate smart cameras, over real TCP or UDP, until Ctrl-C or SIGTERM.
@@ -136,7 +139,10 @@ def command(
         async with contextlib.AsyncExitStack() as stack:
             for emulator in emulators:
                 await stack.enter_async_context(emulator)
-                _announce(emulator, options, named=scenario is not None)
+            shown = [one for one in emulators if isinstance(one, EmulatedCamera)]
+            address = await page.open(stack, shown)
+            for emulator in emulators:
+                _announce(emulator, options, named=scenario is not None, page=address)
             await asyncio.Event().wait()
 
     run(
@@ -210,13 +216,20 @@ def _refuse_what_does_not_fit(context: click.Context) -> None:
         "dialect": "--dialect",
         "transport": "--transport",
         "seed": "--seed",
+        "web": "--web",
     }
     for name, text in said.items():
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise click.UsageError(f"--protocol {INSIGHT.name} takes no {text}")
 
 
-def _announce(emulator: EmulatedCamera | EmulatedInSight, options: Options, *, named: bool) -> None:
+def _announce(
+    emulator: EmulatedCamera | EmulatedInSight,
+    options: Options,
+    *,
+    named: bool,
+    page: str | None,
+) -> None:
     if isinstance(emulator, EmulatedInSight):
         transport, dialect = INSIGHT.schemes["insight"].value, next(iter(INSIGHT.dialects))
         ids = [job.id for job in emulator.device.jobs.values() if job.id is not None]
@@ -231,8 +244,10 @@ def _announce(emulator: EmulatedCamera | EmulatedInSight, options: Options, *, n
         "dialect": dialect,
         "applications": sorted(ids),
     }
-    if named:
+    if named or page is not None:
         value["name"] = emulator.name
+    if page is not None:
+        value["web"] = page
     if isinstance(emulator, EmulatedCamera) and emulator.scenario.is_random:
         value["seed"] = emulator.seed
         click.echo(

@@ -1,12 +1,70 @@
-"""Tools for tests of a client or a camera; nothing but tests imports them.
+"""Tools for tests of a client, a camera or a plug-in; nothing but tests imports them.
 
 ::
 
     async with LinkProxy("127.0.0.1", emulator.port, rules=[Cut(at=20)]) as proxy:
         async with smartcam.connect(proxy.url(emulator.url)) as camera:
             ...
+
+Names are resolved when they are first used.
 """
 
-from smartcam.testing.proxy import LinkProxy
+from __future__ import annotations
 
-__all__ = ["LinkProxy"]
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from smartcam.testing.interpreters import InterpreterSuite, Sample
+    from smartcam.testing.logs import CameraLog
+    from smartcam.testing.protocols import (
+        CameraSuite,
+        Came,
+        Conversation,
+        ProtocolSuite,
+        Sent,
+        Site,
+        WireSuite,
+        World,
+    )
+    from smartcam.testing.proxy import LinkProxy
+    from smartcam.testing.threads import ThreadedCamera, ThreadedFleet
+
+__all__ = [
+    "Came",
+    "CameraLog",
+    "CameraSuite",
+    "Conversation",
+    "InterpreterSuite",
+    "LinkProxy",
+    "ProtocolSuite",
+    "Sample",
+    "Sent",
+    "Site",
+    "ThreadedCamera",
+    "ThreadedFleet",
+    "WireSuite",
+    "World",
+]
+
+_MODULES = {
+    "CameraLog": "logs",
+    "InterpreterSuite": "interpreters",
+    "LinkProxy": "proxy",
+    "Sample": "interpreters",
+    "ThreadedCamera": "threads",
+    "ThreadedFleet": "threads",
+}
+"""Where a name stands; what is not here stands in ``protocols``."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(f"{__name__}.{_MODULES.get(name, 'protocols')}")
+    value = globals()[name] = getattr(module, name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

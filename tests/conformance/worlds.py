@@ -1,124 +1,22 @@
-"""The cameras that the conformance checks run against: one row of a table each.
-
-A world says how to put a camera up and what stands on it; a site is the camera while it is up. Both
-know nothing of the checks, so that a camera of another protocol is one more row. What the camera
-can do in its dialect is asked of the client: ``camera.capabilities``.
-
-On each camera stand the same applications, by their ids:
-
-* ``COUNTER`` and ``OTHER`` wait for a trigger and send the number of the run at once;
-* ``SLOW`` does so after ``SLOW_TIME``;
-* ``ECHO`` sends the number that it was given as input data, where the camera takes any;
-* ``FREE`` runs free and sends the number of the run, where the camera sends unasked.
-"""
+"""The cameras that the suite of ``smartcam.testing`` runs against here: one row of a table each."""
 
 from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator.insight import EmulatedInSight
+from smartcam.testing.protocols import COUNTER, ECHO, FREE, OTHER, SLOW, SLOW_TIME, Site, World
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from contextlib import AbstractAsyncContextManager
+    from collections.abc import AsyncIterator
 
-__all__ = [
-    "COUNTER",
-    "ECHO",
-    "FREE",
-    "NOBODYS",
-    "OTHER",
-    "SLOW",
-    "SLOW_TIME",
-    "WORLDS",
-    "Site",
-    "World",
-]
-
-COUNTER, OTHER, SLOW, ECHO, FREE = 7, 3, 4, 5, 9
-NOBODYS = 99
-"""No application has this id."""
-
-SLOW_TIME = 0.15
-"""Seconds that an inspection of ``SLOW`` takes."""
+__all__ = ["BVS_WORLDS", "INSIGHT_WORLDS"]
 
 FREE_RATE = 200.0
 """Runs per second of ``FREE``."""
-
-
-class Site(Protocol):
-    """A camera that is up, with ``COUNTER`` active and ready to run."""
-
-    @property
-    def url(self) -> str:
-        """Its URL, with everything pinned that can be."""
-        ...
-
-    @property
-    def unpinned(self) -> str:
-        """The same without what a client can find out."""
-        ...
-
-    @property
-    def has_session(self) -> bool:
-        """Whether a client has the camera."""
-        ...
-
-    @property
-    def inspects(self) -> bool:
-        """Whether an inspection is under way."""
-        ...
-
-    def trigger(self) -> None:
-        """Trigger by the digital input."""
-        ...
-
-    def switch(self, application: int) -> None:
-        """Load and run another application, as an operator does."""
-        ...
-
-    async def restart(self) -> None:
-        """Lose every client and be there again at once, as it was at first."""
-        ...
-
-    async def kill(self) -> None:
-        """Be gone, and stay so."""
-        ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class World:
-    """One kind of camera.
-
-    Attributes:
-        name: for people.
-        open: puts one up.
-        numbers: how to interpret what the applications send: a record whose field ``n`` is the
-            number.
-        numbers_with_sequence: the same with the number marked, where it can be set.
-        raw_request: id of a request that is answered by something.
-        foreign_request: an id of another kind than the protocol's.
-        datagrams: a message may be lost, and nobody is told that the camera is gone.
-        exclusive: a second client takes the camera from the first.
-        has_zero: an application may have the id 0.
-    """
-
-    name: str
-    open: Callable[[], AbstractAsyncContextManager[Site]]
-    numbers: str = "n: uint32"
-    numbers_with_sequence: str = "n: uint32 @sequence"
-    raw_request: int | str = 0x30
-    foreign_request: int | str = "text"
-    datagrams: bool = False
-    exclusive: bool = True
-    has_zero: bool = False
-
-    def __str__(self) -> str:
-        return self.name
-
 
 # ---------------------------------------------------------------------- BVS
 
@@ -140,7 +38,7 @@ _APPLICATIONS: list[dict[str, Any]] = [
 
 
 @dataclass
-class _BvsSite:
+class _BvsSite(Site):
     """An emulated BVS camera."""
 
     emulator: EmulatedCamera
@@ -148,10 +46,6 @@ class _BvsSite:
     @property
     def url(self) -> str:
         return self.emulator.url
-
-    @property
-    def unpinned(self) -> str:
-        return self.url.partition("?")[0]
 
     @property
     def has_session(self) -> bool:
@@ -216,7 +110,7 @@ _JOBS: list[dict[str, Any]] = [
 
 
 @dataclass
-class _InSightSite:
+class _InSightSite(Site):
     """An emulated In-Sight camera."""
 
     emulator: EmulatedInSight
@@ -269,20 +163,20 @@ _DIALECTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 _TRANSPORTS: tuple[Literal["tcp", "udp"], ...] = ("tcp", "udp")
 
-WORLDS: tuple[World, ...] = (
-    *(
-        _bvs(name, transport, dialect, quirks)
-        for name, dialect, quirks in _DIALECTS
-        for transport in _TRANSPORTS
-    ),
+BVS_WORLDS = tuple(
+    _bvs(name, transport, dialect, quirks)
+    for name, dialect, quirks in _DIALECTS
+    for transport in _TRANSPORTS
+)
+INSIGHT_WORLDS = (
     World(
         name="In-Sight native mode",
         open=_in_sight,
         numbers_with_sequence="n: uint32",
         raw_request="GJ",
         foreign_request=0x30,
+        silent_request=None,
         exclusive=False,
         has_zero=True,
     ),
 )
-"""The table; another protocol's cameras are further rows."""

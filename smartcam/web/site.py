@@ -1,0 +1,203 @@
+"""A web site in the running event loop: a page of three files, and calls."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.resources
+import socket
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from aiohttp import web
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.web.calls import MAX_BODY, middleware, routes
+from smartcam.web.guard import HEADERS, Guard, checked_token, is_loopback, new_token
+from smartcam.web.streams import Streams
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+    from types import TracebackType
+    from typing import Self
+
+    from smartcam.web.calls import Call
+
+__all__ = ["API", "FAREWELL", "Site"]
+
+API = "/api"
+"""Prefix of the paths of all calls."""
+
+FAREWELL = 0.2
+"""Seconds that an answer under way gets when the site stops, twice."""
+
+KEEP_ALIVE = 60.0
+"""Seconds that a connection stays open without a request."""
+
+RESOLVE_TIMEOUT = 10.0
+"""Seconds that the look-up of the host's address may take."""
+
+_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
+_ANY = frozenset({"", "0.0.0.0", "::"})  # noqa: S104  names, nothing is bound here
+
+S = TypeVar("S")
+
+
+class Site(Generic[S]):
+    """A page and its calls on a port.
+
+    Args:
+        subject: what handlers of calls get.
+        calls: the calls.
+        page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry. None: nothing on a loopback address; on any other one
+            is made.
+
+    Attributes:
+        host: as given.
+        token: what calls must carry, None for nothing.
+        streams: the event streams.
+
+    Raises:
+        ConfigurationError: the token is too short.
+    """
+
+    def __init__(
+        self,
+        subject: S,
+        calls: Iterable[Call[S]],
+        page: str,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        if token is not None:
+            checked_token(token)
+        elif not is_loopback(host):
+            token = new_token()
+        self.host: str = host
+        self.token: str | None = token
+        self.streams: Streams = Streams()
+        self._subject = subject
+        self._calls = tuple(calls)
+        self._page = page
+        self._port = port
+        self._runner: web.AppRunner | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it listens on; the one given until it is started."""
+        return self._port
+
+    @property
+    def base(self) -> str:
+        """Its address, without a slash behind it; this machine's name for all its addresses."""
+        name = socket.gethostname() if self.host in _ANY else self.host
+        return f"http://{f'[{name}]' if ':' in name else name}:{self._port}"
+
+    @property
+    def url(self) -> str:
+        """Address of the page; the token stands behind ``#``, which browsers send to nobody."""
+        return f"{self.base}/" + ("" if self.token is None else f"#token={self.token}")
+
+    async def __aenter__(self) -> Self:
+        await self.start()
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.stop()
+
+    async def start(self) -> None:
+        """Open the port; does nothing if it is started already.
+
+        Raises:
+            ConfigurationError: it cannot listen there.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._runner is not None:
+            return
+        self.streams = Streams()
+        runner = web.AppRunner(
+            self._application(),
+            access_log=None,
+            shutdown_timeout=FAREWELL,
+            keepalive_timeout=KEEP_ALIVE,
+        )
+        try:
+            listener = await _listen(self.host, self._port, local=self.token is None)
+        except (OSError, ValueError, OverflowError) as exc:
+            raise ConfigurationError(f"web: cannot listen on {self.base}: {exc}") from exc
+        try:
+            await runner.setup()
+            await web.SockSite(runner, listener).start()
+        except BaseException:
+            listener.close()
+            await runner.cleanup()
+            raise
+        self._port = listener.getsockname()[1]
+        self._runner = runner
+
+    async def stop(self) -> None:
+        """Close the port, every stream and every connection; does nothing if stopped.
+
+        Cancellation: takes effect when all is closed, which two :data:`FAREWELL` take at most.
+        """
+        runner, self._runner = self._runner, None
+        if runner is None:
+            return
+        self.streams.close()
+        closing = asyncio.ensure_future(runner.cleanup())
+        try:
+            await asyncio.shield(closing)
+        except asyncio.CancelledError:
+            await asyncio.wait({closing})
+            raise
+
+    def _application(self) -> web.Application:
+        guard = Guard(token=self.token)
+        application = web.Application(
+            middlewares=[middleware(guard, API)], client_max_size=MAX_BODY
+        )
+        application.on_response_prepare.append(_add_headers)
+        application.router.add_routes(routes(self._calls, self._subject))
+        application.router.add_get("/", _file(f"{self._page}.html"))
+        for suffix in ("js", "css"):
+            application.router.add_get(f"/{self._page}.{suffix}", _file(f"{self._page}.{suffix}"))
+        return application
+
+
+async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(HEADERS)
+
+
+def _file(name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
+    """Return a handler that serves one of the page's files, which is read now."""
+    body = importlib.resources.files("smartcam.web").joinpath("page", name).read_bytes()
+    content_type = _TYPES[name.rpartition(".")[2]]
+
+    async def serve(_request: web.Request) -> web.Response:
+        return web.Response(body=body, content_type=content_type, charset="utf-8")
+
+    return serve
+
+
+async def _listen(host: str, port: int, *, local: bool) -> socket.socket:
+    """Return a listening socket.
+
+    Raises:
+        OSError, ValueError, OverflowError: it cannot be had, or it is not ``local``.
+    """
+    loop = asyncio.get_running_loop()
+    async with asyncio.timeout(RESOLVE_TIMEOUT):
+        found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    family, _, _, _, address = found[0]
+    if local and not is_loopback(str(address[0])):
+        raise ValueError(f"{host} is {address[0]} here, which needs a token")
+    return socket.create_server((address[0], port), family=family, backlog=128)

@@ -1,0 +1,15 @@
+"""The client in front of every camera that smartcam knows; the checks are the suite's."""
+
+from __future__ import annotations
+
+from worlds import BVS_WORLDS, INSIGHT_WORLDS
+
+from smartcam.testing.protocols import CameraSuite
+
+
+class TestBvs(CameraSuite):
+    worlds = BVS_WORLDS
+
+
+class TestInSight(CameraSuite):
+    worlds = INSIGHT_WORLDS

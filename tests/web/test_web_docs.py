@@ -1,0 +1,84 @@
+"""``docs/control.md``: its table has every call, and its ``curl`` lines do what they show."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from sitekit import TOKEN
+
+from smartcam.emulator import EmulatedCamera
+from smartcam.web import EmulatorSite, calls, emulator, shown, streams
+from smartcam.web.emulator import CALLS
+
+PAGE = (Path(__file__).parents[2] / "docs" / "control.md").read_text(encoding="utf-8")
+CURL = [
+    line
+    for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+    for line in block.splitlines()
+    if line.startswith("curl ")
+]
+
+
+def test_table_has_every_call() -> None:
+    table = PAGE.partition("\n## Calls\n")[2].partition("\n`GET /api`")[0]
+    rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in table.splitlines()[3:]]
+    assert [row for row in rows if row] == [
+        [call.method, f"`{call.path}`", call.about, f"`{call.sample}`" if call.sample else ""]
+        for call in CALLS
+    ]
+
+
+def test_bounds_are_those_of_the_code() -> None:
+    said = {
+        f"did not come within {calls.READ_TIMEOUT:g} s",
+        f"more than {calls.MAX_BODY >> 10} KiB",
+        f"{streams.MAX_STREAMS} event streams",
+        f"nothing for {streams.SLOW:g} s",
+        f"long payloads to {shown.MAX_HEX} bytes and decode results up to {shown.MAX_VALUES}",
+    }
+    assert [text for text in said if text not in PAGE] == []
+    assert emulator.MAX_ENTRIES >= 100  # the example's limit
+
+
+def curl_lacks() -> str:
+    """Return why the examples cannot run here, nothing where they can."""
+    curl = shutil.which("curl")
+    if curl is None:
+        return "no curl on the path"
+    done = subprocess.run([curl, "--help", "all"], capture_output=True, check=False)  # noqa: S603
+    return "" if b" --json " in done.stdout else "this curl is older than 7.82: it has no --json"
+
+
+@pytest.mark.skipif(bool(curl_lacks()), reason=curl_lacks())
+async def test_curl_lines_are_answered() -> None:
+    assert len(CURL) > 20
+    lacking: list[str] = []
+    async with (
+        EmulatedCamera() as camera,
+        EmulatorSite({"camera": camera}) as site,
+        EmulatorSite({"camera": camera}, token=TOKEN) as closed,
+    ):
+        for line in CURL:
+            token = "Authorization" in line
+            words = shlex.split(line.replace("just-for-this-test-bench", TOKEN))
+            api = (closed if token else site).api
+            words = [word.replace("http://localhost:8080", api) for word in words]
+            stream = "-N" in words
+            words[1:1] = ["-sS", "--fail-with-body", "--max-time", "0.3" if stream else "5"]
+            done = await asyncio.create_subprocess_exec(
+                *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+            )
+            out, err = await done.communicate()
+            told = out.startswith(b"event: camera") if stream else not done.returncode
+            if not told:
+                lacking.append(f"{line}: {out.decode()} {err.decode()}")
+            if not stream:
+                json.loads(out)
+    assert lacking == []
