@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from smartcam.testing.interpreters import InterpreterSuite, Sample
     from smartcam.testing.logs import CameraLog
     from smartcam.testing.protocols import (
-        CameraSuite,
         Came,
+        CameraSuite,
         Conversation,
         ProtocolSuite,
         Sent,
