@@ -16,6 +16,7 @@
     ├── CommandRejectedError                   the camera said no; what is active now
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── CameraFaultError                       the camera reports System Error
+    ├── RecordingError (OSError)               a recording that could not be written
     ├── SubscriberOverflowError                a stream's reader was too slow, and wanted to know
     ├── TriggerError                           a trigger that gave no result, and why
     │   ├── OvertriggeredError
@@ -58,6 +59,7 @@ __all__ = [
     "OvertriggeredError",
     "PluginError",
     "ProtocolError",
+    "RecordingError",
     "RemoteProtocolError",
     "ResponseTimeoutError",
     "SmartCamError",
@@ -212,6 +214,13 @@ class UnsupportedError(SmartCamError):
 
 class CameraFaultError(SmartCamError):
     """The camera reports System Error."""
+
+
+class RecordingError(SmartCamError, OSError):
+    """A recording could not be written: the disk is full, or too slow; it ends there.
+
+    What was written before stays and can be read.
+    """
 
 
 class SubscriberOverflowError(SmartCamError):

@@ -17,7 +17,6 @@ here before a fixture is used.
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import inspect
 from pathlib import Path
@@ -56,6 +55,13 @@ MARKER = (
 )
 
 _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Pytest: the options of the suites that judge cameras and clients."""
+    from smartcam.testing.conformance.plan import add_options
+
+    add_options(parser)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -202,6 +208,8 @@ def _with_client(test: Callable[..., Any], client: SmartCamera) -> Callable[...,
 
 
 def _in_asyncio() -> bool:
+    import asyncio  # costs more than all else here
+
     try:
         asyncio.get_running_loop()
     except RuntimeError:

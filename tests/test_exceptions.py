@@ -28,6 +28,7 @@ TREE: dict[type[Exception], tuple[type[Exception], ...]] = {
     e.CommandRejectedError: (ROOT,),
     e.UnsupportedError: (ROOT,),
     e.CameraFaultError: (ROOT,),
+    e.RecordingError: (ROOT, OSError),
     e.SubscriberOverflowError: (ROOT,),
     e.TriggerError: (ROOT,),
     e.OvertriggeredError: (e.TriggerError,),

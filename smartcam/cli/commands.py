@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import smartcam
-from smartcam.cli import decoding, demo, doctoring, probing
+from smartcam.cli import decoding, demo, dissecting, doctoring, probing, recording
 from smartcam.cli.options import (
     CONNECTS,
     SECONDS,
@@ -287,6 +287,12 @@ def demo_command(**shared: Any) -> None:
     """Watch smartcam do its main job against an emulated camera over real TCP."""
     options = Options(**shared)
     run(demo.demo(options), program="smartcam", debug=options.debug)
+
+
+command.add_command(dissecting.dissector)
+command.add_command(recording.record)
+command.add_command(recording.replay)
+command.add_command(recording.pcap)
 
 
 def _then_show(

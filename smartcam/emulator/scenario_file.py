@@ -101,8 +101,7 @@ def scenario_schema() -> dict[str, Any]:
 
 def _texts(path: str | Path, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]) -> str:
     texts = [
-        ": ".join([f"line {_line(root, place)}", *_field(place), text])
-        for place, text in findings
+        ": ".join([f"line {_line(root, place)}", *_field(place), text]) for place, text in findings
     ]
     return f"scenario {path}, {'; '.join(texts)}"
 

@@ -1,0 +1,29 @@
+"""Record what a camera says, play it back as an emulated camera, show it to Wireshark.
+
+::
+
+    with Recorder("run.mcap") as recorder:
+        async with smartcam.connect(url, observers=[recorder]) as camera:
+            ...
+    async with ReplayedCamera(load_recording("run.mcap")) as emulator:
+        emulator.url
+
+The container is MCAP, which Foxglove and others open. It needs the extra ``record``.
+"""
+
+from smartcam.recording.form import RecordedError
+from smartcam.recording.pcap import write_pcap
+from smartcam.recording.reader import RecordedCamera, Recording, load_recording
+from smartcam.recording.recorder import Counts, Recorder
+from smartcam.recording.replay import ReplayedCamera
+
+__all__ = [
+    "Counts",
+    "RecordedCamera",
+    "RecordedError",
+    "Recorder",
+    "Recording",
+    "ReplayedCamera",
+    "load_recording",
+    "write_pcap",
+]

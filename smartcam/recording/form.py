@@ -1,0 +1,343 @@
+"""The form of a recording: which topics there are, what their messages hold, and both ways to JSON.
+
+Each camera has four topics, ``/CAMERA/frames``, ``results``, ``events`` and ``errors``. A message
+is a JSON object with the field names of the public models; a field that is None is left out, since
+viewers such as Foxglove take a field's type from the schema and know no "or null". The schemas
+keep to the types that Foxglove reads (``type`` is one word everywhere).
+"""
+
+from __future__ import annotations
+
+import importlib
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+from smartcam.connection import TraceEntry
+from smartcam.exceptions import MissingExtraError
+from smartcam.models import (
+    ApplicationChanged,
+    CameraEvent,
+    Connected,
+    Disconnected,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+    jsonable,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+__all__ = [
+    "CAMERA_METADATA",
+    "FILE_METADATA",
+    "FORMAT",
+    "KINDS",
+    "PROFILE",
+    "Item",
+    "Kind",
+    "RecordedError",
+    "load_extra",
+    "nanoseconds",
+    "status_of",
+    "topic_of",
+]
+
+FORMAT = "1"
+"""Version of the form; a reader refuses another one."""
+
+PROFILE = "x-smartcam"
+"""Profile in the file's header."""
+
+FILE_METADATA = "smartcam"
+"""Name of the metadata record about the file: ``format``, ``version`` (of smartcam), ``began``."""
+
+CAMERA_METADATA = "smartcam.camera"
+"""Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and what else was
+told; a later one goes before an earlier one."""
+
+EPOCH = datetime.fromtimestamp(0, UTC)
+
+
+class RecordedError(NamedTuple):
+    """Something went wrong while it was recorded: what ``Observer.on_error`` is told.
+
+    Attributes:
+        camera: name of the camera.
+        at: when the recorder was told, UTC.
+        error: name of the exception's class.
+        text: what it says.
+        triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
+    """
+
+    camera: str
+    at: datetime
+    error: str
+    text: str
+    triggered_at: datetime | None
+
+
+Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError
+"""What a recording holds."""
+
+
+class Kind(NamedTuple):
+    """One kind of message.
+
+    Attributes:
+        topic: last part of its topic.
+        schema: name of its schema.
+        about: what it is, for the schema.
+        properties: the schema's, by field.
+        required: fields that are always there.
+        to_json: makes the object of an item.
+        from_json: makes the item of an object; raises whatever comes where it does not fit.
+    """
+
+    topic: str
+    schema: str
+    about: str
+    properties: Mapping[str, Any]
+    required: tuple[str, ...]
+    to_json: Callable[[Any], dict[str, Any]]
+    from_json: Callable[[dict[str, Any]], Item]
+
+    @property
+    def json_schema(self) -> dict[str, Any]:
+        """The JSON Schema of its messages."""
+        return {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": self.schema,
+            "description": self.about,
+            "type": "object",
+            "properties": dict(self.properties),
+            "required": list(self.required),
+        }
+
+
+def load_extra(name: str) -> Any:
+    """Import a module of the extra ``record``.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as exc:
+        raise MissingExtraError(
+            f'recordings need {name.partition(".")[0]}: pip install "smartcam[record]"',
+            extra="record",
+        ) from exc
+
+
+def nanoseconds(at: datetime) -> int:
+    """Return a time as MCAP has it: nanoseconds since 1970, UTC; never negative."""
+    return max(0, (at - EPOCH) // timedelta(microseconds=1) * 1000)
+
+
+def topic_of(camera: str, kind: str) -> str:
+    """Return the topic of a camera's messages of one kind."""
+    return f"/{camera}/{KINDS[kind].topic}"
+
+
+# ---------------------------------------------------------------------- to JSON
+
+
+def _object(value: object) -> dict[str, Any]:
+    """Return an item's fields as JSON, without those that are None."""
+    fields: dict[str, Any] = jsonable(value)
+    return {name: field for name, field in fields.items() if field is not None}
+
+
+def _event_object(event: CameraEvent) -> dict[str, Any]:
+    fields = _object(event)
+    previous = fields.pop("previous", None)
+    if previous is not None:
+        name = "previous_status" if isinstance(event, StatusChanged) else "previous_application"
+        fields[name] = previous
+    return {"event": type(event).__name__, **fields}
+
+
+# ---------------------------------------------------------------------- from JSON
+
+
+def _time(text: str) -> datetime:
+    return datetime.fromisoformat(text)
+
+
+def _optional_time(fields: Mapping[str, Any], name: str) -> datetime | None:
+    return _time(fields[name]) if name in fields else None
+
+
+def status_of(names: list[str]) -> Status:
+    """Return the status of its bits' names; a bit without a name stands there as ``0x40``."""
+    bits = [int(name, 16) if name.startswith("0x") else Status[name].value for name in names]
+    return Status(sum(bits))
+
+
+def _frame(fields: dict[str, Any]) -> TraceEntry:
+    return TraceEntry(
+        _time(fields["at"]),
+        str(fields["camera"]),
+        str(fields["direction"]),
+        fields.get("message_id"),
+        str(fields["message"]),
+        fields.get("fields"),
+        str(fields["hex"]),
+    )
+
+
+def _result(fields: dict[str, Any]) -> Result:
+    return Result(
+        str(fields["camera"]),
+        int(fields["application"]),
+        fields.get("sequence"),
+        int(fields["number"]),
+        _optional_time(fields, "triggered_at"),
+        _time(fields["received_at"]),
+        fields.get("latency"),
+        bytes.fromhex(fields["raw"]),
+        fields.get("value"),
+    )
+
+
+def _event(fields: dict[str, Any]) -> CameraEvent:
+    camera, at = str(fields["camera"]), _time(fields["at"])
+    match fields["event"]:
+        case "Connected":
+            return Connected(camera=camera, at=at, url=fields["url"])
+        case "Reconnected":
+            return Reconnected(camera=camera, at=at, url=fields["url"])
+        case "Disconnected":
+            return Disconnected(
+                camera=camera, at=at, reason=fields["reason"], expected=fields["expected"]
+            )
+        case "StatusChanged":
+            before = fields.get("previous_status")
+            return StatusChanged(
+                camera=camera,
+                at=at,
+                status=status_of(fields["status"]),
+                previous=None if before is None else status_of(before),
+            )
+        case "ApplicationChanged":
+            return ApplicationChanged(
+                camera=camera,
+                at=at,
+                application=fields["application"],
+                previous=fields.get("previous_application"),
+            )
+        case _:
+            return CameraEvent(camera=camera, at=at)
+
+
+def _error(fields: dict[str, Any]) -> RecordedError:
+    return RecordedError(
+        str(fields["camera"]),
+        _time(fields["at"]),
+        str(fields["error"]),
+        str(fields["text"]),
+        _optional_time(fields, "triggered_at"),
+    )
+
+
+# ---------------------------------------------------------------------- the table
+
+
+def _text(about: str) -> dict[str, Any]:
+    return {"type": "string", "description": about}
+
+
+def _integer(about: str) -> dict[str, Any]:
+    return {"type": "integer", "description": about}
+
+
+def _when(about: str) -> dict[str, Any]:
+    return {"type": "string", "format": "date-time", "description": f"{about}; ISO 8601, UTC"}
+
+
+_CAMERA = _text("name of the camera")
+_AT = _when("when")
+_BITS = {"type": "array", "items": {"type": "string"}, "description": "names of the status bits"}
+_TRIGGERED_AT = _when("when it was triggered; absent where it was not")
+
+KINDS: dict[str, Kind] = {
+    "frames": Kind(
+        "frames",
+        "smartcam.Frame",
+        "A frame on the wire, or bytes that make none.",
+        {
+            "at": _AT,
+            "camera": _CAMERA,
+            "direction": _text("> to the camera, < from it, ! bytes that make no frame"),
+            "message_id": _integer("id on the wire"),
+            "message": _text("name of the message, or what is wrong with the bytes"),
+            "fields": {"type": "object", "properties": {}, "description": "the decoded body"},
+            "hex": _text("the bytes"),
+        },
+        ("at", "camera", "direction", "message", "hex"),
+        _object,
+        _frame,
+    ),
+    "results": Kind(
+        "results",
+        "smartcam.Result",
+        "A decoded result container; in `value` stands what the interpreter made of it.",
+        {
+            "camera": _CAMERA,
+            "application": _integer("id of the application that made it"),
+            "sequence": _integer("value of the layout's @sequence field"),
+            "number": _integer("the client's own count, from 1"),
+            "triggered_at": _TRIGGERED_AT,
+            "received_at": _when("when its last byte arrived"),
+            "latency": {"type": "number", "description": "seconds from trigger to arrival"},
+            "raw": _text("the container's bytes behind the application id, as hex"),
+        },
+        ("camera", "application", "number", "received_at", "raw"),
+        _object,
+        _result,
+    ),
+    "events": Kind(
+        "events",
+        "smartcam.Event",
+        "Something happened to the camera.",
+        {
+            "event": _text(
+                "Connected, Reconnected, Disconnected, StatusChanged or ApplicationChanged"
+            ),
+            "camera": _CAMERA,
+            "at": _AT,
+            "url": _text("Connected, Reconnected: the address, with everything pinned"),
+            "reason": _text("Disconnected: why"),
+            "expected": {
+                "type": "boolean",
+                "description": "Disconnected: by the client's own wish",
+            },
+            "status": _BITS,
+            "previous_status": _BITS,
+            "application": _integer("ApplicationChanged: id of the active application"),
+            "previous_application": _integer("ApplicationChanged: id of the one before"),
+        },
+        ("event", "camera", "at"),
+        _event_object,
+        _event,
+    ),
+    "errors": Kind(
+        "errors",
+        "smartcam.Error",
+        "Something went wrong: a trigger without a result, a lost link, a container that does "
+        "not fit.",
+        {
+            "camera": _CAMERA,
+            "at": _AT,
+            "error": _text("name of the exception's class"),
+            "text": _text("what it says"),
+            "triggered_at": _TRIGGERED_AT,
+        },
+        ("camera", "at", "error", "text"),
+        _object,
+        _error,
+    ),
+}
+"""The kinds of messages, by the last part of their topics."""

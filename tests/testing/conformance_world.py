@@ -1,0 +1,114 @@
+"""Emulated cameras for the camera suite, in a thread: documented ones, and ones that sin."""
+
+from __future__ import annotations
+
+import contextlib
+from concurrent.futures import ThreadPoolExecutor
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.emulator import EmulatedCamera
+from smartcam.testing.conformance import Allow, Plan, Report, judge
+from smartcam.testing.threads import LoopThread
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+APPLICATION, OTHER = 5, 6
+
+APPLICATIONS = (
+    {
+        "id": APPLICATION,
+        "layout": "n: int32 @sequence, v: int32",
+        "constant": {"v": 3},
+        "input": "v: int32",
+        "load_time": 0.06,
+        "processing_time": 0.04,
+    },
+    {
+        "id": OTHER,
+        "layout": "t: string[4]",
+        "constant": {"t": "ab"},
+        "load_time": 0.06,
+        "processing_time": 0.04,
+    },
+)
+"""One with a sequence number and input data, and another one."""
+
+WORLDS = [
+    (dialect, transport)
+    for dialect in ("handbook", "thesis", "b16", "bid")
+    for transport in ("tcp", "udp")
+]
+
+AT_ONCE = 24
+"""Cameras judged at the same time: each waits nearly always."""
+
+
+class Case(NamedTuple):
+    """A camera, and what it is judged by.
+
+    Attributes:
+        camera: options of the emulator.
+        items: names of checks and questions, None for all.
+        sin: what is done to the emulator first.
+        plan: fields of the plan.
+    """
+
+    camera: dict[str, Any]
+    items: tuple[str, ...] | None = None
+    sin: Callable[[Any], None] | None = None
+    plan: Mapping[str, Any] = MappingProxyType({})
+
+
+def short_plan(url: str, **fields: Any) -> Plan:
+    """Return a plan with everything allowed and short times."""
+    given: dict[str, Any] = {
+        "other_application": OTHER,
+        "allow": ~Allow.NOTHING,
+        "quiet": 0.05,
+        "timeout": 2.0,
+        "switch_timeout": 1.0,
+        "reboot_timeout": 5.0,
+        "sequence_offset": 0,
+        "input_data": bytes(4),
+    }
+    return Plan(url=url, **{**given, **fields})
+
+
+@contextlib.contextmanager
+def loop_thread() -> Iterator[LoopThread]:
+    """Give an event loop in a thread; it ends all cameras that live in it."""
+    thread = LoopThread("conformance")
+    thread.start()
+    try:
+        yield thread
+    finally:
+        thread.stop()
+
+
+@contextlib.contextmanager
+def emulated(
+    thread: LoopThread, sin: Callable[[Any], None] | None = None, **options: Any
+) -> Iterator[EmulatedCamera]:
+    """Run an emulated camera with short times in a thread."""
+    emulator = EmulatedCamera(**{"applications": APPLICATIONS, **options})
+    if sin is not None:
+        sin(emulator)
+    thread.wait(emulator.start())
+    try:
+        yield emulator
+    finally:
+        thread.wait(emulator.stop())
+
+
+def judge_case(thread: LoopThread, case: Case) -> Report:
+    """Judge one camera."""
+    with emulated(thread, case.sin, **case.camera) as emulator:
+        return judge(short_plan(emulator.url, **case.plan), case.items)
+
+
+def judge_all(cases: Iterable[Case]) -> list[Report]:
+    """Judge cameras, several at the same time."""
+    with loop_thread() as thread, ThreadPoolExecutor(AT_ONCE) as pool:
+        return list(pool.map(lambda case: judge_case(thread, case), cases))
