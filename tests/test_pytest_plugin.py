@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
+from smartcam.registry import INTERPRETERS, PROTOCOLS
+
 if TYPE_CHECKING:
     from pathlib import Path
 
 pytest_plugins = ["pytester"]
+
+# pytester forgets what a nested run imported, and the next one would make second copies of it
+_LOADED = [
+    importlib.import_module(name)
+    for name in ("smartcam.client", "smartcam.testing.threads", "numpy", "yaml")
+]
+_PLUGINS = [one.load(info.name) for one in (INTERPRETERS, PROTOCOLS) for info in one.available()]
 
 SYNCHRONOUS = """
     import socket
@@ -285,8 +295,8 @@ def test_workers_of_xdist_do_not_meet(pytester: pytest.Pytester) -> None:
 def test_suite_that_does_not_use_it_imports_nothing_heavy(tmp_path: Path) -> None:
     (tmp_path / "test_nothing.py").write_text(
         "import sys\n\ndef test_nothing():\n"
-        "    heavy = {'numpy', 'pydantic', 'construct', 'yaml', 'aiohttp', 'smartcam.emulator',\n"
-        "        'smartcam.client', 'smartcam.testing', 'smartcam.exceptions'}\n"
+        "    heavy = {'asyncio', 'numpy', 'pydantic', 'construct', 'yaml', 'aiohttp',\n"
+        "        'smartcam.emulator', 'smartcam.client', 'smartcam.testing.threads'}\n"
         "    assert 'smartcam.pytest_plugin' in sys.modules\n"
         "    assert heavy.isdisjoint(sys.modules)\n",
         encoding="utf-8",

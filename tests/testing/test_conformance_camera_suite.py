@@ -24,19 +24,9 @@ if TYPE_CHECKING:
 
 pytest_plugins = ["pytester"]
 
-PLUGINS = ("-p", "conformance_options", "-p", "no:cacheprovider", "-p", "no:asyncio")
+PLUGINS = ("-p", "no:cacheprovider", "-p", "no:asyncio")
 
 PAGE = Path(__file__).parents[2] / "docs" / "judging-cameras.md"
-
-OPTIONS = """
-from smartcam.testing.conformance import add_options
-
-def pytest_addoption(parser):
-    try:
-        add_options(parser)
-    except ValueError:
-        pass  # the plugin has them already
-"""
 
 FLAGS = re.DOTALL | re.MULTILINE
 
@@ -52,7 +42,6 @@ def thread() -> Iterator[LoopThread]:
 @pytest.fixture
 def folder(pytester: pytest.Pytester) -> pytest.Pytester:
     """Return a folder as a user has one, without settings of ours."""
-    pytester.makepyfile(conformance_options=OPTIONS)
     pytester.syspathinsert()
     return pytester
 
