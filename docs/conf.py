@@ -112,6 +112,8 @@ LIMITS = (
     "recording.recorder.MAX_WAITING",
     "recording.recorder.CLOSE_TIMEOUT",
     "recording.reader.MAX_RECORD",
+    "testing.clients.tasks.MAX_OUTPUT",
+    "testing.clients.runs.MAX_LINES",
     "testing.conformance.wire.MAX_BODY",
     "testing.conformance.line.MAX_HEARD",
     "testing.conformance.line.MAX_TRAIL",

@@ -59,9 +59,18 @@ _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Pytest: the options of the suites that judge cameras and clients."""
-    from smartcam.testing.conformance.plan import add_options
+    from smartcam.testing.clients import options as clients
+    from smartcam.testing.conformance import plan as cameras
 
-    add_options(parser)
+    cameras.add_options(parser)
+    clients.add_options(parser)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Pytest: what was found of clients; what was found of a camera, its judge tells itself."""
+    from smartcam.testing.clients.options import terminal_summary
+
+    terminal_summary(terminalreporter)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -93,7 +102,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 
 @pytest.fixture
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
-    """Several emulated cameras by name, as :func:`emulated_camera`: two, or those of a scenario."""
+    """Emulated cameras by name: two, or those of a scenario; otherwise as emulated_camera."""
     from smartcam.emulator import Scenario
     from smartcam.testing.threads import ThreadedFleet
 

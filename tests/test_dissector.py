@@ -334,40 +334,42 @@ SPOKEN = [
 
 
 @contextlib.asynccontextmanager
-async def dumping(path: Path) -> AsyncIterator[None]:
-    """Capture what is said on loopback; at the end everything that was said is in the file."""
-    process = await asyncio.create_subprocess_exec(
-        *("dumpcap", "-q", "-i", "lo", "-w", str(path), "-f", "tcp or udp"),
-        stderr=asyncio.subprocess.PIPE,
-    )
-    assert process.stderr is not None
-    try:
-        async with asyncio.timeout(20):
-            heard = b""
-            while b"File:" not in heard:
-                line = await process.stderr.readline()
-                heard += line
-                if not line:
-                    pytest.skip(f"may not capture on loopback: {heard.decode().strip()}")
-            yield
-            await _flushed(path)
-        process.terminate()
-    finally:
-        if process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                process.terminate()
-        await asyncio.wait_for(process.communicate(), 10)
-
-
-async def _flushed(path: Path) -> None:
-    """Send marks until one is in the file: packets come in order."""
-    mark = b"smartcam: the end of a capture"
+async def dumping(path: Path, ports: list[int]) -> AsyncIterator[None]:
+    """Capture what is said on some ports of loopback; at the end all of it is in the file."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as marker:
         marker.bind(("127.0.0.1", 0))
-        async with asyncio.timeout(20):
-            while mark not in path.read_bytes():  # noqa: ASYNC240 - a small file
-                marker.sendto(mark, marker.getsockname())
-                await asyncio.sleep(0.02)
+        wanted = " or ".join(f"port {port}" for port in (*ports, marker.getsockname()[1]))
+        process = await asyncio.create_subprocess_exec(
+            *("dumpcap", "-q", "-i", "lo", "-w", str(path), "-f", wanted),
+            stderr=asyncio.subprocess.PIPE,
+        )
+        try:
+            async with asyncio.timeout(20):
+                await _began(process)
+                yield
+                await _flushed(path, marker)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                process.terminate()
+            await asyncio.wait_for(process.communicate(), 10)
+
+
+async def _began(process: asyncio.subprocess.Process) -> None:
+    assert process.stderr is not None
+    heard = b""
+    while b"File:" not in heard:
+        line = await process.stderr.readline()
+        heard += line
+        if not line:
+            pytest.skip(f"may not capture on loopback: {heard.decode().strip()}")
+
+
+async def _flushed(path: Path, marker: socket.socket) -> None:
+    """Send marks until one is in the file: packets come in order."""
+    mark = b"smartcam: the end of a capture"
+    while mark not in path.read_bytes():  # noqa: ASYNC240 - a small file
+        marker.sendto(mark, marker.getsockname())
+        await asyncio.sleep(0.02)
 
 
 async def use(emulator: EmulatedCamera) -> None:
@@ -397,7 +399,7 @@ async def test_captured_sessions_are_shown_as_the_camera_saw_them(
             )
             for dialect, transport, quirks in SPOKEN
         ]
-        async with dumping(path):
+        async with dumping(path, [one.port for one in cameras]):
             await asyncio.gather(*map(use, cameras))
     told = [("-d", f"{one.transport}.port=={one.port},bvs") for one in cameras]
     shown = await asyncio.to_thread(show, lua, path, "-2", *itertools.chain(*told))

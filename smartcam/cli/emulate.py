@@ -164,11 +164,11 @@ def _scenarios(path: str | None, dialect: str | None, copies: int) -> tuple[Scen
     loaded = (Scenario(),) if path is None else load_scenarios(path, dialect=dialect)
     if copies == 1:
         return loaded
-    if len(loaded) > 1:
+    one, *others = loaded
+    if others:
         raise ConfigurationError(
             f"--cameras {copies}: the scenario {path} has {len(loaded)} cameras already"
         )
-    (one,) = loaded
     return tuple(
         one.model_copy(update={"name": f"camera{index + 1}", "seed": one.seed + index})
         for index in range(copies)

@@ -13,7 +13,7 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["NANOSECONDS", "Clock", "ManualClock", "RealClock", "TimerHandle"]
+__all__ = ["NANOSECONDS", "Clock", "ManualClock", "OneTimer", "RealClock", "TimerHandle"]
 
 NANOSECONDS = 1_000_000_000
 """In a second. Devices and the manual clock count whole nanoseconds, so that instants that are the
@@ -52,6 +52,35 @@ class RealClock(Clock):
     def call_at(self, when: float, callback: Callable[[], None]) -> TimerHandle:
         """Call ``callback`` by a timer of the loop."""
         return asyncio.get_running_loop().call_at(when, callback)
+
+
+class OneTimer:
+    """One timer of a clock, set again whenever something else is next.
+
+    Args:
+        clock: whose time counts.
+        callback: called when the time has come; the timer is not set then.
+    """
+
+    def __init__(self, clock: Clock, callback: Callable[[], None]) -> None:
+        self._clock = clock
+        self._callback = callback
+        self._handle: TimerHandle | None = None
+        self._when: int | None = None
+
+    def set(self, when: int | None) -> None:
+        """Set it to an instant, nanoseconds; None: not at all."""
+        if when == self._when:
+            return
+        if self._handle is not None:
+            self._handle.cancel()
+        self._handle, self._when = None, when
+        if when is not None:
+            self._handle = self._clock.call_at(when / NANOSECONDS, self._due)
+
+    def _due(self) -> None:
+        self._handle = self._when = None
+        self._callback()
 
 
 class _Timer:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.emulator.clock import NANOSECONDS
+from smartcam.emulator.clock import NANOSECONDS, OneTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.emulator.clock import Clock, TimerHandle
+    from smartcam.emulator.clock import Clock
     from smartcam.emulator.parcels import Ending, Parcel
 
 __all__ = ["Conveyor", "Piece"]
@@ -81,14 +81,12 @@ class Conveyor:
         """Bytes on it."""
         self._clock = clock
         self._ordered = ordered
-        self._wake = wake
         self._carry = carry
         self._end = end
         self._lost = lost
         self._queue: deque[_Waiting] = deque()
         self._loose: list[_Waiting] = []
-        self._timer: TimerHandle | None = None
-        self._timer_at: int | None = None
+        self._timer = OneTimer(clock, wake)
         self._running = False
 
     @property
@@ -123,7 +121,7 @@ class Conveyor:
 
     def close(self) -> None:
         """Drop what is on it; nothing passes any more. Harmless when done twice."""
-        self._disarm()
+        self._timer.set(None)
         self.size = 0
         left = [*self._queue, *self._loose]
         self._queue.clear()
@@ -210,21 +208,6 @@ class Conveyor:
             self._end(parcel.end)
 
     def _arm(self) -> None:
-        """Set one timer for what passes next."""
+        """Set the timer for what passes next."""
         waiting = [*list(self._queue)[:1], *self._loose]
-        when = min((one.when for one in waiting), default=None)
-        if when == self._timer_at:
-            return
-        self._disarm()
-        if when is not None:
-            self._timer_at = when
-            self._timer = self._clock.call_at(when / NANOSECONDS, self._due)
-
-    def _disarm(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = self._timer_at = None
-
-    def _due(self) -> None:
-        self._timer = self._timer_at = None
-        self._wake()
+        self._timer.set(min((one.when for one in waiting), default=None))

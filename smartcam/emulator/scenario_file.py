@@ -29,13 +29,13 @@ def load_scenario(path: str | Path, *, dialect: str | None = None) -> Scenario:
         ConfigurationError: as :func:`load_scenarios`, or there are several cameras in it.
         MissingExtraError: PyYAML is not installed.
     """
-    scenarios = load_scenarios(path, dialect=dialect)
-    if len(scenarios) > 1:
+    first, *others = load_scenarios(path, dialect=dialect)
+    if others:
         raise ConfigurationError(
-            f"scenario {path}: one camera was expected, it has {len(scenarios)}: "
-            f"{', '.join(scenario.name for scenario in scenarios)}; EmulatedFleet takes them all"
+            f"scenario {path}: one camera was expected, it has {1 + len(others)}: "
+            f"{', '.join(one.name for one in (first, *others))}; EmulatedFleet takes them all"
         )
-    return scenarios[0]
+    return first
 
 
 def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Scenario, ...]:

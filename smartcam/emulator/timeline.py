@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from smartcam.emulator.clock import NANOSECONDS
+from smartcam.emulator.clock import NANOSECONDS, OneTimer
 from smartcam.emulator.faults import Fault
 from smartcam.emulator.states import DeviceState
 from smartcam.exceptions import ConfigurationError
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pydantic.json_schema import JsonSchemaValue
     from pydantic_core import CoreSchema
 
-    from smartcam.emulator.clock import Clock, TimerHandle
+    from smartcam.emulator.clock import Clock
 
 __all__ = ["MAX_AT_ONCE", "MAX_PENDING", "Cue", "Timeline"]
 
@@ -212,8 +212,7 @@ class Timeline:
         self._inject = inject
         self._pending: list[tuple[int, int, _Row, bool]] = []
         self._order = itertools.count()
-        self._timer: TimerHandle | None = None
-        self._timer_at: int | None = None
+        self._timer = OneTimer(clock, self._run)
         self._waiting: list[_Row] = []
         self._acting = False
         self._instant: tuple[float, int] = (0.0, 0)
@@ -243,7 +242,7 @@ class Timeline:
         """Forget what is to come. Harmless when done twice."""
         self._pending.clear()
         self._waiting.clear()
-        self._disarm()
+        self._timer.set(None)
 
     def entered(self, state: DeviceState) -> None:
         """The camera has entered a state."""
@@ -302,7 +301,7 @@ class Timeline:
                 self._happen()
         finally:
             self._acting = False
-        self._arm()
+        self._timer.set(self._pending[0][0] if self._pending else None)
 
     def _happen(self) -> None:
         while self._waiting:
@@ -317,25 +316,6 @@ class Timeline:
                 self._inject(row.cue.do)
             except ConfigurationError as exc:  # too many faults wait
                 _log.warning("! timeline: not injected: %s", exc)
-
-    def _arm(self) -> None:
-        """Set one timer for what happens next."""
-        when = self._pending[0][0] if self._pending else None
-        if when == self._timer_at:
-            return
-        self._disarm()
-        if when is not None:
-            self._timer_at = when
-            self._timer = self._clock.call_at(when / NANOSECONDS, self._due)
-
-    def _disarm(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = self._timer_at = None
-
-    def _due(self) -> None:
-        self._timer = self._timer_at = None
-        self._run()
 
 
 def _ns(seconds: float) -> int:

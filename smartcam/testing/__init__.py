@@ -15,6 +15,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from smartcam.testing.clients import ClientConformance
+    from smartcam.testing.conformance import CameraConformance
     from smartcam.testing.interpreters import InterpreterSuite, Sample
     from smartcam.testing.logs import CameraLog
     from smartcam.testing.protocols import (
@@ -32,8 +34,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Came",
+    "CameraConformance",
     "CameraLog",
     "CameraSuite",
+    "ClientConformance",
     "Conversation",
     "InterpreterSuite",
     "LinkProxy",
@@ -48,7 +52,9 @@ __all__ = [
 ]
 
 _MODULES = {
+    "CameraConformance": "conformance",
     "CameraLog": "logs",
+    "ClientConformance": "clients",
     "InterpreterSuite": "interpreters",
     "LinkProxy": "proxy",
     "Sample": "interpreters",

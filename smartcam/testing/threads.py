@@ -47,6 +47,7 @@ class LoopThread:
     def __init__(self, name: str) -> None:
         self._name = name
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -57,9 +58,9 @@ class LoopThread:
 
         async def live() -> None:
             self._loop = asyncio.get_running_loop()
-            self._end = asyncio.Event()
+            end = self._end = asyncio.Event()
             ready.set()
-            await self._end.wait()
+            await end.wait()
 
         # a daemon, so that a test that is killed does not wait for it
         self._thread = threading.Thread(
@@ -74,7 +75,7 @@ class LoopThread:
     def stop(self) -> None:
         """End it. Harmless when done twice."""
         thread, self._thread = self._thread, None
-        if thread is not None and self._loop is not None:
+        if thread is not None and self._loop is not None and self._end is not None:
             self._loop.call_soon_threadsafe(self._end.set)
             thread.join(CALL_TIMEOUT)
             self._loop = None
@@ -134,7 +135,60 @@ class _InThread:
         return lambda *args, **kwargs: self._thread.run(value, *args, **kwargs)
 
 
-class ThreadedCamera:
+class _InLoop:
+    """Something with ``start()`` and ``stop()`` that lives in a thread's loop.
+
+    Args:
+        thread: the thread.
+        hosted: what lives in it.
+        owns: whether the thread is started and ended with it.
+    """
+
+    def __init__(
+        self, thread: LoopThread, hosted: EmulatedCamera | EmulatedFleet, *, owns: bool = True
+    ) -> None:
+        self._thread = thread
+        self._hosted = hosted
+        self._owns_thread = owns
+
+    def start(self) -> None:
+        """Start it; does nothing if it runs.
+
+        Raises:
+            ConfigurationError: it cannot listen; nothing is started.
+        """
+        if self._owns_thread:
+            self._thread.start()
+        try:
+            self._thread.wait(self._hosted.start())
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Stop it; the log can still be read. Harmless when done twice."""
+        try:
+            self._thread.wait(self._hosted.stop())
+        except ConfigurationError:
+            return  # it does not run
+        finally:
+            if self._owns_thread:
+                self._thread.stop()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+
+class ThreadedCamera(_InLoop):
     """An :class:`~smartcam.emulator.EmulatedCamera` in a thread; a context manager.
 
     Args:
@@ -149,66 +203,24 @@ class ThreadedCamera:
     """
 
     def __init__(self, *, manual_clock: bool = False, **options: Any) -> None:
-        clock = ManualClock() if manual_clock else None
-        self._manual = clock
-        self._emulator = EmulatedCamera(clock=clock, **options)
-        self._own_thread = True
-        self._adopt(LoopThread(f"smartcam.emulator[{self._emulator.name}]"))
+        emulator = EmulatedCamera(clock=ManualClock() if manual_clock else None, **options)
+        self._host(LoopThread(f"smartcam.emulator[{emulator.name}]"), emulator, owns=True)
 
     @classmethod
     def in_thread(cls, thread: LoopThread, emulator: EmulatedCamera) -> Self:
         """Return the synchronous face of an emulator that lives in a thread already."""
         self = cls.__new__(cls)
-        self._manual = emulator.clock if isinstance(emulator.clock, ManualClock) else None
-        self._emulator = emulator
-        self._own_thread = False
-        self._adopt(thread)
+        self._host(thread, emulator, owns=False)
         return self
 
-    def _adopt(self, thread: LoopThread) -> None:
-        emulator, self._thread = self._emulator, thread
+    def _host(self, thread: LoopThread, emulator: EmulatedCamera, *, owns: bool) -> None:
+        super().__init__(thread, emulator, owns=owns)
+        self._emulator = emulator
         self.log: CameraLog = CameraLog(
             read=lambda: self._look(lambda: list(emulator.log)),
             visits=lambda: self.visits,
             links=lambda: self.links if self.transport == "tcp" else [],
         )
-
-    # ------------------------------------------------------------------ life
-
-    def start(self) -> None:
-        """Start thread and camera; does nothing if they run.
-
-        Raises:
-            ConfigurationError: the camera cannot listen there.
-        """
-        self._thread.start()
-        try:
-            self._thread.wait(self._emulator.start())
-        except BaseException:
-            self.stop()
-            raise
-
-    def stop(self) -> None:
-        """Stop both; the log can still be read. Harmless when done twice."""
-        if self._own_thread:
-            try:
-                self._thread.wait(self._emulator.stop())
-            except ConfigurationError:
-                return  # it does not run
-            finally:
-                self._thread.stop()
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         return f"<ThreadedCamera {self.name} {self.url}>"
@@ -324,9 +336,10 @@ class ThreadedCamera:
         Raises:
             ConfigurationError: it runs in real time, or the time is negative.
         """
-        if self._manual is None:
+        clock = self._emulator.clock
+        if not isinstance(clock, ManualClock):
             raise ConfigurationError("the emulator runs in real time: give it manual_clock=True")
-        self._thread.run(self._manual.advance, seconds)
+        self._thread.run(clock.advance, seconds)
 
     def run(self, function: Callable[[EmulatedCamera], T]) -> T:
         """Call ``function`` with the :class:`~smartcam.emulator.EmulatedCamera`, in its thread."""
@@ -374,7 +387,7 @@ class ThreadedCamera:
             return function()
 
 
-class ThreadedFleet(Mapping[str, ThreadedCamera]):
+class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
     """An :class:`~smartcam.emulator.EmulatedFleet` in a thread; a context manager.
 
     Args:
@@ -387,7 +400,7 @@ class ThreadedFleet(Mapping[str, ThreadedCamera]):
 
     def __init__(self, scenarios: Any, **options: Any) -> None:
         self._fleet = EmulatedFleet(scenarios, **options)
-        self._thread = LoopThread("smartcam.emulator[fleet]")
+        super().__init__(LoopThread("smartcam.emulator[fleet]"), self._fleet)
         self._cameras = {
             name: ThreadedCamera.in_thread(self._thread, emulator)
             for name, emulator in self._fleet.cameras.items()
@@ -411,37 +424,3 @@ class ThreadedFleet(Mapping[str, ThreadedCamera]):
     def urls(self) -> dict[str, str]:
         """Their addresses by name."""
         return self._fleet.urls
-
-    def start(self) -> None:
-        """Start all.
-
-        Raises:
-            ConfigurationError: one cannot listen; none is started.
-        """
-        self._thread.start()
-        try:
-            self._thread.wait(self._fleet.start())
-        except BaseException:
-            self.stop()
-            raise
-
-    def stop(self) -> None:
-        """Stop all; their logs can still be read. Harmless when done twice."""
-        try:
-            self._thread.wait(self._fleet.stop())
-        except ConfigurationError:
-            return  # it does not run
-        finally:
-            self._thread.stop()
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.stop()
