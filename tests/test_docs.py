@@ -232,6 +232,18 @@ def test_sh_block_of_the_readme_runs(block: Block, shell: Shell) -> None:
     assert process.returncode == 0, f"{block.page}:{block.line}\n{printed}"
 
 
+def test_what_sh_blocks_name_is_there() -> None:
+    texts = [block.values[0].text for block in blocks("sh", PAGES)]
+    named = {
+        word
+        for text in texts
+        for word in shlex.split(text, comments=True)
+        if re.fullmatch(r"(tests|examples|docs|smartcam|benchmarks|\.ci)/[\w./-]+", word)
+    }
+    assert len(named) > 5
+    assert [word for word in sorted(named) if not (ROOT / word).exists()] == []
+
+
 # ---------------------------------------------------------------------- contents
 
 
