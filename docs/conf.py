@@ -42,6 +42,7 @@ version = release = smartcam.__version__
 copyright = "the smartcam maintainers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["benchmarks/*", "_build"]
+html_extra_path = ["scenario.schema.json"]
 html_theme = "furo"
 html_title = f"smartcam {release}"
 myst_heading_anchors = 4
