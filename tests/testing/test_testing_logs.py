@@ -84,7 +84,9 @@ def test_order_counts(emulator: ThreadedCamera) -> None:
 
 
 def test_only_finds_what_else_was_sent(emulator: ThreadedCamera) -> None:
-    with talk(emulator, CONNECT, QUERY, QUERY):
+    with talk(emulator, CONNECT, QUERY) as client:
+        emulator.log.expect(m.QueryAnswer)
+        client.sendall(QUERY)
         emulator.wait_received(m.Query, count=2)
         emulator.log.expect(m.Connect, m.Query, m.QueryAnswer, m.Query, only=True)
         text = failure(emulator.log.expect, m.Connect, m.Query, only=True, timeout=0)
