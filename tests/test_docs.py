@@ -108,7 +108,8 @@ class Shell:
             stderr=subprocess.STDOUT,
             text=True,
             encoding="utf-8",
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            # how this run of pytest was called says nothing to one on a page
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "PYTEST_ADDOPTS": ""},
         )
         self.running.append(process)
         return process

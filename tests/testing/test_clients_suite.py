@@ -67,7 +67,7 @@ def run_pytest(folder: Path, *arguments: str) -> Ended:
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-m", "pytest", "-v", "-rs", *WITHOUT, *arguments],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(HERE), "COLUMNS": "400"},
+        env={**os.environ, "PYTHONPATH": str(HERE), "COLUMNS": "400", "PYTEST_ADDOPTS": ""},
         capture_output=True,
         text=True,
         check=False,

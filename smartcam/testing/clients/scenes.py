@@ -44,6 +44,9 @@ EVERY_DIALECT = (*SMART, "bid")
 WAIT = 0.25
 """Seconds that something is held back; a client's time-outs are longer."""
 
+LONG = 1.0
+"""Seconds of BUSY behind a switch's answer: a client that starts slowly must come into it, too."""
+
 STATUS_GO = 0x280
 """Running and Waiting for Trigger."""
 
@@ -228,7 +231,7 @@ SCENES: Mapping[str, Scene] = {
         Scene(
             name="busy_after_switch",
             about="BUSY is still set when the switch is answered",
-            faults=_always(f.BusyForEver(seconds=0.1 + WAIT, on="SwitchApplication", when="after")),
+            faults=_always(f.BusyForEver(seconds=LONG, on="SwitchApplication", when="after")),
             verb="switch",
             number=OTHER,
             dialects=SMART,
