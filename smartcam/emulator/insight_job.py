@@ -61,9 +61,10 @@ class Control(BaseModel):
     )
 
     def admits(self, value: CellValue) -> bool:
-        """Whether the value lies within its bounds; it has the kind's type."""
+        """Whether the value lies within its bounds and fits a line; it has the kind's type."""
         if isinstance(value, str):
-            return self.kind == "string" and len(value) <= self.max_length
+            fits = len(value) <= self.max_length and (value == "" or _printable(value))
+            return self.kind == "string" and fits
         if self.kind == "string" or not math.isfinite(value):
             return False
         low = -math.inf if self.low is None else self.low

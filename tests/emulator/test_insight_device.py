@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.emulator.insight_commands import Commands
@@ -206,6 +206,8 @@ LINES = st.builds(
 
 
 @given(st.lists(LINES, max_size=20), st.booleans())
+@example(lines=["SSD004\x1f"], online=False)
+@example(lines=["SSD004" + "x" * 2000], online=False)
 def test_every_line_has_exactly_one_answer(lines: list[str], online: bool) -> None:
     cells = {
         "A1": [1, 2],

@@ -205,8 +205,8 @@ def impatient(reader: Reader) -> float:
 
 def trusting(reader: Reader) -> float:
     value = good(reader)
-    if value < 0:
-        raise ValueError("no weight is negative")
+    if value != FOUR.value:
+        raise ValueError("only one weight is known")
     return value
 
 

@@ -41,7 +41,7 @@ WORLDS = [
     for transport in ("tcp", "udp")
 ]
 
-AT_ONCE = 24
+AT_ONCE = 16
 """Cameras judged at the same time: each waits nearly always."""
 
 
@@ -66,7 +66,7 @@ def short_plan(url: str, **fields: Any) -> Plan:
     given: dict[str, Any] = {
         "other_application": OTHER,
         "allow": ~Allow.NOTHING,
-        "quiet": 0.05,
+        "quiet": 0.1,
         "timeout": 2.0,
         "switch_timeout": 1.0,
         "reboot_timeout": 5.0,

@@ -202,7 +202,11 @@ def test_suite_that_is_broken_off_leaves_the_camera_as_it_was(
         thread.wait(emulator.wait_received(m.Stop, count=2, timeout=20), timeout=25)
         assert not thread.run(lambda: emulator.device.running)
         process.send_signal(signal.SIGINT)
-        printed, _ = process.communicate(timeout=20)
+        try:
+            printed, _ = process.communicate(timeout=15)
+        except subprocess.TimeoutExpired:  # it fell into a destructor, which swallows it
+            process.send_signal(signal.SIGINT)
+            printed, _ = process.communicate(timeout=15)
         assert process.returncode == pytest.ExitCode.INTERRUPTED
         assert "found with application 5, in run mode; left so" in printed
         assert thread.run(lambda: emulator.device.running)
