@@ -60,7 +60,7 @@ _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Pytest: the options of the suites that judge cameras and clients."""
     from smartcam.testing.clients import options as clients
-    from smartcam.testing.conformance import plan as cameras
+    from smartcam.testing.conformance import options as cameras
 
     cameras.add_options(parser)
     clients.add_options(parser)

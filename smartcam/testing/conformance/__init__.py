@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from smartcam.testing.conformance.judging import judge
-    from smartcam.testing.conformance.plan import Allow, Plan, add_options
+    from smartcam.testing.conformance.options import add_options
+    from smartcam.testing.conformance.plan import Allow, Plan
     from smartcam.testing.conformance.report import Report
     from smartcam.testing.conformance.suite import CameraConformance
 
@@ -26,7 +27,7 @@ _HOMES = {
     "CameraConformance": "suite",
     "Plan": "plan",
     "Report": "report",
-    "add_options": "plan",
+    "add_options": "options",
     "judge": "judging",
 }
 

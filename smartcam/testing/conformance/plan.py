@@ -11,7 +11,7 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["OPTIONS", "Allow", "Plan", "add_options"]
+__all__ = ["READERS", "Allow", "Plan"]
 
 MAX_SECONDS = 3600.0
 """Seconds that may be waited for one thing at most."""
@@ -136,68 +136,15 @@ def _read_hex(text: str) -> bytes:
         raise ConfigurationError(f"--camera-input: {text!r} is not hex: {exc}") from exc
 
 
-OPTIONS: dict[str, tuple[str | None, Callable[[str], Any] | None, str]] = {
-    "--camera-url": (
-        None,
-        None,
-        "the camera that smartcam.testing.conformance judges, such as bvs://192.168.0.10; "
-        "it is taken from whoever has it",
-    ),
-    "--camera-application": (
-        "application",
-        int,
-        "id of the application that may be started and triggered (default: the active one)",
-    ),
-    "--camera-other-application": (
-        "other_application",
-        int,
-        "id of another application, which may be loaded for a moment (default: none is)",
-    ),
-    "--camera-allow": (
-        "allow",
-        Allow.read,
-        "what may be done to the camera beside run, trigger and switch, which are put back: "
-        "clock, number, input, errors, reboot, all; 'nothing' takes the three away",
-    ),
-    "--camera-timeout": (
-        "timeout",
-        float,
-        "seconds that an answer, a status or a result may take (default 5)",
-    ),
-    "--camera-quiet": (
-        "quiet",
-        float,
-        "seconds of silence that count as no answer (default 0.5)",
-    ),
-    "--camera-switch-timeout": (
-        "switch_timeout",
-        float,
-        "seconds that loading an application may take (default 30)",
-    ),
-    "--camera-reboot-timeout": (
-        "reboot_timeout",
-        float,
-        "seconds that a restart may take (default 180)",
-    ),
-    "--camera-sequence-offset": (
-        "sequence_offset",
-        int,
-        "where in the application's results its sequence number (int32) stands, bytes behind the "
-        "application's id",
-    ),
-    "--camera-input": (
-        "input_data",
-        _read_hex,
-        "input data that the application takes, as hex",
-    ),
-    "--camera-report": (None, None, "file to write the report to, as JSON"),
+READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "--camera-application": ("application", int),
+    "--camera-other-application": ("other_application", int),
+    "--camera-allow": ("allow", Allow.read),
+    "--camera-timeout": ("timeout", float),
+    "--camera-quiet": ("quiet", float),
+    "--camera-switch-timeout": ("switch_timeout", float),
+    "--camera-reboot-timeout": ("reboot_timeout", float),
+    "--camera-sequence-offset": ("sequence_offset", int),
+    "--camera-input": ("input_data", _read_hex),
 }
-"""Options of the command line: the field of :class:`Plan`, what reads it, the help text."""
-
-
-def add_options(parser: Any) -> None:
-    """Register :data:`OPTIONS` with pytest's ``parser`` (``pytest_addoption``)."""
-    group = parser.getgroup("smartcam", "smartcam: is it a BVS camera?")
-    for name, (_, _, text) in OPTIONS.items():
-        metavar = name.rpartition("-")[2].upper()
-        group.addoption(name, action="store", default=None, metavar=metavar, help=text)
+"""What an option of the command line says: the field of :class:`Plan`, and what reads it."""

@@ -11,7 +11,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.testing.conformance.bench import Bench
 from smartcam.testing.conformance.items import ITEMS
 from smartcam.testing.conformance.judging import judge_item
-from smartcam.testing.conformance.plan import OPTIONS, Plan
+from smartcam.testing.conformance.plan import READERS, Plan
 from smartcam.testing.conformance.report import Report
 from smartcam.testing.conformance.verdicts import Finding, Item, Outcome
 
@@ -115,9 +115,9 @@ class CameraConformance:
 
     def _make_plan(self, config: pytest.Config, url: str) -> Plan:
         fields: dict[str, Any] = {}
-        for option, (field, read, _) in OPTIONS.items():
+        for option, (field, read) in READERS.items():
             text = config.getoption(option, None)
-            if field is None or read is None or text is None:
+            if text is None:
                 continue
             try:
                 fields[field] = read(text)
