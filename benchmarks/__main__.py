@@ -20,6 +20,7 @@ BENCHMARKS = {
     "fleet": "10, 100 and 1,000 cameras in one process",
     "emulator": "triggers that emulated cameras answer, one and 1,000 of them",
     "startup": "import smartcam, and the first connect",
+    "calibration": "error and predicted error of a plane over the bound, points and poses a second",
     "scaling": "cost of a message over 10^3 to 10^6 of them",
 }
 """Modules of this package with a ``run(plan)``, and what they measure."""

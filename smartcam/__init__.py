@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from smartcam.backoff import Backoff
     from smartcam.client import SmartCamera, connect
     from smartcam.exceptions import (
+        CalibrationError,
         CameraBusyError,
         CameraFaultError,
         CommandRejectedError,
@@ -71,6 +72,7 @@ __version__ = "0.1.0"
 __all__ = [
     "ApplicationChanged",
     "Backoff",
+    "CalibrationError",
     "CameraBusyError",
     "CameraEvent",
     "CameraFaultError",

@@ -16,6 +16,7 @@
     ├── CommandRejectedError                   the camera said no; what is active now
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── CameraFaultError                       the camera reports System Error
+    ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
     ├── RecordingError (OSError)               a recording that could not be written
     ├── SubscriberOverflowError                a stream's reader was too slow, and wanted to know
     ├── TriggerError                           a trigger that gave no result, and why
@@ -39,6 +40,7 @@ All of them survive ``pickle``. Texts say what was tried, what came and what was
 from __future__ import annotations
 
 __all__ = [
+    "CalibrationError",
     "CameraBusyError",
     "CameraFaultError",
     "CommandRejectedError",
@@ -214,6 +216,24 @@ class UnsupportedError(SmartCamError):
 
 class CameraFaultError(SmartCamError):
     """The camera reports System Error."""
+
+
+class CalibrationError(SmartCamError, ValueError):
+    """Samples, or a calibration, of which no number can be made that means something.
+
+    Attributes:
+        code: what is wrong, in one word: ``TOO_FEW``, ``COLLINEAR``, ``MIRRORED``, ...
+        expected: what was expected.
+        got: what came.
+    """
+
+    def __init__(
+        self, message: str, *, code: str = "", expected: object = None, got: object = None
+    ) -> None:
+        super().__init__(message)
+        self.code = code
+        self.expected = expected
+        self.got = got
 
 
 class RecordingError(SmartCamError, OSError):

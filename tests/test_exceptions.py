@@ -28,6 +28,7 @@ TREE: dict[type[Exception], tuple[type[Exception], ...]] = {
     e.CommandRejectedError: (ROOT,),
     e.UnsupportedError: (ROOT,),
     e.CameraFaultError: (ROOT,),
+    e.CalibrationError: (ROOT, ValueError),
     e.RecordingError: (ROOT, OSError),
     e.SubscriberOverflowError: (ROOT,),
     e.TriggerError: (ROOT,),
@@ -61,6 +62,7 @@ ATTRIBUTES: dict[type[Exception], dict[str, Any]] = {
     e.ResponseTimeoutError: {"message_id": 0x30, "waited": 2.5},
     e.CommandRejectedError: {"message_id": 0x31, "code": 1, "active_application": 3},
     e.TriggerTimeoutError: {"waited": 5.0},
+    e.CalibrationError: {"code": "TOO_FEW", "expected": 3, "got": 2},
     e.RemoteProtocolError: FRAME,
     e.FrameError: FRAME,
     e.MessageError: FRAME,
@@ -73,6 +75,11 @@ DEFAULTS: dict[str, Any] = {
     "message_id": None, "waited": 0.0, "code": 0, "active_application": None, "offset": 0,
     "data": b"", "field": "", "expected": None, "got": None,
 }  # fmt: skip
+
+SPECIAL: dict[tuple[type[Exception], str], Any] = {
+    (e.CommandRejectedError, "message_id"): 0,
+    (e.CalibrationError, "code"): "",
+}
 
 each_error = pytest.mark.parametrize("kind", TREE, ids=lambda one: one.__name__)
 
@@ -102,8 +109,7 @@ def test_error_with_a_text_only_has_default_attributes(kind: type[Exception]) ->
     error = kind("what happened")
     assert str(error) == "what happened"
     for name in ATTRIBUTES.get(kind, {}):
-        special = 0 if (kind, name) == (e.CommandRejectedError, "message_id") else DEFAULTS[name]
-        assert getattr(error, name) == special
+        assert getattr(error, name) == SPECIAL.get((kind, name), DEFAULTS[name])
 
 
 @each_error

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     import types
 
 PUBLIC = [
-    "ApplicationChanged", "Backoff", "CameraBusyError", "CameraEvent", "CameraFaultError",
+    "ApplicationChanged", "Backoff", "CalibrationError", "CameraBusyError", "CameraEvent",
+    "CameraFaultError",
     "Capabilities", "CommandRejectedError", "ConfigurationError", "ConnectFailedError",
     "Connected",
     "ConnectionClosedError", "ConnectionLostError", "ConnectionTakenError", "Disconnected",

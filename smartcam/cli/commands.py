@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import smartcam
-from smartcam.cli import decoding, demo, dissecting, doctoring, probing, recording
+from smartcam.cli import (
+    calibrating,
+    decoding,
+    demo,
+    dissecting,
+    doctoring,
+    picking,
+    probing,
+    recording,
+)
 from smartcam.cli.options import (
     CONNECTS,
     SECONDS,
@@ -282,13 +291,34 @@ def interpreters(**shared: Any) -> None:
 
 
 @command.command(name="demo")
+@click.option(
+    "--pick",
+    is_flag=True,
+    help="Calibrate a simulated robot against the camera instead, and pick seven parts with it.",
+)
+@click.option(
+    "--picture",
+    type=click.Path(dir_okay=False),
+    default="pick.svg",
+    show_default=True,
+    help="With --pick: where the picture of the calibration goes (SVG).",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="With --pick: of all noise, and of where the table is.",
+)
 @output_options
-def demo_command(**shared: Any) -> None:
+def demo_command(pick: bool, picture: str, seed: int, **shared: Any) -> None:
     """Watch smartcam do its main job against an emulated camera over real TCP."""
     options = Options(**shared)
-    run(demo.demo(options), program="smartcam", debug=options.debug)
+    main = picking.pick(options, picture, seed) if pick else demo.demo(options)
+    run(main, program="smartcam", debug=options.debug)
 
 
+command.add_command(calibrating.calibrate)
 command.add_command(dissecting.dissector)
 command.add_command(recording.record)
 command.add_command(recording.replay)

@@ -14,13 +14,13 @@ from smartcam.models import ApplicationChanged, StatusChanged
 if TYPE_CHECKING:
     from smartcam.cli.options import Options
 
-__all__ = ["demo"]
+__all__ = ["Steps", "demo"]
 
 STREAMED = 10
 TANGRAM, COUNTER, HELLO = 7, 9, 21
 
 
-class _Steps:
+class Steps:
     """Prints steps, as text or JSON lines."""
 
     def __init__(self, options: Options) -> None:
@@ -28,17 +28,19 @@ class _Steps:
         self._number = 0
 
     def step(self, text: str, **values: Any) -> None:
+        """Print the next one, with its number; ``values`` stand beside the text in JSON."""
         self._number += 1
         number = self._number
         self._options.show({"step": number, "text": text, **values}, f"\n{number}. {text}")
 
     def detail(self, text: str, **values: Any) -> None:
+        """Print more about it."""
         self._options.show({"text": text, **values}, text)
 
 
 async def demo(options: Options) -> None:
     """Connect, switch while BUSY, trigger, localize, stream, disconnect."""
-    say = _Steps(options)
+    say = Steps(options)
     async with EmulatedCamera(seed=1) as emulator:
         say.step(f"An emulated BVS002C listens on real TCP: {emulator.url}", url=emulator.url)
         interpret_as = {
@@ -63,7 +65,7 @@ async def demo(options: Options) -> None:
         )
 
 
-async def _switch(camera: smartcam.SmartCamera, say: _Steps) -> None:
+async def _switch(camera: smartcam.SmartCamera, say: Steps) -> None:
     loop = asyncio.get_running_loop()
     say.step(
         f"Switch to application {TANGRAM}. The camera must be stopped, is BUSY, then runs again:"
@@ -90,7 +92,7 @@ async def _switch(camera: smartcam.SmartCamera, say: _Steps) -> None:
     )
 
 
-async def _localize(camera: smartcam.SmartCamera, emulator: EmulatedCamera, say: _Steps) -> None:
+async def _localize(camera: smartcam.SmartCamera, emulator: EmulatedCamera, say: Steps) -> None:
     result = await camera.trigger(timeout=2.0)
     say.step(
         f"Triggered: {len(result.value)} parts after {1e3 * (result.latency or 0):.0f} ms. "
@@ -118,7 +120,7 @@ async def _localize(camera: smartcam.SmartCamera, emulator: EmulatedCamera, say:
     say.detail(table_text(head, rows), result=result)
 
 
-async def _stream(camera: smartcam.SmartCamera, say: _Steps) -> None:
+async def _stream(camera: smartcam.SmartCamera, say: Steps) -> None:
     say.step(f"Application {COUNTER} runs free: {STREAMED} results as they come:")
     async with camera.application(COUNTER):
         numbers: list[int] = []

@@ -13,6 +13,7 @@ import traceback
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from smartcam.exceptions import (
+    CalibrationError,
     CameraFaultError,
     CommandRejectedError,
     ConfigurationError,
@@ -34,6 +35,7 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (ConfigurationError, 2),
     (LinkError, 3),
     (ProtocolError, 3),
+    (CalibrationError, 2),
     (InterpretationError, 6),
     (TimeoutError, 4),
     (CommandRejectedError, 5),

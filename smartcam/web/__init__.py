@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: the emulator's, to see and control it while it runs.
+"""Pages and HTTP calls: the emulator's, to see and control it while it runs, and the wizard's.
 
 ::
 
@@ -18,15 +18,18 @@ from smartcam.exceptions import MissingExtraError
 
 if TYPE_CHECKING:
     from smartcam.web.emulator import EmulatorSite
+    from smartcam.web.wizard import WizardSite
 
-__all__ = ["EmulatorSite"]
+__all__ = ["EmulatorSite", "WizardSite"]
+
+_HOMES = {"EmulatorSite": "emulator", "WizardSite": "wizard"}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'smartcam.web' has no attribute {name!r}")
     try:
-        return importlib.import_module("smartcam.web.emulator").EmulatorSite
+        return getattr(importlib.import_module(f"smartcam.web.{_HOMES[name]}"), name)
     except ModuleNotFoundError as exc:
         if exc.name != "aiohttp":
             raise

@@ -1,0 +1,69 @@
+"""What can be wrong with the samples of a calibration, one word each."""
+
+from __future__ import annotations
+
+import enum
+from typing import NamedTuple
+
+__all__ = ["Code", "Remark"]
+
+
+class Code(enum.StrEnum):
+    """Why samples give no calibration, or what one should know of the calibration they give."""
+
+    SHAPE = "SHAPE"
+    """The numbers do not come in the shape that is expected, or not as many of each."""
+    NOT_FINITE = "NOT_FINITE"
+    """NaN or infinity among the numbers."""
+    TOO_FEW = "TOO_FEW"
+    """Fewer points than the model has need of."""
+    COINCIDENT = "COINCIDENT"
+    """Points that should be apart are the same."""
+    COLLINEAR = "COLLINEAR"
+    """The points lie on a line, or so nearly that the rest is not determined."""
+    SHORT_LEVER = "SHORT_LEVER"
+    """The points lie too close together for how well they are touched."""
+    MIRRORED = "MIRRORED"
+    """The camera's frame is left-handed as seen from the tool's side: y points the wrong way."""
+    SIDE_UNKNOWN = "SIDE_UNKNOWN"
+    """From which side the plane is touched was not told: mirrored input could not be noticed."""
+    SCALE_MISMATCH = "SCALE_MISMATCH"
+    """The scale of the points is not the nominal one: print, units or height differ."""
+    SCALE_ASSUMED = "SCALE_ASSUMED"
+    """The scale was taken from the user; no point measures it."""
+    NOT_PLANAR = "NOT_PLANAR"
+    """The touched points lie further from a plane than touching explains."""
+    POOR_FIT = "POOR_FIT"
+    """The residuals are larger than touching explains."""
+    OUTLIER = "OUTLIER"
+    """One point fits far worse than the others."""
+    NOT_SIMILAR = "NOT_SIMILAR"
+    """One scale for the whole field does not do: the camera is tilted, or its lens distorts."""
+    NOT_HELD_OUT = "NOT_HELD_OUT"
+    """Too few points to leave one out: nothing tells how good the calibration is."""
+    UNVERIFIED = "UNVERIFIED"
+    """Nothing tells how well the points were touched: no predicted error."""
+    OUT_OF_FIELD = "OUT_OF_FIELD"
+    """A point that the calibration cannot map: behind the horizon of the plane."""
+    OUT_OF_PLANE = "OUT_OF_PLANE"
+    """A pose that does not lie in the camera's plane."""
+    WRONG_FRAME = "WRONG_FRAME"
+    """A pose is given in another frame than the calibration's."""
+    PLANE_MOVED = "PLANE_MOVED"
+    """The camera moved in a way that moves the plane it sees."""
+    INSUFFICIENT_ROTATION = "INSUFFICIENT_ROTATION"
+    """The poses are turned too little against each other."""
+    POSES_TOO_SIMILAR = "POSES_TOO_SIMILAR"
+    """Poses that should differ are nearly the same."""
+
+
+class Remark(NamedTuple):
+    """What one should know of a calibration that could be made.
+
+    Attributes:
+        code: what it is, in one word.
+        text: what was found and what was expected.
+    """
+
+    code: Code
+    text: str

@@ -1,0 +1,354 @@
+"""``smartcam calibrate``: the wizard of a calibration in the terminal, or as a web page."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import json
+import os
+import sys
+import textwrap
+import threading
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam.cli.options import CONNECTS, SECONDS, Options, output_options
+from smartcam.cli.running import run
+from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import CalibrationError, ConfigurationError
+from smartcam.models import Localization
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.calibration.sequence import Session
+    from smartcam.calibration.services import CalibrationService
+
+__all__ = ["calibrate"]
+
+ABORTED = 130
+"""Exit code after an abort: as after Ctrl-C there is no calibration."""
+
+WIDTH = 88
+"""Columns of a text."""
+
+
+@click.command(
+    help="Calibrate a camera against a robot: where its localizations lie in the robot's space. "
+    "Asks step by step; an answer is on the disk before the next step is shown, so the same "
+    "command goes on where it was broken off. Beside an answer, :undo, :repeat and :abort are "
+    "understood. With --json each step is a line of stdout and each line of stdin "
+    '{"answers": {...}} or {"do": "undo"|"repeat"|"abort"}, each with the "token" of the step that '
+    "is meant, or without for the current one. "
+    f"The camera is connected for each picture only. {CONNECTS}"
+)
+@click.argument("url")
+@click.option("--name", metavar="NAME", default="plane", show_default=True, help="Its name.")
+@click.option(
+    "--folder",
+    type=click.Path(file_okay=False),
+    default="calibrations",
+    show_default=True,
+    help="Where calibrations and journals stand; made if need be.",
+)
+@click.option(
+    "--web",
+    is_flag=True,
+    help="Serve a page instead of asking here, until Ctrl-C; its address goes to stdout. Needs "
+    'the extra "web".',
+)
+@click.option("--web-host", metavar="HOST", help="Its address.  [default: 127.0.0.1]")
+@click.option(
+    "--web-port", type=click.IntRange(0, 65535), help="Its port; 0, the default, a free one."
+)
+@click.option(
+    "--web-token",
+    metavar="TOKEN",
+    envvar="SMARTCAM_WEB_TOKEN",
+    show_envvar=True,
+    help="What everybody must know who uses it. Without one this machine's users need none; on an "
+    "address that others can reach, one is made.",
+)
+@click.option("--fresh", is_flag=True, help="Begin anew, also where one was broken off.")
+@click.option("--feature", metavar="ID", help="Only localizations of this feature are marks.")
+@click.option(
+    "--application",
+    type=click.IntRange(0, 0xFFFFFFFF),
+    help="Have this application running and ready for each picture.",
+)
+@click.option(
+    "--interpret-as",
+    metavar="SPEC",
+    default="localizations",
+    show_default=True,
+    help="How to read results; must give localizations.",
+)
+@click.option("--y-down", is_flag=True, help="The camera's y axis points down.")
+@click.option(
+    "--timeout",
+    type=SECONDS,
+    help="Bound of each step of a picture: connect (default 10), switch (10), trigger (5).",
+)
+@output_options
+def calibrate(
+    name: str,
+    folder: str,
+    fresh: bool,
+    feature: str | None,
+    web: bool,
+    web_host: str | None,
+    web_port: int | None,
+    web_token: str | None,
+    **shared: Any,
+) -> None:
+    """Calibrate a camera against a robot."""
+    if not web and (web_host is not None or web_port is not None):
+        raise click.UsageError(
+            f"{'--web-host' if web_host is not None else '--web-port'} needs --web"
+        )
+    url: str = shared.pop("url")
+    options = Options(**shared)
+    parameters = {} if feature is None else {"feature": feature}
+    place = {"host": web_host or "127.0.0.1", "port": web_port or 0, "token": web_token}
+
+    async def main() -> None:
+        try:
+            service = _service(url, folder, options)
+            try:
+                service.start(name, parameters=parameters, fresh=fresh)
+                await (_serve(service, options, place) if web else _drive(service.session, options))
+            finally:
+                service.close()
+        except CalibrationError as exc:
+            raise ConfigurationError(str(exc)) from exc
+
+    run(main(), program="smartcam", debug=options.debug, interrupted=0 if web else 130)
+
+
+async def _serve(service: CalibrationService, options: Options, place: Mapping[str, Any]) -> None:
+    from smartcam.web import WizardSite
+
+    async with WizardSite(service, **place) as site:
+        options.show({"page": site.url}, f"page: {site.url}")
+        await asyncio.Event().wait()
+
+
+def _service(url: str, folder: str, options: Options) -> CalibrationService:
+    from smartcam.calibration.extra import load
+    from smartcam.calibration.folder import Folder
+    from smartcam.calibration.services import CalibrationService
+    from smartcam.calibration.wizard import plane_wizard
+
+    load("scipy")  # before anything is measured
+
+    async def localize() -> list[Localization]:
+        with options.camera(url) as unopened:
+            async with unopened as camera:
+                result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
+        found = result.value
+        if not isinstance(found, list) or not all(isinstance(one, Localization) for one in found):
+            raise ConfigurationError(
+                f"--interpret-as {options.interpret_as}: expected localizations, "
+                f"got {type(found).__name__}"
+            )
+        return found
+
+    try:
+        inside = Folder(folder)
+    except OSError as exc:
+        raise ConfigurationError(f"--folder {folder}: {exc.strerror}") from exc
+    wizard = plane_wizard(localize=localize, save_to=inside.calibration)
+    return CalibrationService(inside, [wizard])
+
+
+async def _drive(session: Session, options: Options) -> None:
+    lines = _Lines()
+    view = session.current
+    while view["type"] not in {"result", "abort"}:
+        options.show(view, _step_text)
+        if options.as_json:
+            view = await _from_json(session, await lines.next())
+        else:
+            view = await _from_prompts(session, view, lines)
+    options.show(view, _end_text)
+    if view["type"] == "abort":
+        raise SystemExit(ABORTED)
+
+
+_COMMANDS = ("undo", "repeat", "abort")
+
+
+async def _do(session: Session, command: str, token: str) -> dict[str, Any]:
+    view: dict[str, Any] = await getattr(session, command)(token)
+    return view
+
+
+async def _from_json(session: Session, line: str) -> dict[str, Any]:
+    try:
+        asked = json.loads(line)
+        token = asked.get("token", session.token)
+        answers, command = asked.get("answers"), asked.get("do")
+    except (ValueError, RecursionError, AttributeError) as exc:
+        raise ConfigurationError(
+            f'a line of input: expected {{"answers": {{...}}}}, got {line[:64]!r}'
+        ) from exc
+    if command is None:
+        return await session.submit(token, answers)
+    if command not in _COMMANDS:
+        raise ConfigurationError(f"do: expected one of {', '.join(_COMMANDS)}, got {command!r}")
+    return await _do(session, command, token)
+
+
+async def _from_prompts(session: Session, view: dict[str, Any], lines: _Lines) -> dict[str, Any]:
+    """Ask for a step's answers until it is left; what was answered stands there again."""
+    defaults = dict(view["defaults"])
+    token = view["token"]
+    while view["token"] == token:
+        answers: dict[str, Any] = {}
+        properties = view["schema"]["properties"]
+        for name, schema in properties.items():
+            text = await _ask(lines, _prompt(schema, defaults.get(name)))
+            if text.startswith(":"):
+                return await _command(session, view, text[1:])
+            if text or name in defaults:
+                answers[name] = _value(schema, text) if text else defaults[name]
+        if not properties:
+            text = await _ask(lines, f"{view['button']}: press Enter")
+            if text.startswith(":"):
+                return await _command(session, view, text[1:])
+        view = await session.submit(token, answers)
+        wrong = view["errors"]
+        defaults.update({name: value for name, value in answers.items() if name not in wrong})
+        if view["token"] == token:
+            click.echo(_errors_text(view))
+    return view
+
+
+async def _command(session: Session, view: Mapping[str, Any], text: str) -> dict[str, Any]:
+    command = text.strip()
+    if command in view["can"]:
+        return await _do(session, command, view["token"])
+    possible = ", ".join(f":{one}" for one in view["can"])
+    click.echo(f"! :{command}: expected one of {possible}")
+    return session.current
+
+
+async def _ask(lines: _Lines, prompt: str) -> str:
+    click.echo(f"{prompt}: ", nl=False)
+    return await lines.next()
+
+
+# ---------------------------------------------------------------------- texts
+
+
+def _prompt(schema: Mapping[str, Any], default: Any) -> str:
+    unit = f", {schema['x-unit']}" if "x-unit" in schema else ""
+    shown = "" if default is None else f" [{_default_text(default)}]"
+    rows = [f"    {one['const']}: {one['title']}\n" for one in schema.get("oneOf", ())]
+    head = f"{schema['title']}{unit}"
+    return f"{head}\n{''.join(rows)}  answer{shown}" if rows else f"{head}{shown}"
+
+
+def _default_text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+_BOOLEANS = {"y": True, "yes": True, "n": False, "no": False}
+
+
+def _value(schema: Mapping[str, Any], text: str) -> Any:
+    """Return what a text stands for; one that stands for nothing is the session's to refuse."""
+    kind = schema.get("type")
+    if kind == "boolean":
+        return _BOOLEANS.get(text.lower(), text)
+    if kind == "string":
+        return text
+    with contextlib.suppress(ValueError):
+        return float(text.replace(",", "."))
+    return text
+
+
+def _step_text(view: Mapping[str, Any]) -> str:
+    commands = ", ".join(f":{one}" for one in view["can"])
+    lines = ["", f"{view['number']}. {view['title']}  ({commands})"]
+    lines += textwrap.wrap(view["description"], WIDTH)
+    for note in view["notes"]:
+        lines += textwrap.wrap(note, WIDTH, initial_indent="  - ", subsequent_indent="    ")
+    errors = _errors_text(view)
+    return "\n".join([*lines, errors] if errors else lines)
+
+
+def _errors_text(view: Mapping[str, Any]) -> str:
+    properties = view["schema"]["properties"]
+    rows = [
+        f"! {text}" if name == "base" else f"! {properties[name]['title']}: {text}"
+        for name, text in view["errors"].items()
+    ]
+    return "\n".join(rows)
+
+
+def _end_text(view: Mapping[str, Any]) -> str:
+    if view["type"] == "abort":
+        return "\naborted; what was measured stands in the journal"
+    rows = [f"  {name}: {value}" for name, value in view["result"].items() if name != "remarks"]
+    return "\n".join(["", "done", *rows])
+
+
+# ---------------------------------------------------------------------- standard input
+
+
+class _Lines:
+    """Lines of standard input, one when it is asked for; the event loop goes on meanwhile.
+
+    A thread waits for each. It reads the descriptor itself: one that is left waiting in Python's
+    own buffer at the end would stop the interpreter from ending.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    async def next(self) -> str:
+        """Return the next line without its end.
+
+        Raises:
+            ConfigurationError: there is none.
+
+        Cancellation: the thread goes on waiting, and ends with the process.
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[str] = loop.create_future()
+
+        def tell(line: str) -> None:
+            if not future.done():
+                future.set_result(line)
+
+        def wait() -> None:
+            line = self._read()
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                loop.call_soon_threadsafe(tell, line)
+
+        threading.Thread(target=wait, name="stdin", daemon=True).start()
+        line = await future
+        if not line:
+            raise ConfigurationError(
+                "the input has ended before the calibration has; what was done is kept: "
+                "the same command goes on with it"
+            )
+        return line.strip()
+
+    def _read(self) -> str:
+        try:
+            descriptor = sys.stdin.fileno()
+        except (io.UnsupportedOperation, AttributeError, ValueError):
+            return sys.stdin.readline() if sys.stdin is not None else ""
+        while b"\n" not in self._buffer:
+            more = os.read(descriptor, 4096)
+            if not more:
+                break
+            self._buffer += more
+        line, end, self._buffer = self._buffer.partition(b"\n")
+        return (line + end).decode(errors="replace")
