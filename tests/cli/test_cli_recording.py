@@ -216,7 +216,8 @@ def test_record_goes_on_over_a_lost_link_and_ends_when_it_is_taken(
         "Reconnected",
         "Disconnected",
     ]
-    assert [error.error for error in recording.errors()][-1] == "ConnectionTakenError"
+    # the trigger under way may be told of the loss a moment later
+    assert "ConnectionTakenError" in [error.error for error in recording.errors()][-2:]
 
 
 @posix
