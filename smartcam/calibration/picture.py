@@ -144,7 +144,9 @@ def _ellipses(calibration: PlaneCalibration, points: Array) -> Array:
     inside = calibration.rotation[:, :2]
     covariances = inside.T @ calibration.covariance_at(points) @ inside
     values, vectors = np.linalg.eigh(covariances)
-    half = vectors * (ELLIPSE * np.sqrt(np.maximum(values, 0.0)))[:, None, :]
+    lengths = ELLIPSE * np.sqrt(np.maximum(values, 0.0))
+    # the symmetric root: axes alone may point to either side
+    half = (vectors * lengths[:, None, :]) @ vectors.swapaxes(1, 2)
     angles = np.linspace(0.0, math.tau, OUTLINE, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)])
     outlines = (half @ circle).swapaxes(1, 2) @ inside.T  # metres in the robot's space
