@@ -394,7 +394,8 @@ class PlaneCalibration:
         """Read what :meth:`save` wrote.
 
         Raises:
-            CalibrationError: the file is not there, damaged, newer, or holds something else.
+            CalibrationError: the file is damaged, newer, or holds something else.
+            OSError: it is not there, or cannot be read.
         """
         from smartcam.calibration import store
 

@@ -23,11 +23,12 @@ it asks for the next step. Only a step that was taken is written.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import copy
 import hashlib
 import json
 import secrets
-from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
@@ -367,7 +368,7 @@ class Session:
             if self._is_done("answer", token, given):
                 return self.current
             request = self._expect(token)
-            with _Shown(self):
+            with self._shown():
                 values = request.step.checked(self._with_undone(request.step, given))
                 outcome = await self._act(request, values)
                 self._take(self._run, self._entry("answer", request, values, outcome, given))
@@ -424,7 +425,7 @@ class Session:
             request = run.request
             if request is None or request.action is None:
                 raise self._impossible("repeat")
-            with _Shown(self):
+            with self._shown():
                 outcome = await self._act(request, last["answers"])
                 self._take(run, self._entry("repeat", request, last["answers"], outcome, None))
             return self.current
@@ -556,24 +557,17 @@ class Session:
             self._run = run
         self._errors = {}
 
-
-class _Shown:
-    """Turns errors into those of the step."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-
-    def __enter__(self) -> None:
-        self._session._errors = {}  # noqa: SLF001  a part of the class above
-
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> bool:
-        if not isinstance(error, SmartCamError | OSError):
-            return False
-        errors: Any = {"base": str(error)}
-        if isinstance(error, CalibrationError) and error.code == Refusal.WRONG_ANSWERS:
-            errors = error.got
-        self._session._errors = errors  # noqa: SLF001
-        return True
+    @contextlib.contextmanager
+    def _shown(self) -> Iterator[None]:
+        """Turn errors into those of the step."""
+        self._errors = {}
+        try:
+            yield
+        except (SmartCamError, OSError) as exc:
+            errors: Any = {"base": str(exc)}
+            if isinstance(exc, CalibrationError) and exc.code == Refusal.WRONG_ANSWERS:
+                errors = exc.got
+            self._errors = errors
 
 
 def _named(header: Mapping[str, Any]) -> str:
