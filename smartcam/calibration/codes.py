@@ -1,4 +1,4 @@
-"""What can be wrong with the samples of a calibration, one word each."""
+"""What can be wrong with a calibration, one word each."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ __all__ = ["Code", "Remark"]
 
 
 class Code(enum.StrEnum):
-    """Why samples give no calibration, or what one should know of the calibration they give."""
+    """``code`` of a :class:`~smartcam.CalibrationError` and of a :class:`Remark`."""
 
+    # samples
     SHAPE = "SHAPE"
     """The numbers do not come in the shape that is expected, or not as many of each."""
     NOT_FINITE = "NOT_FINITE"
@@ -55,6 +56,50 @@ class Code(enum.StrEnum):
     """The poses are turned too little against each other."""
     POSES_TOO_SIMILAR = "POSES_TOO_SIMILAR"
     """Poses that should differ are nearly the same."""
+
+    # frames
+    NOT_RIGID = "NOT_RIGID"
+    """No rotation: a reflection, a scale, a quaternion that is none."""
+    BAD_TIME = "BAD_TIME"
+    """A time that is missing, or for which nothing is known."""
+    NOT_SIMULTANEOUS = "NOT_SIMULTANEOUS"
+    """Two things that belong to different times."""
+    SECOND_PARENT = "SECOND_PARENT"
+    """A frame that lies in another one already."""
+    CYCLE = "CYCLE"
+    """A frame that would lie in itself."""
+    UNKNOWN_FRAME = "UNKNOWN_FRAME"
+    """No frame of this name."""
+    NOT_CONNECTED = "NOT_CONNECTED"
+    """No way from one frame to the other."""
+
+    # steps, files and services
+    WRONG_ANSWERS = "WRONG_ANSWERS"
+    """Answers that do not fit the step's inputs; ``got`` has a text for each wrong one."""
+    STALE_STEP = "STALE_STEP"
+    """A token of another step than the current one."""
+    NOT_POSSIBLE = "NOT_POSSIBLE"
+    """Nothing to undo or to repeat, or the sequence has ended."""
+    NO_SEQUENCE = "NO_SEQUENCE"
+    """No sequence was started."""
+    NO_CALIBRATION = "NO_CALIBRATION"
+    """No calibration was loaded."""
+    WRONG_JOURNAL = "WRONG_JOURNAL"
+    """A journal that another wizard wrote, or another version of it."""
+    IN_USE = "IN_USE"
+    """Another process, or another sequence of this one, writes the journal."""
+    BAD_NAME = "BAD_NAME"
+    """A name that no file may have, or that leads out of the folder."""
+    NOT_FOUND = "NOT_FOUND"
+    """No such file."""
+    BROKEN_FILE = "BROKEN_FILE"
+    """A file that was damaged or changed, or is no file of ours."""
+    WRONG_KIND = "WRONG_KIND"
+    """A file of ours that holds something else."""
+    NEWER_VERSION = "NEWER_VERSION"
+    """A file of a newer smartcam, whose meaning this one does not know."""
+    NOT_STORABLE = "NOT_STORABLE"
+    """A value that JSON cannot hold exactly: NaN, infinity, an object."""
 
 
 class Remark(NamedTuple):

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from smartcam.calibration.refusals import Refusal
+from smartcam.calibration.codes import Code
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class Folder:
             known = ", ".join(self.names()[:20]) or "none: the folder is empty"
             raise CalibrationError(
                 f"no calibration {name_or_path!r}; there are {known}",
-                code=Refusal.NOT_FOUND,
+                code=Code.NOT_FOUND,
                 got=name_or_path,
             )
         return path
@@ -137,7 +137,7 @@ def _bad(name: str, expected: str) -> CalibrationError:
     shown = repr(name) if len(name) <= MAX_NAME else f"{name[:MAX_NAME]!r}..."
     return CalibrationError(
         f"the name {shown} cannot be used: expected {expected}",
-        code=Refusal.BAD_NAME,
+        code=Code.BAD_NAME,
         got=name,
         expected=expected,
     )

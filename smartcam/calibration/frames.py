@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
-import enum
 import math
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -36,26 +35,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration.geometry import Array
 
-__all__ = ["FrameFault", "FrameTree", "Transform"]
-
-
-class FrameFault(enum.StrEnum):
-    """``code`` of a :class:`~smartcam.CalibrationError` that is about frames."""
-
-    NOT_RIGID = "NOT_RIGID"
-    """No rotation: a reflection, a scale, a quaternion that is none."""
-    BAD_TIME = "BAD_TIME"
-    """A time that is missing, or for which nothing is known."""
-    NOT_SIMULTANEOUS = "NOT_SIMULTANEOUS"
-    """Two things that belong to different times."""
-    SECOND_PARENT = "SECOND_PARENT"
-    """A frame that lies in another one already."""
-    CYCLE = "CYCLE"
-    """A frame that would lie in itself."""
-    UNKNOWN_FRAME = "UNKNOWN_FRAME"
-    """No frame of this name."""
-    NOT_CONNECTED = "NOT_CONNECTED"
-    """No way from one frame to the other."""
+__all__ = ["FrameTree", "Transform"]
 
 
 _ORTHONORMAL: Final = 1e-6
@@ -96,7 +76,7 @@ class Transform:
             raise CalibrationError(
                 f"{self.label}: expected a (3, 3) rotation and a (3,) translation, got "
                 f"{rotation.shape} and {translation.shape}",
-                code=FrameFault.NOT_RIGID,
+                code=Code.NOT_RIGID,
                 expected=((3, 3), (3,)),
                 got=(rotation.shape, translation.shape),
             )
@@ -107,14 +87,14 @@ class Transform:
             raise CalibrationError(
                 f"{self.label}: expected a rotation and a finite translation, got a matrix of "
                 f"determinant {turn:.6g}, off by {off:.3g}, and {translation.tolist()}",
-                code=FrameFault.NOT_RIGID,
+                code=Code.NOT_RIGID,
                 expected="a rotation, determinant 1",
                 got=turn,
             )
         if self.at is not None and self.at.tzinfo is None:
             raise CalibrationError(
                 f"{self.label}: expected a time with its time zone, got {self.at}",
-                code=FrameFault.BAD_TIME,
+                code=Code.BAD_TIME,
                 expected="a time zone",
                 got=self.at,
             )
@@ -149,7 +129,7 @@ class Transform:
             raise CalibrationError(
                 f"T_{target}_{source}: expected a quaternion x, y, z, w of length 1, got "
                 f"{values.tolist()} of length {length:.6g}",
-                code=FrameFault.NOT_RIGID,
+                code=Code.NOT_RIGID,
                 expected=1.0,
                 got=length,
             )
@@ -187,7 +167,7 @@ class Transform:
         if self.at is None:
             raise CalibrationError(
                 f"{self.label}: expected a time for the pose's header, got none",
-                code=FrameFault.BAD_TIME,
+                code=Code.BAD_TIME,
                 expected="a time",
             )
         position = Position(*self.translation.tolist())
@@ -222,7 +202,7 @@ class Transform:
             raise CalibrationError(
                 f"{self.label} @ {other.label}: expected both at one time, got {self.at} and "
                 f"{other.at}",
-                code=FrameFault.NOT_SIMULTANEOUS,
+                code=Code.NOT_SIMULTANEOUS,
                 expected=self.at,
                 got=other.at,
             )
@@ -260,7 +240,7 @@ class Transform:
         if self.at is None or later.at is None or not self.at <= at <= later.at:
             raise CalibrationError(
                 f"{self.label}: expected a time between {self.at} and {later.at}, got {at}",
-                code=FrameFault.BAD_TIME,
+                code=Code.BAD_TIME,
                 expected=(self.at, later.at),
                 got=at,
             )
@@ -340,7 +320,7 @@ class FrameTree:
                 raise CalibrationError(
                     f"{transform.label}: expected a parent that does not hang on {child!r}, got "
                     f"{' in '.join(above)}",
-                    code=FrameFault.CYCLE,
+                    code=Code.CYCLE,
                     got=parent,
                 )
             times = [] if transform.at is None else [transform.at]
@@ -350,7 +330,7 @@ class FrameTree:
             raise CalibrationError(
                 f"{transform.label}: expected {link.parent!r}, in which {child!r} lies already, "
                 f"got a second parent {parent!r}",
-                code=FrameFault.SECOND_PARENT,
+                code=Code.SECOND_PARENT,
                 expected=link.parent,
                 got=parent,
             )
@@ -358,7 +338,7 @@ class FrameTree:
             raise CalibrationError(
                 f"{transform.label}: expected {'a time' if link.times else 'no time'} as "
                 f"before, got {transform.at}",
-                code=FrameFault.BAD_TIME,
+                code=Code.BAD_TIME,
                 got=transform.at,
             )
         self._keep(link, transform)
@@ -410,7 +390,7 @@ class FrameTree:
             raise CalibrationError(
                 f"T_{target}_{source}: expected a common parent, got the roots {up[-1]!r} and "
                 f"{down[-1]!r}",
-                code=FrameFault.NOT_CONNECTED,
+                code=Code.NOT_CONNECTED,
                 expected=up[-1],
                 got=down[-1],
             )
@@ -447,7 +427,7 @@ class FrameTree:
             raise CalibrationError(
                 f"{label}: expected a time from {first} to {last}, got {at}: nothing is "
                 "extrapolated",
-                code=FrameFault.BAD_TIME,
+                code=Code.BAD_TIME,
                 expected=(first, last),
                 got=at,
             )
@@ -456,7 +436,7 @@ class FrameTree:
             raise CalibrationError(
                 f"{label}: expected two poses at most {self._max_gap.total_seconds():g} s apart "
                 f"around {at}, got {gap.total_seconds():g} s",
-                code=FrameFault.BAD_TIME,
+                code=Code.BAD_TIME,
                 expected=self._max_gap,
                 got=gap,
             )
@@ -466,7 +446,7 @@ class FrameTree:
         known = self.frames
         return CalibrationError(
             f"frame {frame!r}: expected one of {', '.join(known) or 'none'}",
-            code=FrameFault.UNKNOWN_FRAME,
+            code=Code.UNKNOWN_FRAME,
             expected=known,
             got=frame,
         )

@@ -12,7 +12,7 @@ import json
 import os
 from typing import TYPE_CHECKING, Any
 
-from smartcam.calibration.refusals import Refusal
+from smartcam.calibration.codes import Code
 from smartcam.calibration.store import sync_folder
 from smartcam.exceptions import CalibrationError
 
@@ -97,7 +97,7 @@ class Journal:
         if len(self.entries) >= MAX_ENTRIES:
             raise CalibrationError(
                 f"{self.path}: entry {MAX_ENTRIES + 1}, expected {MAX_ENTRIES} at most",
-                code=Refusal.NOT_STORABLE,
+                code=Code.NOT_STORABLE,
             )
         read = self._write(entry)
         self.entries.append(read)
@@ -115,7 +115,7 @@ class Journal:
         except BlockingIOError as exc:
             raise CalibrationError(
                 f"{self.path}: another sequence writes it; expected one at a time",
-                code=Refusal.IN_USE,
+                code=Code.IN_USE,
             ) from exc
 
     def _load(self) -> None:
@@ -142,12 +142,12 @@ class Journal:
             line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         except (TypeError, ValueError, RecursionError) as exc:
             raise CalibrationError(
-                f"{self.path}: cannot be stored: {exc}", code=Refusal.NOT_STORABLE
+                f"{self.path}: cannot be stored: {exc}", code=Code.NOT_STORABLE
             ) from exc
         if len(line) > MAX_LINE:
             raise CalibrationError(
                 f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE} at most",
-                code=Refusal.NOT_STORABLE,
+                code=Code.NOT_STORABLE,
             )
         try:
             self._put(line)
@@ -171,5 +171,5 @@ class Journal:
 
     def _broken(self, why: str) -> CalibrationError:
         return CalibrationError(
-            f"{self.path}: {why}; expected the journal of a sequence", code=Refusal.BROKEN_FILE
+            f"{self.path}: {why}; expected the journal of a sequence", code=Code.BROKEN_FILE
         )

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.frames import FrameFault, Transform
 from smartcam.calibration.solvers import Chain, Poses, Solver
 from smartcam.exceptions import CalibrationError
 
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from smartcam.calibration.frames import Transform
     from smartcam.calibration.geometry import Array
 
 __all__ = ["Moved", "MovingCamera"]
@@ -140,7 +140,7 @@ class MovingCamera:
             raise CalibrationError(
                 f"moving camera: expected the time of {pose.label}, to compare it with the "
                 "image's, got none",
-                code=FrameFault.NOT_SIMULTANEOUS,
+                code=Code.NOT_SIMULTANEOUS,
                 expected=image_at,
             )
         lag = abs(pose.at - image_at)
@@ -148,7 +148,7 @@ class MovingCamera:
             raise CalibrationError(
                 f"moving camera: expected a pose within {1e3 * self._max_lag.total_seconds():g} ms "
                 f"of the image, got one {1e3 * lag.total_seconds():g} ms from it",
-                code=FrameFault.NOT_SIMULTANEOUS,
+                code=Code.NOT_SIMULTANEOUS,
                 expected=self._max_lag,
                 got=lag,
             )

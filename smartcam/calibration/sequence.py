@@ -33,7 +33,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
-from smartcam.calibration.refusals import Refusal
+from smartcam.calibration.codes import Code
 from smartcam.exceptions import CalibrationError, SmartCamError
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class _Run:
                 raise CalibrationError(
                     f"entry {number} is of step {entry['step']!r}, expected {here}: another "
                     f"version of {wizard.name!r} wrote it",
-                    code=Refusal.WRONG_JOURNAL,
+                    code=Code.WRONG_JOURNAL,
                 )
             self.take(entry)
 
@@ -224,7 +224,7 @@ class Session:
         except (KeyError, IndexError, TypeError, ValueError) as exc:
             raise CalibrationError(
                 f"the journal is incomplete: {exc!r}; expected one as a sequence writes it",
-                code=Refusal.BROKEN_FILE,
+                code=Code.BROKEN_FILE,
             ) from exc
         self._run = _Run(wizard, self.parameters, self._log.entries)
         if journal is not None and journal.header is None:
@@ -241,7 +241,7 @@ class Session:
             if found != mine:
                 raise CalibrationError(
                     f"{journal.path}: written by {_named(found)}, expected {_named(mine)}",
-                    code=Refusal.WRONG_JOURNAL,
+                    code=Code.WRONG_JOURNAL,
                     got=found,
                     expected=mine,
                 )
@@ -250,7 +250,7 @@ class Session:
             kept = json.loads(json.dumps(dict(parameters), allow_nan=False))
         except (TypeError, ValueError) as exc:
             raise CalibrationError(
-                f"the parameters cannot be stored: {exc}", code=Refusal.NOT_STORABLE
+                f"the parameters cannot be stored: {exc}", code=Code.NOT_STORABLE
             ) from exc
         return {
             **mine,
@@ -476,13 +476,13 @@ class Session:
         if self.state != "asking" or request is None:
             raise CalibrationError(
                 f"the sequence is over ({self.state}); expected one that asks",
-                code=Refusal.NOT_POSSIBLE,
+                code=Code.NOT_POSSIBLE,
                 got=self.state,
             )
         if token != self.token:
             raise CalibrationError(
                 "the step has changed meanwhile: look at the current one",
-                code=Refusal.STALE_STEP,
+                code=Code.STALE_STEP,
                 got=token,
                 expected=self.token,
             )
@@ -495,7 +495,7 @@ class Session:
     def _impossible(self, what: str) -> CalibrationError:
         return CalibrationError(
             f"{what}: not possible here; expected one of {', '.join(self._can())}",
-            code=Refusal.NOT_POSSIBLE,
+            code=Code.NOT_POSSIBLE,
             got=what,
         )
 
@@ -531,7 +531,7 @@ class Session:
         except (TypeError, ValueError) as exc:
             raise CalibrationError(
                 f"step {request.step.id!r}: its outcome cannot be stored: {exc}",
-                code=Refusal.NOT_STORABLE,
+                code=Code.NOT_STORABLE,
             ) from exc
         return read
 
@@ -565,7 +565,7 @@ class Session:
             yield
         except (SmartCamError, OSError) as exc:
             errors: Any = {"base": str(exc)}
-            if isinstance(exc, CalibrationError) and exc.code == Refusal.WRONG_ANSWERS:
+            if isinstance(exc, CalibrationError) and exc.code == Code.WRONG_ANSWERS:
                 errors = exc.got
             self._errors = errors
 

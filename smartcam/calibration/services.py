@@ -12,9 +12,9 @@ import itertools
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from smartcam.calibration.codes import Code
 from smartcam.calibration.folder import EXPORTS, Folder
 from smartcam.calibration.journal import Journal
-from smartcam.calibration.refusals import Refusal
 from smartcam.calibration.sequence import Session
 from smartcam.calibration.store import keep_backup, read_document, replace_file
 from smartcam.calibration.wizard import KIND
@@ -85,7 +85,7 @@ class CalibrationService:
         if self._session is None:
             raise CalibrationError(
                 "no calibration is under way; expected one to be started",
-                code=Refusal.NO_SEQUENCE,
+                code=Code.NO_SEQUENCE,
             )
         return self._session
 
@@ -117,13 +117,13 @@ class CalibrationService:
         if wizard not in self._wizards:
             raise CalibrationError(
                 f"no wizard is called {wizard!r}; expected one of {', '.join(self._wizards)}",
-                code=Refusal.NOT_FOUND,
+                code=Code.NOT_FOUND,
                 got=wizard,
             )
         if self._session is not None and self._session.busy:
             raise CalibrationError(
                 "an action is under way; expected it to end or to be aborted",
-                code=Refusal.NOT_POSSIBLE,
+                code=Code.NOT_POSSIBLE,
             )
         self.close()
         given = {**(parameters or {}), "name": name}
@@ -197,11 +197,9 @@ class CalibrationService:
         if calibration is None:
             raise CalibrationError(
                 "no calibration is loaded; expected one to be loaded first",
-                code=Refusal.NO_CALIBRATION,
+                code=Code.NO_CALIBRATION,
             )
         if frame not in {None, calibration.robot_frame}:
-            from smartcam.calibration.codes import Code
-
             raise CalibrationError(
                 f"frame {frame!r}: expected {calibration.robot_frame!r}",
                 code=Code.WRONG_FRAME,
@@ -225,7 +223,7 @@ def _put_aside(path: Path) -> None:
     try:
         Journal(path).close()  # nobody else writes it
     except CalibrationError as exc:
-        if exc.code != Refusal.BROKEN_FILE:
+        if exc.code != Code.BROKEN_FILE:
             raise
     keep_backup(path, JOURNALS)
     path.unlink()
@@ -238,7 +236,7 @@ def _loaded(path: Path) -> tuple[PlaneCalibration, dict[str, Any]]:
     if document.kind != KIND:
         raise CalibrationError(
             f"{path.name}: holds {document.kind!r}, expected {KIND!r}",
-            code=Refusal.WRONG_KIND,
+            code=Code.WRONG_KIND,
             got=document.kind,
             expected=KIND,
         )

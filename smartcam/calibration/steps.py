@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from smartcam.calibration.refusals import Refusal
+from smartcam.calibration.codes import Code
 from smartcam.exceptions import CalibrationError
 
 __all__ = [
@@ -290,7 +290,7 @@ class Step:
 
 def _wrong(errors: dict[str, str]) -> CalibrationError:
     text = "; ".join(text if name == "base" else f"{name}: {text}" for name, text in errors.items())
-    return CalibrationError(text, code=Refusal.WRONG_ANSWERS, got=errors)
+    return CalibrationError(text, code=Code.WRONG_ANSWERS, got=errors)
 
 
 # ---------------------------------------------------------------------- the thesis' lists

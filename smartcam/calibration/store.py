@@ -24,7 +24,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from smartcam.calibration.refusals import Refusal
+from smartcam.calibration.codes import Code
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -128,12 +128,12 @@ def write(
     except (TypeError, ValueError, RecursionError) as exc:
         raise CalibrationError(
             f"{path}: cannot be stored: {exc}; expected finite numbers, texts, lists and mappings",
-            code=Refusal.NOT_STORABLE,
+            code=Code.NOT_STORABLE,
         ) from exc
     if len(body) > MAX_FILE:
         raise CalibrationError(
             f"{path}: {len(body)} bytes, expected {MAX_FILE} at most",
-            code=Refusal.NOT_STORABLE,
+            code=Code.NOT_STORABLE,
             got=len(body),
             expected=MAX_FILE,
         )
@@ -155,7 +155,7 @@ def read(path: StrPath, kind: str) -> dict[str, Any]:
     if document.kind != kind:
         raise CalibrationError(
             f"{path}: holds {document.kind!r}, expected {kind!r}",
-            code=Refusal.WRONG_KIND,
+            code=Code.WRONG_KIND,
             got=document.kind,
             expected=kind,
         )
@@ -203,7 +203,7 @@ def read_document(path: StrPath) -> Document:
 
 def _broken(path: StrPath, why: str) -> CalibrationError:
     return CalibrationError(
-        f"{path}: {why}; expected a calibration as smartcam writes it", code=Refusal.BROKEN_FILE
+        f"{path}: {why}; expected a calibration as smartcam writes it", code=Code.BROKEN_FILE
     )
 
 
@@ -216,7 +216,7 @@ def _version(path: StrPath, text: object) -> tuple[int, int]:
         raise CalibrationError(
             f"{path}: schema version {text}, expected {SCHEMA_VERSION[0]} at most: "
             "a newer smartcam wrote it",
-            code=Refusal.NEWER_VERSION,
+            code=Code.NEWER_VERSION,
             got=text,
             expected="{}.{}".format(*SCHEMA_VERSION),
         )

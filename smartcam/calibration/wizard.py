@@ -18,7 +18,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.refusals import Refusal
 from smartcam.calibration.sequence import Wizard, ask
 from smartcam.calibration.steps import Flag, Number, Option, Step, Text
 from smartcam.calibration.store import write
@@ -170,7 +169,7 @@ def _with_default(one: Any, parameters: Mapping[str, Any]) -> Any:
         return replace(one, default=one.checked(value))
     except ValueError as exc:
         raise CalibrationError(
-            f"parameter {one.name}: {exc}", code=Refusal.WRONG_ANSWERS, got={one.name: str(exc)}
+            f"parameter {one.name}: {exc}", code=Code.WRONG_ANSWERS, got={one.name: str(exc)}
         ) from exc
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from smartcam.calibration.refusals import Refusal
+from smartcam.calibration.codes import Code
 from smartcam.exceptions import CalibrationError
 from smartcam.web.calls import Ask, Call, as_table
 from smartcam.web.refusals import RefusedError
@@ -140,12 +140,12 @@ class _Pose(_Body):
 # ---------------------------------------------------------------------- what calls do
 
 _STATUS = {
-    Refusal.NOT_FOUND: 404,
-    Refusal.NO_SEQUENCE: 409,
-    Refusal.NO_CALIBRATION: 409,
-    Refusal.STALE_STEP: 409,
-    Refusal.NOT_POSSIBLE: 409,
-    Refusal.IN_USE: 409,
+    Code.NOT_FOUND: 404,
+    Code.NO_SEQUENCE: 409,
+    Code.NO_CALIBRATION: 409,
+    Code.STALE_STEP: 409,
+    Code.NOT_POSSIBLE: 409,
+    Code.IN_USE: 409,
 }
 """HTTP status by what a call is refused for; 422 for the rest."""
 
