@@ -26,7 +26,7 @@ from smartcam.testing.protocols.parameters import Parameters
 from smartcam.testing.protocols.words import REQUESTS, example
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from hypothesis.strategies import DataObject
 
@@ -92,20 +92,27 @@ class MachineChecks(Parameters):
         from smartcam.testing import drawing
 
         places = range(len(stream.steps) + 1)
-        pieces = drawing.st.lists(drawing.noise(_samples(stream)), max_size=3)
+        samples = _samples(stream)
+        pieces = drawing.st.lists(drawing.noise(samples), max_size=3)
+
+        def told(place: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
+            player = Player(self.protocol, stream).play(place)
+            events = [event for chunk in cut for event in player.deliver(chunk)]
+            return events, player.machine.state
+
+        def compare(place: int, whole: bytes, chunks: list[bytes]) -> None:
+            first = told(place, [whole])
+            for cut in (chunks, [bytes([one]) for one in whole]):
+                other = told(place, cut)
+                assert other == first, f"whole: {first}, in pieces: {other}"
 
         def check(data: DataObject) -> None:
             place = data.draw(drawing.st.sampled_from(places), label="at step")
             whole = b"".join(data.draw(pieces, label="comes"))
-            chunks = drawing.cut(data, whole)
-            outcomes: list[tuple[list[Any], State]] = []
-            for cut in ([whole], chunks, [bytes([one]) for one in whole]):
-                player = Player(self.protocol, stream).play(place)
-                events = [event for chunk in cut for event in player.deliver(chunk)]
-                outcomes.append((events, player.machine.state))
-            for other in outcomes[1:]:
-                assert other == outcomes[0], f"whole: {outcomes[0]}, in pieces: {other}"
+            compare(place, whole, drawing.cut(data, whole))
 
+        for place in places:
+            compare(place, b"".join(samples), samples)
         drawing.each_drawn(check)
 
     # ------------------------------------------------------------------ anything

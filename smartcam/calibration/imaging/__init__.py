@@ -1,0 +1,1 @@
+"""Calibration from images: printed targets, lenses, pairs of cameras, cameras on robots."""
