@@ -104,10 +104,11 @@ class PlaneMap:
         """Raise where a point lies behind the plane's horizon; NaN passes."""
         if not self.projective or not len(points):
             return
-        low, high = float(points.min()), float(points.max())
         u, v, one = self.matrix[3]
-        if one + min(u * low, u * high) + min(v * low, v * high) > 0:
-            return
+        if len(points) > FEW:  # before all of them, what the farthest of any plane would have
+            farthest = load("cv2").norm(points.reshape(-1, 1), load("cv2").NORM_INF)
+            if one - (abs(u) + abs(v)) * farthest > 0:
+                return
         w = points[:, :2] @ self.matrix[3, :2] + one
         if (w <= 0).any():
             raise _behind_horizon(points[int(np.argmin(w)), :2].tolist())
