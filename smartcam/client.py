@@ -73,10 +73,21 @@ def connect(
         model: camera model, such as ``"BVS002C"``.
         observers: see frames, events, results and errors:
             :class:`~smartcam.observers.Observer`.
-        **options: ``name``, ``application``, ``interpret_as``, ``y_down``, ``lenient``,
-            ``connect_timeout``, ``connect_attempts``, ``switch_timeout``, ``request_timeout``,
-            ``close_timeout``, ``liveness_timeout``, ``reconnect``, ``restore``, ``max_length``: see
-            :class:`~smartcam.settings.CameraSettings`.
+        **options: ``name``, ``application``, ``interpret_as``, ``calibration``, ``y_down``,
+            ``lenient``, ``connect_timeout``, ``connect_attempts``, ``switch_timeout``,
+            ``request_timeout``, ``close_timeout``, ``liveness_timeout``, ``reconnect``,
+            ``restore``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
+
+    With ``calibration`` the value of every result is a list of localizations in the robot's frame,
+    as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
+    an observer. It gets what ``interpret_as`` gives, turned to y up with ``y_down``; the headers'
+    frame is the camera's ``name``, which a calibration with a ``camera_frame`` wants to be that.
+    No value passes without it. One that is no list of localizations, or that the calibration
+    refuses, is an :exc:`~smartcam.exceptions.InterpretationError` with the cause chained; an
+    interpreter whose values never are localizations (raw, record, table, strings50) is a
+    ConfigurationError at once. A mapping from application id takes another calibration for each,
+    and None for those whose values are to stay as they are; an application that it lacks is an
+    error, too.
 
     Raises:
         ConfigurationError: an address or option cannot work; nothing was tried.
@@ -265,7 +276,7 @@ class SmartCamera:
 
         The stream goes on over a reconnect; what the camera sent in between nobody got.
 
-        A container that does not fit its layout is raised from the iterator as
+        A container that does not fit its layout, or its calibration, is raised from the iterator as
         :exc:`~smartcam.exceptions.InterpretationError`; the iterator stays usable. Results of
         another application than the one named are counted, not delivered.
 
@@ -352,7 +363,7 @@ class SmartCamera:
 
         Raises:
             TriggerTimeoutError: nothing came in time.
-            InterpretationError: what came does not fit its layout.
+            InterpretationError: what came does not fit its layout, or its calibration.
 
         Cancellation: safe; the result still goes to the streams.
         """
@@ -432,7 +443,7 @@ class SmartCamera:
             InputContainerError: with ``input``: it did not belong to this inspection, or the input
                 of an earlier trigger without a result may still be queued in the camera; loading
                 an application (:meth:`switch_application`) empties its queue (inferred).
-            InterpretationError: the result does not fit its layout.
+            InterpretationError: the result does not fit its layout, or its calibration.
             WrongApplicationError: the result is another application's, or another application is
                 active than the one that was named.
             CommandRejectedError: with ``application``: the camera does not have it.
@@ -738,7 +749,9 @@ class SmartCamera:
         if known is not None:
             return known
         lenient, y_down = self.settings.lenient, self.settings.y_down
-        made = Interpretation(spec, lenient=lenient, y_down=y_down)
+        made = Interpretation(
+            spec, lenient=lenient, y_down=y_down, calibration=self.settings.calibration
+        )
         if isinstance(spec, str) and len(self._interpretations) < MAX_INTERPRETATIONS:
             self._interpretations[spec] = made
         return made

@@ -1,13 +1,21 @@
 """From a result container to a :class:`~smartcam.models.Result`: which interpreter, and running it.
 
 ``interpret_as`` is one specification for whatever comes, or a mapping from application id to one.
+``calibration`` stands behind the interpreter, for all applications or for each by itself; where it
+stands no value passes that it has not turned into poses of the robot.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+import inspect
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
+from smartcam.exceptions import (
+    CalibrationError,
+    ConfigurationError,
+    InterpretationError,
+    WrongApplicationError,
+)
 from smartcam.interpreters.base import (
     Context,
     Interpreter,
@@ -20,12 +28,14 @@ from smartcam.interpreters.base import (
     run_sequence,
 )
 from smartcam.layout.texts import pack_texts
+from smartcam.models import Localization
+from smartcam.registry import INTERPRETERS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from datetime import datetime
 
-    from smartcam.models import ByteOrder
+    from smartcam.models import ByteOrder, Calibration
     from smartcam.protocols.messages import ResultContainer
 
 __all__ = ["Interpretation", "byte_order"]
@@ -83,12 +93,14 @@ class Interpretation:
         spec: what ``interpret_as`` accepts.
         lenient: any non-zero byte is a true bool.
         y_down: the camera's y axis points down.
+        calibration: what ``calibration`` accepts.
 
     Raises:
-        ConfigurationError: the specification is wrong (a layout text with the position).
+        ConfigurationError: the specification is wrong (a layout text with the position), or the
+            calibration is none, or cannot apply to what the specification gives.
     """
 
-    def __init__(self, spec: Any, *, lenient: bool, y_down: bool) -> None:
+    def __init__(self, spec: Any, *, lenient: bool, y_down: bool, calibration: Any = None) -> None:
         self._lenient = lenient
         self._y_down = y_down
         self._plain_context = Context(y_down=y_down, lenient=lenient)
@@ -105,6 +117,12 @@ class Interpretation:
                 self._by_application[application] = _way(resolve(one, lenient=lenient))
         else:
             self._one = _way(resolve(spec, lenient=lenient))
+        self._calibrations = None if calibration is None else _Calibrations(calibration)
+        if self._calibrations is not None:
+            if self._one is not None:
+                self._calibrations.check(None, self._one.interpreter)
+            for application, way in self._by_application.items():
+                self._calibrations.check(application, way.interpreter)
 
     @property
     def by_application(self) -> bool:
@@ -148,8 +166,9 @@ class Interpretation:
         """Interpret one container.
 
         Raises:
-            InterpretationError: it does not fit.
-            WrongApplicationError: the mapping does not know its application.
+            InterpretationError: it does not fit, or the calibration cannot turn its value into
+                poses of the robot; then the calibration's error is chained.
+            WrongApplicationError: a mapping does not know its application.
         """
         interpreter, simple, sequenced, _ = self._known(container.application)
         data = container.data
@@ -158,6 +177,8 @@ class Interpretation:
         if simple is not None and not sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(simple, data, context)
+            if self._calibrations is not None:
+                value = self._calibrations.apply(value, container.application)
             return Interpreted(value, None, context.empty_slots)
         order = byte_order(endian)
         context = Context(
@@ -165,6 +186,8 @@ class Interpretation:
         )
         reader = Reader(data, context, interpreter.layout)
         value = run(interpreter, reader)
+        if self._calibrations is not None:
+            value = self._calibrations.apply(value, container.application)
         sequence = run_sequence(interpreter, reader) if sequenced else None
         return Interpreted(value, sequence, context.empty_slots)
 
@@ -202,9 +225,146 @@ class Interpretation:
         try:
             values = way.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
+            if self._calibrations is not None:
+                # each by itself, so that it has the same bits whichever way it came
+                values = [self._calibrations.apply(value, application) for value in values]
         except Exception:  # noqa: BLE001 - one by one it shows, with its place
             return None
         return (values, context.empty_slots) if complete else None
+
+
+class _Calibrations:
+    """What the values of each application go through.
+
+    Args:
+        given: what ``calibration`` accepts, but None.
+
+    Raises:
+        ConfigurationError: it is no calibration, and no mapping from application ids to some.
+    """
+
+    def __init__(self, given: Any) -> None:
+        self._one: Calibration | None = None
+        self._by_application: dict[int, Calibration | None] | None = None
+        if hasattr(given, "to_robot") or not hasattr(given, "items"):
+            self._one = _calibration(given)
+            return
+        self._by_application = {}
+        for application, one in given.items():
+            if not isinstance(application, int):
+                raise ConfigurationError(
+                    f"calibration: a mapping goes from application id to a calibration or None; "
+                    f"{application!r} is no id"
+                )
+            self._by_application[application] = None if one is None else _calibration(one)
+
+    def check(self, application: int | None, interpreter: Interpreter) -> None:
+        """Raise where no value of an interpreter would ever pass.
+
+        Args:
+            application: whose values they are; None: of any.
+            interpreter: what gives them.
+
+        Raises:
+            ConfigurationError: says what to give instead.
+        """
+        given, known = [self._one], self._by_application
+        of = "" if application is None else f" of application {application}"
+        if known is not None:
+            if application is not None and application not in known:
+                raise ConfigurationError(
+                    f"calibration: expected one{of}, or None to leave its values as they are; "
+                    f"the mapping has {sorted(known)}"
+                )
+            given = [*known.values()] if application is None else [known[application]]
+        name = _without_poses(interpreter)
+        if name is not None and None not in given:
+            raise ConfigurationError(
+                f"calibration: expected results{of} to be localizations, as with "
+                f"interpret_as='localizations', got the interpreter {name!r}; a mapping with None "
+                "for an application leaves its values as they are"
+            )
+
+    def apply(self, value: object, application: int) -> Any:
+        """Return localizations in the robot's frame; any value where None is the calibration.
+
+        Raises:
+            InterpretationError: these are no localizations, or the calibration failed; then the
+                cause is chained.
+            WrongApplicationError: the mapping does not know the application.
+        """
+        calibration = self._of(application)
+        if calibration is None:
+            return value
+        parts = _localizations(value)
+        if parts is None:
+            raise InterpretationError(
+                f"calibration: expected a list of localizations of application {application}, "
+                f"got {type(value).__name__}",
+                expected="a list of localizations",
+                got=type(value).__name__,
+            )
+        try:
+            found: object = calibration.to_robot(parts)
+        except CalibrationError as exc:
+            raise InterpretationError(
+                f"calibration: {exc}", expected=exc.expected, got=exc.got
+            ) from exc
+        except Exception as exc:
+            raise InterpretationError(
+                f"the calibration failed with {type(exc).__name__}: {exc}", got=repr(exc)
+            ) from exc
+        made = _localizations(found)
+        if made is None or len(made) != len(parts):
+            got = type(found).__name__ if made is None else len(made)
+            raise InterpretationError(
+                f"calibration: expected to_robot to return {len(parts)} localizations, got {got}",
+                expected=len(parts),
+                got=got,
+            )
+        return made
+
+    def _of(self, application: int) -> Calibration | None:
+        known = self._by_application
+        if known is None:
+            return self._one
+        if application not in known:
+            raise WrongApplicationError(
+                f"a result of application {application} came; calibration knows {sorted(known)}",
+                expected=sorted(known),
+                got=application,
+            )
+        return known[application]
+
+
+def _calibration(given: Any) -> Calibration:
+    """Return what was given; raise where it cannot be a calibration."""
+    method = getattr(given, "to_robot", None)
+    if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):
+        raise ConfigurationError(
+            "calibration: expected an object with a method to_robot(localizations) that is not "
+            f"async, such as PlaneCalibration.load(FILE) gives, got {given!r:.80}"
+        )
+    return cast("Calibration", given)
+
+
+def _localizations(value: object) -> list[Localization] | None:
+    """Return ``value`` where it is a list of nothing but localizations, else None."""
+    if not isinstance(value, list):
+        return None
+    parts: list[Any] = value
+    return parts if all(isinstance(part, Localization) for part in parts) else None
+
+
+_WITHOUT_POSES = ("raw", "record", "strings50", "table")
+"""Built-in interpreters whose values are no localizations, whatever comes."""
+
+
+def _without_poses(interpreter: Interpreter) -> str | None:
+    """Return an interpreter's name where it is one of those; a class made from one is not."""
+    # exactly these types: what a user makes of one may give anything
+    found = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
+    return next(found, None)
 
 
 def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:

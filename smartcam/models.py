@@ -13,7 +13,7 @@ import math
 import sys
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ApplicationChanged",
     "ByteOrder",
+    "Calibration",
     "CameraEvent",
     "Capabilities",
     "Connected",
@@ -184,6 +185,29 @@ class Localization(NamedTuple):
     quality: float
     photo_index: int
     pose: Pose
+
+
+class Calibration(Protocol):
+    """What brings localizations into a robot's frame.
+
+    The option ``calibration`` takes any object with this method, such as a
+    :class:`~smartcam.calibration.PlaneCalibration`.
+    """
+
+    def to_robot(self, localizations: list[Localization], /) -> list[Localization]:
+        """Return one localization for each, in the same order, with its pose in the robot's frame.
+
+        The client calls it in its event loop, once for the localizations of each result container,
+        none included; it must not wait. It may be called again for the same container.
+
+        Args:
+            localizations: of one container; their header has the camera's name as its frame.
+
+        Raises:
+            CalibrationError: one of them cannot be brought there. That makes the whole result an
+                :exc:`~smartcam.InterpretationError`, and so does anything else that is raised.
+        """
+        ...
 
 
 class Result(NamedTuple):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from smartcam.interpreters.base import Spec
+    from smartcam.models import Calibration
     from smartcam.protocols.base import Protocol
 
 __all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address", "validation_text"]
@@ -212,6 +213,7 @@ class CameraOptions(TypedDict, total=False):
     name: str
     application: int | None
     interpret_as: Spec | Mapping[int, Spec]
+    calibration: Calibration | Mapping[int, Calibration | None] | None
     y_down: bool
     lenient: bool
     connect_timeout: float
@@ -238,6 +240,11 @@ class CameraSettings(BaseModel):
         None, ge=0, le=0xFFFFFFFF, description="application to have running and ready"
     )
     interpret_as: Any = Field(None, description="what result containers hold")
+    calibration: Any = Field(
+        None,
+        description="what brings localizations into the robot's frame: one for all applications, "
+        "or a mapping from application id to one, or to None to leave its values as they are",
+    )
     y_down: bool = Field(
         False, description="the camera's y axis points down; turned to y up on the way in"
     )

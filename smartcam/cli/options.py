@@ -19,6 +19,7 @@ from smartcam.observers import Observer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from smartcam.calibration.plane import PlaneCalibration
     from smartcam.connection import TraceEntry
 
 __all__ = [
@@ -79,6 +80,17 @@ _result = [
         "'table: (x: real32)*'. Default raw: bytes, shown as hex.",
     ),
     click.option("--y-down", is_flag=True, help="The camera's y axis points down."),
+    click.option(
+        "--calibration",
+        metavar="FILE",
+        type=click.Path(dir_okay=False),
+        help="Show localizations in the robot's frame, by what smartcam calibrate wrote.",
+    ),
+    click.option(
+        "--name",
+        metavar="NAME",
+        help="The camera's name: in results, and as the frame of poses; default HOST:PORT.",
+    ),
     click.option("--count", type=click.IntRange(min=1), help="End after so many results."),
     click.option("--seconds", type=SECONDS, help="End after so many seconds."),
 ]
@@ -135,6 +147,16 @@ class _Frames(Observer):
         self._write(entry)
 
 
+def _calibration(path: str) -> PlaneCalibration:
+    """Return what a calibration's file holds."""
+    from smartcam.calibration.plane import PlaneCalibration
+
+    try:
+        return PlaneCalibration.load(path)
+    except OSError as exc:
+        raise ConfigurationError(f"--calibration {path}: {exc.strerror}") from exc
+
+
 @dataclass(slots=True)
 class Options:
     """The shared options as a command uses them."""
@@ -146,6 +168,8 @@ class Options:
     application: int | None = None
     interpret_as: str | None = None
     y_down: bool = False
+    calibration: str | None = None
+    name: str | None = None
     count: int | None = None
     seconds: float | None = None
 
@@ -155,14 +179,22 @@ class Options:
 
     @contextmanager
     def camera(self, url: str) -> Iterator[SmartCamera]:
-        """Give an unopened camera; the trace file is open around it."""
+        """Give an unopened camera; the trace file is open around it.
+
+        Raises:
+            CalibrationError: the calibration's file is damaged, newer, or holds something else.
+            ConfigurationError: a file cannot be opened, or an option cannot work.
+        """
+        calibration = None if self.calibration is None else _calibration(self.calibration)
         with self.tracing() as trace:
             yield connect(
                 camera_url(url),
                 observers=[_Frames(trace)] if trace is not None else [],
                 reconnect=None,
+                name=self.name or "",
                 application=self.application,
                 interpret_as=self.interpret_as,
+                calibration=calibration,
                 y_down=self.y_down,
                 connect_timeout=self.step(10.0),
                 switch_timeout=self.step(10.0),

@@ -63,17 +63,17 @@ def value_text(value: Any) -> str:
 
 
 def _localizations_text(parts: list[Localization]) -> str:
-    rows = [
-        (
-            part.feature_id,
-            part.quality,
-            part.pose.position.x,
-            part.pose.position.y,
-            part.pose.orientation.theta,
-        )
-        for part in parts
-    ]
-    return table_text(("feature_id", "quality", "x [m]", "y [m]", "theta [rad]"), rows)
+    """Return a row for each: in the plane where all of them lie there, else in space."""
+    head: tuple[str, ...]
+    rows: list[tuple[object, ...]]
+    if any(pose.position.z or any(pose.orientation[:2]) for *_, pose in parts):
+        head = ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw")
+        rows = [(*part.pose.position, *part.pose.orientation) for part in parts]
+    else:
+        head = ("x [m]", "y [m]", "theta [rad]")
+        rows = [(*part.pose.position[:2], part.pose.orientation.theta) for part in parts]
+    named = [(*part[:2], *row) for part, row in zip(parts, rows, strict=True)]
+    return table_text(("feature_id", "quality", *head), named)
 
 
 def _cell(value: object) -> str:
