@@ -37,7 +37,7 @@ class Code(enum.StrEnum):
     POOR_FIT = "POOR_FIT"
     """The residuals are larger than touching explains."""
     OUTLIER = "OUTLIER"
-    """One point fits far worse than the others."""
+    """A point that fits far worse than the others; as an error, half of the points or more."""
     NOT_SIMILAR = "NOT_SIMILAR"
     """One scale for the whole field does not do: the camera is tilted, or its lens distorts."""
     NOT_HELD_OUT = "NOT_HELD_OUT"
@@ -73,6 +73,26 @@ class Code(enum.StrEnum):
     NOT_CONNECTED = "NOT_CONNECTED"
     """No way from one frame to the other."""
 
+    # images
+    TARGET_NOT_FOUND = "TARGET_NOT_FOUND"
+    """The image does not show the target, or not enough of it."""
+    AMBIGUOUS_ORIGIN = "AMBIGUOUS_ORIGIN"
+    """Which corner of the target is its origin cannot be told with a margin."""
+    WRONG_SIZE = "WRONG_SIZE"
+    """An image of another size than the camera's, or than the other images."""
+    DIFFERENT_TARGETS = "DIFFERENT_TARGETS"
+    """Views of several targets where those of one are expected."""
+    BAD_VIEW = "BAD_VIEW"
+    """A view that fits far worse than the others; it is left out."""
+    UNSUPPORTED = "UNSUPPORTED"
+    """The OpenCV that is installed lacks what is needed."""
+    POOR_COVERAGE = "POOR_COVERAGE"
+    """The views show the target in too few places, sizes or tilts to tell the lens well."""
+    SHEET_NOT_EXACT = "SHEET_NOT_EXACT"
+    """The points of a printed target are not where they were meant to be."""
+    PAGE_TOO_SMALL = "PAGE_TOO_SMALL"
+    """A sheet's target does not fit on its page."""
+
     # steps, files and services
     WRONG_ANSWERS = "WRONG_ANSWERS"
     """Answers that do not fit the step's inputs; ``got`` has a text for each wrong one."""
@@ -100,6 +120,12 @@ class Code(enum.StrEnum):
     """A file of a newer smartcam, whose meaning this one does not know."""
     NOT_STORABLE = "NOT_STORABLE"
     """A value that JSON cannot hold exactly: NaN, infinity, an object."""
+
+    # formats of other programs
+    UNKNOWN_FORMAT = "UNKNOWN_FORMAT"
+    """No format, or no robot's convention, of this name."""
+    MALFORMED = "MALFORMED"
+    """A file of another program that is not what its format says."""
 
 
 class Remark(NamedTuple):

@@ -313,6 +313,8 @@ def _solve_homography(pairs: Pairs, scale: float) -> Array:
         step = tangent @ np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
         for halving in range(MOST_HALVINGS):
             following = matrix + 0.5**halving * step.reshape(4, 3)
+            if (pairs.homogeneous @ following[3]).min() <= 0.0:  # a point beyond the horizon
+                continue
             after = root * (pairs.robot - apply(following, pairs.camera))
             if (after**2).sum() < (residuals**2).sum():
                 break

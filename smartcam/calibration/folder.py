@@ -27,7 +27,7 @@ MAX_NAME = 64
 EXPORTS = "exports"
 """Where exported files stand, in the folder."""
 
-_SUFFIXES = (".json", ".yaml")
+_SUFFIXES = (".json", ".yaml", ".txt", ".calib")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])", re.IGNORECASE)
 """Names that Windows keeps for devices."""
 
@@ -62,13 +62,26 @@ class Folder:
         """
         return self._within(f"{_checked(name)}.json")
 
-    def journal(self, name: str) -> Path:
-        """Return the journal of a calibration's wizard.
+    def journal(self, name: str, wizard: str = "") -> Path:
+        """Return the journal of a wizard.
+
+        Args:
+            name: of the calibration.
+            wizard: name of the wizard; empty for the one that makes the calibration.
 
         Raises:
             CalibrationError: ``BAD_NAME``.
         """
-        return self._within(f"{_checked(name)}.journal")
+        of = f"{_checked(name)}.{_checked(wizard)}" if wizard else _checked(name)
+        return self._within(f"{of}.journal")
+
+    def checks(self, name: str) -> Path:
+        """Return the file of a calibration's checks.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``.
+        """
+        return self._within(f"{_checked(name)}.checks.jsonl")
 
     def export(self, target: str) -> Path:
         """Return the file that an export goes to; its folder is made.
@@ -83,7 +96,7 @@ class Folder:
         target = target.removeprefix(f"{EXPORTS}/")
         stem, dot, suffix = target.rpartition(".")
         if f"{dot}{suffix}" not in _SUFFIXES:
-            raise _bad(target, f"a name that ends in {' or '.join(_SUFFIXES)}")
+            raise _bad(target, f"a name that ends in one of {', '.join(_SUFFIXES)}")
         path = self._within(EXPORTS, f"{_checked(stem)}.{suffix}")
         path.parent.mkdir(exist_ok=True)
         return path

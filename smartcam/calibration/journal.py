@@ -10,16 +10,17 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.store import sync_folder
 from smartcam.exceptions import CalibrationError
 
-try:
+if sys.platform == "win32":
+    import msvcrt
+else:
     import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]  # a module or None
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,7 +40,7 @@ _MAX_FILE = 1 << 28
 class Journal:
     """A journal in a file, for one sequence at a time.
 
-    The file is locked as long as it is open (POSIX), so that no other process writes into it.
+    The file is locked as long as it is open, so that no other process writes into it.
 
     Args:
         path: the file; made where it is not there. A symbolic link is refused.
@@ -108,11 +109,9 @@ class Journal:
         self._stream.close()
 
     def _lock(self) -> None:
-        if fcntl is None:
-            return
         try:
-            fcntl.flock(self._stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as exc:
+            _lock(self._stream.fileno())
+        except (BlockingIOError, PermissionError) as exc:  # POSIX, Windows
             raise CalibrationError(
                 f"{self.path}: another sequence writes it; expected one at a time",
                 code=Code.IN_USE,
@@ -173,3 +172,14 @@ class Journal:
         return CalibrationError(
             f"{self.path}: {why}; expected the journal of a sequence", code=Code.BROKEN_FILE
         )
+
+
+def _lock(descriptor: int) -> None:
+    """Lock an open file, which must stand at its start, or raise OSError where it is locked."""
+    if sys.platform == "win32":
+        # Windows keeps others from what is locked: a byte behind all that a journal may hold
+        os.lseek(descriptor, _MAX_FILE, os.SEEK_SET)
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        os.lseek(descriptor, 0, os.SEEK_SET)
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

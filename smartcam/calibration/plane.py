@@ -7,6 +7,7 @@
     calibration.predicted_error([[0.10, 0.05]])     # metres, rms
 
 A point is seen by the camera and touched by the robot; three are needed, nine tell how good it is.
+Of six and more, ``robust=True`` leaves out those that are wrong.
 """
 
 from __future__ import annotations
@@ -26,7 +27,15 @@ from smartcam.calibration.findings import Evidence, check_side, findings
 from smartcam.calibration.fitting import MODELS, Fit, Frame, ModelName, sensitivity
 from smartcam.calibration.geometry import as_points, as_vector
 from smartcam.calibration.mapping import PlaneMap
-from smartcam.calibration.samples import check_positive, check_samples, normalize, read_pairs
+from smartcam.calibration.robust import agreeing, renumbered
+from smartcam.calibration.samples import (
+    check_lever,
+    check_positive,
+    check_samples,
+    lever,
+    normalize,
+    read_pairs,
+)
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Localization
 
@@ -34,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
     from smartcam.calibration.geometry import Array
 
@@ -84,15 +93,17 @@ class PlaneCalibration:
             :func:`~smartcam.calibration.touches.fit_touches`.
         camera_points: (N, 2), as given.
         robot_points: (N, 3), as given, metres.
-        weights: (N,), as given; ones where none were.
+        weights: (N,), as given, ones where none were; 0 for a point that ``robust`` left out.
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres.
         place: centre and size of the points, in both spaces.
         unit_covariance: (12, 12), of the elements of the matrix between the centred and scaled
             points, row by row, for touches with a variance of 1 m^2.
-        residuals: (N, 3), robot minus mapped, metres. They are smaller than the error.
+        residuals: (N, 3), robot minus mapped, metres. They are smaller than the error, except of
+            points left out.
         leave_one_out: (N, 3), robot minus what a calibration from the other points says, metres;
-            NaN where the others alone give none. The point's own touch is part of it.
-        freedom: coordinates minus parameters.
+            NaN where the others alone give none. The point's own touch is part of it. Of a point
+            left out it is the residual.
+        freedom: coordinates of the points that count, minus parameters.
         touch_sigma: of one coordinate of a touch of weight 1, metres: as given or, where
             ``sigma_given`` is false, estimated from the residuals; None where there is no telling.
         sigma_given: whether it was given.
@@ -171,8 +182,16 @@ class PlaneCalibration:
         return None if math.isnan(value) else value
 
     @property
+    def outliers(self) -> tuple[int, ...]:
+        """Indices of the points that ``robust`` left out; they count in no error."""
+        return tuple(np.flatnonzero(self.weights == 0.0).tolist())
+
+    @property
     def worst(self) -> int:
-        """Index of the point with the largest held-out error, or residual where there is none."""
+        """Index of the point with the largest held-out error, or residual where there is none.
+
+        Points left out are not asked.
+        """
         held_out = not np.isnan(self.leave_one_out).any()
         errors = self.leave_one_out if held_out else self.residuals
         return int(np.argmax(self.weights * (errors**2).sum(axis=1)))
@@ -273,7 +292,7 @@ class PlaneCalibration:
         if self.touch_sigma is None:
             raise CalibrationError(
                 "predicted error: expected touch_sigma, or more points than the "
-                f"{len(self.weights)} that {self.model} has need of",
+                f"{np.count_nonzero(self.weights)} that {self.model} has need of",
                 code=Code.UNVERIFIED,
                 expected="touch_sigma",
             )
@@ -300,7 +319,9 @@ class PlaneCalibration:
         """Return whether points touched again still lie where the calibration says.
 
         Offsets are compared with their covariance: that of the new touches, and that of the
-        calibration, which the points have in common.
+        calibration, which the points have in common. Of several points both all offsets are
+        tested and the one shift that fits them best, each at half the level: a camera that was
+        knocked shifts all of them, and the more are touched the surer that is noticed.
 
         Args:
             camera_points: (K, 2), or one point (2,).
@@ -325,11 +346,17 @@ class PlaneCalibration:
         variance = self._variance
         joint = rows @ self.unit_covariance @ rows.T + np.eye(len(rows))
         squared = float(offsets.ravel() @ np.linalg.solve(joint, offsets.ravel()))
+        each = np.tile(np.eye(3), (len(seen), 1))
+        weighted = np.linalg.solve(joint, each)
+        pull = weighted.T @ offsets.ravel()
+        shifted = float(pull @ np.linalg.solve(each.T @ weighted, pull))
         noise = Noise(
             max(variance, (NEGLIGIBLE * self.place.robot_size) ** 2),
             None if self.sigma_given else self.freedom,
         )
         chance = noise.chance(squared, len(rows))
+        if len(seen) > 1:
+            chance = min(1.0, 2.0 * min(chance, noise.chance(shifted, 3)))
         expected = math.sqrt(variance * float(np.trace(joint)) / len(seen))
         return Drift(offsets, expected, chance, normal_deviations(chance), chance < level)
 
@@ -411,6 +438,7 @@ def fit_plane(
     weights: ArrayLike | None = None,
     nominal_scale: float | None = None,
     tool_z: ArrayLike | None = None,
+    robust: bool = False,
     robot_frame: str = "robot",
     camera_frame: str | None = None,
 ) -> PlaneCalibration:
@@ -431,13 +459,18 @@ def fit_plane(
         tool_z: (3,) or (N, 3), direction of the tool's axis, into the plane, when it touched. Three
             dimensions have room for a mirrored plane, so only this tells whether y points the wrong
             way.
+        robust: leave out points that do not agree with the others (6 points or more, of which more
+            than half agree; MSAC). They keep their place among the points, with the weight 0, and
+            each is named by a warning OUTLIER. Which they are does not depend on ``model``. Give
+            ``touch_sigma``: without it fewer are found, and only such as are further off.
         robot_frame: name of the frame that poses will be given in.
         camera_frame: name of the frame that localizations must come in; None for any.
 
     Raises:
         CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
-            COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, or SCALE_MISMATCH where
-            ``rigid`` was asked for.
+            COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, SCALE_MISMATCH where
+            ``rigid`` was asked for, or with ``robust`` OUTLIER: no map agrees with more than half
+            of the points; OUT_OF_FIELD: one left out is behind the plane's horizon.
         MissingExtraError: SciPy is not installed.
         ValueError: no model has that name.
     """
@@ -446,10 +479,13 @@ def fit_plane(
     camera, robot, parts = read_pairs(camera_points, robot_points, weights)
     check_positive(touch_sigma, "touch_sigma", "metres")
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
+    kept = np.arange(len(camera))
+    if robust:
+        kept = np.flatnonzero(agreeing(camera, robot, parts, touch_sigma))
     least = MODELS["similarity" if model == "auto" else model].least
-    check_samples(camera, robot, least, touch_sigma)
+    check_samples(camera[kept], robot[kept], least, touch_sigma)
     side = None if tool_z is None else mean_axis(tool_z, len(camera))
-    place, pairs = normalize(camera, robot, parts)
+    place, pairs = normalize(camera[kept], robot[kept], parts[kept])
     sigma = None if touch_sigma is None else touch_sigma / place.robot_size
     unit = place.camera_size / place.robot_size
     nominal = 1.0 if nominal_scale is None and model == "rigid" else nominal_scale
@@ -459,7 +495,7 @@ def fit_plane(
     fitted = candidates.require(preferred if model == "auto" else model)
     held_out = candidates.held_out(fitted)
     matrix = place.outward(fitted.matrix)
-    normal = PlaneMap(matrix, place.camera).frame[:, 2]
+    plane = PlaneMap(matrix, place.camera)
     evidence = Evidence(
         pairs=pairs,
         fitted=fitted,
@@ -470,20 +506,25 @@ def fit_plane(
         sigma=sigma,
         place=place,
         nominal_scale=nominal,
-        side=None if side is None else check_side(normal, side),
+        side=None if side is None else check_side(plane.frame[:, 2], side),
     )
-    estimate = _estimated(fitted, parts)
+    estimate = _estimated(fitted, pairs.weights)
+    if robust and touch_sigma is None and estimate is not None:
+        check_lever(lever(robot[kept]), place.robot_size * estimate)
+    off = np.setdiff1d(np.arange(len(camera)), kept)
+    missed = np.zeros_like(robot)
+    missed[off] = robot[off] - plane.transform(camera[off])
     compared: list[ModelName] = [*candidates.names] if model == "auto" else [fitted.model]
-    return PlaneCalibration(
+    found = PlaneCalibration(
         model=fitted.model,
         camera_points=camera,
         robot_points=robot,
-        weights=parts,
+        weights=_put(np.zeros(len(camera)), kept, parts[kept]),
         matrix=matrix,
         place=place,
         unit_covariance=fitted.unit_covariance / place.robot_size**2,
-        residuals=place.robot_size * fitted.residuals,
-        leave_one_out=place.robot_size * held_out,
+        residuals=_put(missed, kept, place.robot_size * fitted.residuals),
+        leave_one_out=_put(missed, kept, place.robot_size * held_out),
         freedom=fitted.freedom,
         touch_sigma=touch_sigma
         if estimate is None or touch_sigma is not None
@@ -497,7 +538,28 @@ def fit_plane(
         tool_z=side,
         robot_frame=robot_frame,
         camera_frame=camera_frame,
-        warnings=findings(evidence),
+        warnings=tuple(renumbered(findings(evidence), kept)),
+    )
+    remarks = [_left_out(found, index, parts[index]) for index in found.outliers]
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
+
+
+def _put(whole: Array, at: NDArray[np.intp], values: Array) -> Array:
+    """Return a copy of ``whole`` with ``values`` in some rows."""
+    result = whole.copy()
+    result[at] = values
+    return result
+
+
+def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
+    """Say how far off a point lies that was left out, and how far touching explains."""
+    distance = float(np.linalg.norm(found.residuals[index]))
+    variance = 3.0 / weight * (found.touch_sigma or 0.0) ** 2
+    variance += float(found.predicted_error(found.camera_points[index : index + 1])[0]) ** 2
+    return Remark(
+        Code.OUTLIER,
+        f"point {index} is left out: it lies {1e3 * distance:.3g} mm from where the others say, "
+        f"where touching explains {1e3 * math.sqrt(variance):.3g} mm rms",
     )
 
 

@@ -22,6 +22,7 @@ __all__ = [
     "check_lever",
     "check_positive",
     "check_samples",
+    "lever",
     "normalize",
     "read_pairs",
 ]
@@ -119,23 +120,32 @@ def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | 
             got=float(extents[2]),
         )
     if touch_sigma is not None:
-        check_lever(float(np.ptp(_turned(robot)[:, 1])), touch_sigma)
+        check_lever(lever(robot), touch_sigma)
 
 
-def check_lever(lever: float, touch_sigma: float) -> None:
+def lever(robot: Array) -> float:
+    """Return how far touched points (N, 3) reach across their longest direction, metres."""
+    return float(np.ptp(_turned(robot)[:, 1]))
+
+
+def check_lever(found: float, touch_sigma: float) -> None:
     """Raise where points lie too close together for how well they are touched.
+
+    Args:
+        found: how far they reach, metres.
+        touch_sigma: of one coordinate, metres.
 
     Raises:
         CalibrationError: SHORT_LEVER.
     """
-    if lever < LEAST_LEVER * touch_sigma:
+    if found < LEAST_LEVER * touch_sigma:
         raise CalibrationError(
             f"robot points: expected at least {LEAST_LEVER:g} sigmas of a touch "
             f"({1e3 * LEAST_LEVER * touch_sigma:.3g} mm) in each direction, "
-            f"got {1e3 * lever:.3g} mm",
+            f"got {1e3 * found:.3g} mm",
             code=Code.SHORT_LEVER,
             expected=LEAST_LEVER * touch_sigma,
-            got=lever,
+            got=found,
         )
 
 

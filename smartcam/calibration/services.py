@@ -35,8 +35,12 @@ JOURNALS = 5
 """Journals of earlier runs that are kept for each name."""
 
 
+MATRIX = ".yaml"
+"""What the file of a matrix alone ends in."""
+
+
 class CalibrationService:
-    """Calibrations in a folder, and one wizard at a time that makes one.
+    """Calibrations in a folder, and one wizard at a time that makes or checks one.
 
     Args:
         folder: where calibrations and journals stand.
@@ -101,7 +105,7 @@ class CalibrationService:
 
         Args:
             name: of the calibration.
-            wizard: which one.
+            wizard: which one; each has a journal of its own for a name.
             parameters: for its start; one that is resumed has its own.
             fresh: begin anew in any case. The journal of the run before is kept beside it.
 
@@ -113,7 +117,7 @@ class CalibrationService:
                 ``WRONG_JOURNAL``, ``BROKEN_FILE``, ``NOT_POSSIBLE`` while an action is under way.
             OSError: the journal cannot be opened or written.
         """
-        path = self.folder.journal(name)
+        path = self.folder.journal(name, "" if wizard == KIND else wizard)
         if wizard not in self._wizards:
             raise CalibrationError(
                 f"no wizard is called {wizard!r}; expected one of {', '.join(self._wizards)}",
@@ -144,28 +148,48 @@ class CalibrationService:
             journal.close()
             raise
 
-    def export(self, name: str, target: str) -> str:
+    def export(self, name: str, target: str, form: str | None = None) -> str:
         """Copy a calibration to a file of ``exports/``, as a backup or for another program.
 
         Args:
             name: of the calibration.
             target: name of the file. With ``.json`` it is a copy, which :meth:`load` takes; with
-                ``.yaml`` the matrix, which PyYAML and ``cv2.FileStorage`` read.
+                ``.yaml`` the matrix, which PyYAML and ``cv2.FileStorage`` read, and
+                :func:`~smartcam.calibration.formats.read_matrix`.
+            form: instead of the matrix, the frame of its plane in this format, a key of
+                :data:`~smartcam.calibration.formats.TRANSFORMS`; the scale stands in a comment.
 
         Returns:
             The file's path in the folder.
 
         Raises:
-            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read.
+            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read. ``UNKNOWN_FORMAT``;
+                ``NOT_SIMILAR``: it has no frame; see
+                :func:`~smartcam.calibration.formats.plane_frame`.
             OSError: it cannot be written.
         """
+        from smartcam.calibration.formats import PlaneMatrix, compose
+        from smartcam.calibration.formats.opencv import compose_matrix
+
         source = self.folder.find(name)
         path = self.folder.export(target)
         calibration, context = _loaded(source)
-        if path.suffix == ".json":
-            replace_file(path, source.read_bytes())
+        if form is not None:
+            body = compose(form, calibration, suffix=path.suffix).encode()
+        elif path.suffix == ".json":
+            body = source.read_bytes()
+        elif path.suffix != MATRIX:
+            raise CalibrationError(
+                f"{path.name}: expected the format to be named, or a file that ends in .json or "
+                f"{MATRIX}",
+                code=Code.UNKNOWN_FORMAT,
+                expected=[".json", MATRIX],
+                got=path.suffix,
+            )
         else:
-            replace_file(path, _as_yaml(calibration, context).encode())
+            unit = str(context.get("camera_unit", "unit"))
+            body = compose_matrix(PlaneMatrix.of(calibration), unit).encode()
+        replace_file(path, body)
         return f"{EXPORTS}/{path.name}"
 
     def load(self, name_or_path: str) -> PlaneCalibration:
@@ -241,32 +265,3 @@ def _loaded(path: Path) -> tuple[PlaneCalibration, dict[str, Any]]:
             expected=KIND,
         )
     return PlaneCalibration.from_data(document.data), document.context
-
-
-def _as_yaml(calibration: PlaneCalibration, context: Mapping[str, Any]) -> str:
-    """Return the matrix as YAML 1.1, as little of it as both readers have in common."""
-    rows = calibration.matrix.tolist()
-    numbers = ",\n    ".join(", ".join(_real(value) for value in row) for row in rows)
-    about = f"w (x, y, z, 1) = matrix (u, v, 1), metres; {context.get('camera_unit', 'unit')} in"
-    return (
-        "%YAML 1.1\n---\n"
-        f'about: "{about}"\n'
-        f'model: "{calibration.model}"\n'
-        f'robot_frame: "{_quoted(calibration.robot_frame)}"\n'
-        f'camera_frame: "{_quoted(calibration.camera_frame or "")}"\n'
-        f"rows: {len(rows)}\ncols: {len(rows[0])}\n"
-        f"data: [\n    {numbers} ]\n"
-    )
-
-
-def _quoted(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
-
-
-def _real(value: float) -> str:
-    """Return a number as YAML 1.1 knows a real: with a point, also before an exponent."""
-    mantissa, e, exponent = repr(value).partition("e")
-    if not e:
-        return mantissa
-    sign = "" if exponent.startswith("-") else "+"
-    return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}e{sign}{exponent.lstrip('+')}"

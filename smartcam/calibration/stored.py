@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
@@ -22,6 +22,7 @@ __all__ = ["PlaceData", "PlaneData", "RemarkData", "from_data", "to_data"]
 
 Pair = tuple[FiniteFloat, FiniteFloat]
 Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Open = tuple[FiniteFloat | None, FiniteFloat | None, FiniteFloat | None]
 
 
@@ -53,7 +54,7 @@ class PlaneData(_Stored):
     model: ModelName | Literal["touches"]
     camera_points: list[Pair] = Field(min_length=3, description="the camera's unit")
     robot_points: list[Triple] = Field(min_length=3, description="m")
-    weights: list[FiniteFloat] = Field(min_length=3)
+    weights: list[NonNegative] = Field(min_length=3, description="0: the point was left out")
     matrix: tuple[Triple, Triple, Triple, Triple] = Field(
         description="w (x, y, z, 1) = matrix (u, v, 1), m"
     )
@@ -156,6 +157,8 @@ def _check_counts(stored: PlaneData) -> None:
     for name in ("robot_points", "weights", "residuals", "leave_one_out"):
         if len(getattr(stored, name)) != count:
             raise _no_calibration(f"{name}: expected {count}", len(getattr(stored, name)))
+    if np.count_nonzero(stored.weights) < 3:
+        raise _no_calibration("weights: expected 3 that are not 0", stored.weights)
     if any(len(row) != 12 for row in stored.unit_covariance):
         raise _no_calibration("unit_covariance: expected rows of 12", None)
 

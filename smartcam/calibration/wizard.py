@@ -11,46 +11,39 @@ Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
 from __future__ import annotations
 
 import math
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration.codes import Code
+from smartcam.calibration.marks import SIGMA, UNIT, Mark, Station, Touch, choose, with_default
+from smartcam.calibration.preview import before, compared, plain
 from smartcam.calibration.sequence import Wizard, ask
-from smartcam.calibration.steps import Flag, Number, Option, Step, Text
+from smartcam.calibration.steps import Number, Option, Step, Text
 from smartcam.calibration.store import write
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from smartcam.calibration.marks import Localize, ReadRobot
     from smartcam.calibration.plane import PlaneCalibration
     from smartcam.calibration.sequence import Answer
     from smartcam.calibration.steps import Answers
 
-__all__ = ["KIND", "MAX_MARKS", "MAX_POINTS", "RULER", "Localize", "ReadRobot", "plane_wizard"]
+__all__ = ["KIND", "MAX_POINTS", "RULER", "plane_wizard"]
 
 KIND = "plane"
 """What the store calls a calibration of a plane."""
-
-MAX_MARKS = 25
-"""Marks of one picture that can be touched: 5 x 5."""
 
 MAX_POINTS = 200
 """Touches of a calibration."""
 
 RULER = 100.0
 """Length of the ruler on the sheet, mm."""
-
-Localize = Callable[[], Awaitable[list[Localization]]]
-"""Takes a picture and returns what was found in it."""
-
-ReadRobot = Callable[[], Awaitable[Pose]]
-"""Returns where the robot's tip is, in the robot's base, metres; its z points out of the tool."""
 
 _SIDES: Mapping[str, tuple[float, float, float] | None] = {
     "-z": (0.0, 0.0, -1.0),
@@ -61,7 +54,6 @@ _SIDES: Mapping[str, tuple[float, float, float] | None] = {
     "+y": (0.0, 1.0, 0.0),
     "unknown": None,
 }
-_UNITS = {"mm": 1e-3, "m": 1.0}
 
 
 def plane_wizard(
@@ -87,9 +79,11 @@ def plane_wizard(
         work = _Work(
             about=about,
             name=str(parameters.get("name", "plane")),
-            feature=str(parameters.get("feature") or ""),
-            localize=localize,
-            read_robot=read_robot,
+            station=Station(
+                localize=localize,
+                read_robot=read_robot,
+                feature=str(parameters.get("feature") or ""),
+            ),
         )
         calibration = await (work.rays() if about["method"] == "rays" else work.marks())
         file = save_to(work.name)
@@ -136,20 +130,9 @@ def _about(parameters: Mapping[str, Any], *, typed: bool) -> Step:
         ),
         Text(name="robot_frame", label="Name of the robot's frame", default="robot"),
         Text(name="tool", label="Which tool touches", default=""),
-        Option(
-            name="unit",
-            label="Unit of the robot's coordinates",
-            options={"mm": "millimetres", "m": "metres"},
-        ),
+        UNIT,
         *((side,) if typed else ()),
-        Number(
-            name="touch_sigma",
-            label="How well a touch repeats, standard deviation; empty if not known",
-            unit="mm",
-            minimum=1e-4,
-            maximum=100.0,
-            optional=True,
-        ),
+        SIGMA,
     )
     return Step(
         id="about",
@@ -157,48 +140,21 @@ def _about(parameters: Mapping[str, Any], *, typed: bool) -> Step:
         description="The camera is fixed, and sees the plane that the robot works on. All touches "
         "are made with one tool, held the same way: then what is wrong with its tip is the same in "
         "all of them, and cancels out as long as parts are taken like that.",
-        inputs=tuple(_with_default(one, parameters) for one in inputs),
+        inputs=tuple(with_default(one, parameters) for one in inputs),
     )
 
 
-def _with_default(one: Any, parameters: Mapping[str, Any]) -> Any:
-    value = parameters.get(one.name)
-    if value is None:
-        return one
-    try:
-        return replace(one, default=one.checked(value))
-    except ValueError as exc:
-        raise CalibrationError(
-            f"parameter {one.name}: {exc}", code=Code.WRONG_ANSWERS, got={one.name: str(exc)}
-        ) from exc
+async def _choose_origin(marks: list[Mark]) -> Mark:
+    if len(marks) == 1:
+        return marks[0]
+    options = {str(number): f"{mark}" for number, mark in enumerate(marks, 1)}
+    inputs = (Option(name="mark", label="The origin mark", options=options),)
+    step = Step(id="which", title="Which one is the origin?", inputs=inputs)
+    return marks[int((await ask(step))["mark"]) - 1]
 
 
 def _side_text(name: str) -> str:
     return {"-z": "down: -z of the robot", "unknown": "not known"}.get(name, f"{name} of the robot")
-
-
-@dataclass(frozen=True, slots=True)
-class _Mark:
-    feature: str
-    x: float
-    y: float
-    theta: float
-
-    @classmethod
-    def of(cls, row: Mapping[str, Any]) -> _Mark:
-        return cls(row["feature_id"], row["x"], row["y"], row["theta"])
-
-    def __str__(self) -> str:
-        name = self.feature if self.feature.isprintable() else repr(self.feature)
-        return f"{name or 'mark'} at x {self.x:.6g}, y {self.y:.6g}"
-
-
-@dataclass(slots=True)
-class _Point:
-    mark: _Mark
-    robot: tuple[float, float, float]
-    tool_z: tuple[float, float, float] | None
-    what: str = "mark"
 
 
 class _Work:
@@ -209,49 +165,15 @@ class _Work:
         *,
         about: Answer,
         name: str,
-        feature: str,
-        localize: Localize,
-        read_robot: ReadRobot | None,
+        station: Station,
     ) -> None:
         self.name = name
         self._about = about
-        self._feature = feature
-        self._localize = localize
-        self._read_robot = read_robot
-        self._marks: list[_Mark] = []
-        self._points: list[_Point] = []
+        self._station = station
+        self._marks: list[Mark] = []
+        self._points: list[Touch] = []
 
     # ------------------------------------------------------------------ what is done
-
-    async def picture(self, _answers: Answers) -> list[dict[str, Any]]:
-        found = await self._localize()
-        rows = [
-            {
-                "feature_id": one.feature_id,
-                "quality": one.quality,
-                "photo_index": one.photo_index,
-                "x": one.pose.position.x,
-                "y": one.pose.position.y,
-                "theta": one.pose.orientation.theta,
-            }
-            for one in found
-            if self._feature in {"", one.feature_id}
-        ]
-        if not 0 < len(rows) <= MAX_MARKS:
-            wanted = f"{self._feature!r} " if self._feature else ""
-            raise CalibrationError(
-                f"the camera found {len(rows)} marks {wanted}among {len(found)} localizations; "
-                f"expected 1 to {MAX_MARKS}",
-                code=Code.TOO_FEW if not rows else Code.SHAPE,
-                got=len(rows),
-            )
-        return rows
-
-    async def _read(self, _answers: Answers) -> dict[str, Any]:
-        if self._read_robot is None:
-            return {}
-        pose = await self._read_robot()
-        return {"position": list(pose.position), "orientation": list(pose.orientation)}
 
     async def save(
         self, file: Path, calibration: PlaneCalibration, _answers: Answers
@@ -278,45 +200,17 @@ class _Work:
 
     # ------------------------------------------------------------------ steps
 
-    async def _touch(self, step_id: str, title: str, what: str, mark: _Mark) -> _Point:
-        unit = self._about["unit"]
-        where = f"Move the tip of the tool onto {what}, with the tool held as at every touch."
-        if self._read_robot is not None:
-            step = Step(
-                id=step_id,
-                title=title,
-                description=where,
-                button="It is there",
-                preview=self._before(mark),
-            )
-            outcome = (await ask(step, self._read)).outcome
-            x, y, z = outcome["position"]
-            return _Point(mark, (x, y, z), _axis_z(Quaternion(*outcome["orientation"])))
-        step = Step(
-            id=step_id,
-            title=title,
-            description=f"{where} Then take its position from the robot, in its base.",
-            inputs=tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz"),
-            preview=self._before(mark),
+    async def _touch(self, step_id: str, title: str, what: str, mark: Mark) -> Touch:
+        about = self._about
+        return await self._station.touch(
+            step_id,
+            title,
+            what,
+            mark,
+            unit=about["unit"],
+            tool_z=_SIDES[about["side"]] if "side" in about else None,
+            preview=before(self._points, self._marks, mark),
         )
-        answer = await ask(step)
-        x, y, z = (answer[axis] * _UNITS[unit] for axis in "xyz")
-        return _Point(mark, (x, y, z), _SIDES[self._about["side"]])
-
-    async def _choose(self, marks: list[_Mark], *, one: bool) -> list[_Mark]:
-        if len(marks) == 1:
-            return marks
-        if one:
-            options = {str(number): f"{mark}" for number, mark in enumerate(marks, 1)}
-            inputs = (Option(name="mark", label="The origin mark", options=options),)
-            step = Step(id="which", title="Which one is the origin?", inputs=inputs)
-            return [marks[int((await ask(step))["mark"]) - 1]]
-        flags = tuple(
-            Flag(name=f"mark_{number}", label=f"{number}: {mark}", default=True)
-            for number, mark in enumerate(marks, 1)
-        )
-        answer = await ask(Step(id="which", title="Which ones will be touched?", inputs=flags))
-        return [mark for flag, mark in zip(flags, marks, strict=True) if answer[flag.name]]
 
     async def _nominal_scale(self) -> float:
         """Ask for metres for each unit of the camera, which touches of rays do not tell."""
@@ -351,8 +245,8 @@ class _Work:
             "must not hide the origin mark.",
             button="Take a picture",
         )
-        rows = (await ask(step, self.picture)).outcome
-        origin = (await self._choose([_Mark.of(row) for row in rows], one=True))[0]
+        rows = (await ask(step, self._station.picture)).outcome
+        origin = await _choose_origin([Mark.of(row) for row in rows])
         for letter, what in (
             ("O", "the origin mark"),
             ("A", "a point of ray A, as far out as it goes"),
@@ -411,8 +305,8 @@ class _Work:
             button="Take a picture",
             notes=(f"{done} points so far",) if done else (),
         )
-        rows = (await ask(step, self.picture)).outcome
-        marks = await self._choose([_Mark.of(row) for row in rows], one=False)
+        rows = (await ask(step, self._station.picture)).outcome
+        marks = await choose([Mark.of(row) for row in rows])
         if done + len(marks) > MAX_POINTS:
             raise CalibrationError(
                 f"{done + len(marks)} points, expected {MAX_POINTS} at most",
@@ -468,7 +362,7 @@ class _Work:
         sigma = self._about["touch_sigma"]
         return None if sigma is None else 1e-3 * sigma
 
-    def _fit_rays(self, origin: _Mark, scale: float) -> PlaneCalibration:
+    def _fit_rays(self, origin: Mark, scale: float) -> PlaneCalibration:
         from smartcam.calibration.touches import fit_touches
 
         header = Header(0, datetime.fromtimestamp(0, UTC), self._about["camera_frame"])
@@ -503,50 +397,18 @@ class _Work:
             return None, [f"{exc.code}: {exc}"]
         return calibration, _summary(calibration)
 
-    def _before(self, mark: _Mark) -> dict[str, Any] | None:
-        """Return what a picture of a touch that is still to be made is drawn from."""
-        if not self._marks:  # the camera does not see where rays are touched
-            return None
-        seen = [[one.x, one.y] for one in self._marks]
-        return {**self.preview(None), "marks": seen, "next": [mark.x, mark.y]}
-
     def preview(self, calibration: PlaneCalibration | None) -> dict[str, Any]:
-        """Return what a picture is drawn from; metres, along the axes of the plane."""
-        points: list[dict[str, Any]] = [
-            {
-                "label": str(number) if one.what == "mark" else one.what,
-                "feature": one.mark.feature,
-                "camera": [one.mark.x, one.mark.y],
-                "robot": list(one.robot),
-            }
-            for number, one in enumerate(self._points, 1)
-        ]
+        """Return what a picture is drawn from."""
         if calibration is None:
-            return {"points": points}
-        across = calibration.rotation.T
-        centre = calibration.robot_points.mean(axis=0)
-        known = calibration.touch_sigma is not None
-        errors = calibration.covariance_at(calibration.camera_points) if known else None
-        for index, point in enumerate(points):
-            point["at"] = (across @ (calibration.robot_points[index] - centre)).tolist()
-            point["residual"] = (across @ calibration.residuals[index]).tolist()
-            held_out = (across @ calibration.leave_one_out[index]).tolist()
-            point["held_out"] = None if math.isnan(sum(held_out)) else held_out
-            point["covariance"] = (
-                None if errors is None else (across @ errors[index] @ across.T)[:2, :2].tolist()
-            )
-        return {
-            "points": points,
-            "worst": int(calibration.worst),
-            "camera_origin": (across @ (calibration.origin - centre)).tolist(),
-            "robot_axes": across.T.tolist(),
-        }
-
-
-def _axis_z(q: Quaternion) -> tuple[float, float, float]:
-    """Return where a turned z axis points."""
-    x, y, z, w = q
-    return 2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z
+            return plain(self._points)
+        return compared(
+            calibration,
+            self._points,
+            calibration.camera_points,
+            calibration.residuals,
+            calibration.leave_one_out,
+            worst=calibration.worst,
+        )
 
 
 def _figures(calibration: PlaneCalibration) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""``smartcam calibrate``: the wizard of a calibration in the terminal, or as a web page."""
+"""``smartcam calibrate``: the wizards of a calibration in the terminal, or as a web page."""
 
 from __future__ import annotations
 
@@ -31,6 +31,9 @@ __all__ = ["calibrate"]
 ABORTED = 130
 """Exit code after an abort: as after Ctrl-C there is no calibration."""
 
+STALE = 7
+"""Exit code after a check that found the calibration stale."""
+
 WIDTH = 88
 """Columns of a text."""
 
@@ -42,10 +45,13 @@ WIDTH = 88
     "understood. With --json each step is a line of stdout and each line of stdin "
     '{"answers": {...}} or {"do": "undo"|"repeat"|"abort"}, each with the "token" of the step that '
     "is meant, or without for the current one. "
+    "With --check it asks for some touches only, and tells whether a calibration is still true: "
+    f"exit code {STALE} if it is stale. "
     f"The camera is connected for each picture only. {CONNECTS}"
 )
 @click.argument("url")
-@click.option("--name", metavar="NAME", default="plane", show_default=True, help="Its name.")
+@click.option("--name", metavar="NAME", help="Its name.  [default: plane]")
+@click.option("--check", metavar="NAME", help="Check the calibration of that name.")
 @click.option(
     "--folder",
     type=click.Path(file_okay=False),
@@ -93,7 +99,8 @@ WIDTH = 88
 )
 @output_options
 def calibrate(
-    name: str,
+    name: str | None,
+    check: str | None,
     folder: str,
     fresh: bool,
     feature: str | None,
@@ -108,16 +115,28 @@ def calibrate(
         raise click.UsageError(
             f"{'--web-host' if web_host is not None else '--web-port'} needs --web"
         )
+    if name is not None and check is not None:
+        raise click.UsageError("--check names the calibration: no --name beside it")
     url: str = shared.pop("url")
     options = Options(**shared)
     parameters = {} if feature is None else {"feature": feature}
     place = {"host": web_host or "127.0.0.1", "port": web_port or 0, "token": web_token}
 
     async def main() -> None:
+        from smartcam.calibration.drift import WIZARD
+        from smartcam.calibration.wizard import KIND
+
         try:
             service = _service(url, folder, options)
             try:
-                service.start(name, parameters=parameters, fresh=fresh)
+                if check is not None:
+                    service.folder.find(check)
+                service.start(
+                    check or name or KIND,
+                    KIND if check is None else WIZARD,
+                    parameters,
+                    fresh=fresh,
+                )
                 await (_serve(service, options, place) if web else _drive(service.session, options))
             finally:
                 service.close()
@@ -136,6 +155,7 @@ async def _serve(service: CalibrationService, options: Options, place: Mapping[s
 
 
 def _service(url: str, folder: str, options: Options) -> CalibrationService:
+    from smartcam.calibration.drift import drift_wizard
     from smartcam.calibration.extra import load
     from smartcam.calibration.folder import Folder
     from smartcam.calibration.services import CalibrationService
@@ -159,8 +179,11 @@ def _service(url: str, folder: str, options: Options) -> CalibrationService:
         inside = Folder(folder)
     except OSError as exc:
         raise ConfigurationError(f"--folder {folder}: {exc.strerror}") from exc
-    wizard = plane_wizard(localize=localize, save_to=inside.calibration)
-    return CalibrationService(inside, [wizard])
+    wizards = (
+        plane_wizard(localize=localize, save_to=inside.calibration),
+        drift_wizard(localize=localize, find=inside.find, record_to=inside.checks),
+    )
+    return CalibrationService(inside, wizards)
 
 
 async def _drive(session: Session, options: Options) -> None:
@@ -175,6 +198,8 @@ async def _drive(session: Session, options: Options) -> None:
     options.show(view, _end_text)
     if view["type"] == "abort":
         raise SystemExit(ABORTED)
+    if view["result"].get("stale"):
+        raise SystemExit(STALE)
 
 
 _COMMANDS = ("undo", "repeat", "abort")
@@ -294,8 +319,17 @@ def _errors_text(view: Mapping[str, Any]) -> str:
 def _end_text(view: Mapping[str, Any]) -> str:
     if view["type"] == "abort":
         return "\naborted; what was measured stands in the journal"
-    rows = [f"  {name}: {value}" for name, value in view["result"].items() if name != "remarks"]
+    result = view["result"].items()
+    rows = [f"  {name}: {_result_text(value)}" for name, value in result if name != "remarks"]
     return "\n".join(["", "done", *rows])
+
+
+def _result_text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_result_text, value))
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else "-" if value is None else str(value)
 
 
 # ---------------------------------------------------------------------- standard input

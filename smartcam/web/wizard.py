@@ -23,7 +23,7 @@ __all__ = ["CALLS", "WizardSite"]
 
 
 class WizardSite:
-    """A page and HTTP calls that drive the wizard of a calibration.
+    """A page and HTTP calls that drive the wizards of calibrations.
 
     It runs in the event loop that the service's actions run in. Whoever uses it at the same time
     uses one sequence: a token tells which step a call meant.
@@ -124,6 +124,7 @@ class _Token(_Body):
 class _Export(_Body):
     name: str
     target: str
+    form: str | None = None
 
 
 class _Load(_Body):
@@ -200,7 +201,7 @@ def _start(service: CalibrationService, body: _Start) -> object:
 
 
 def _export(service: CalibrationService, body: _Export) -> object:
-    return {"file": service.export(body.name, body.target)}
+    return {"file": service.export(body.name, body.target, body.form)}
 
 
 def _load(service: CalibrationService, body: _Load) -> object:
@@ -226,7 +227,8 @@ CALLS: tuple[_Row, ...] = (
         method="POST",
         path=f"{API}/start",
         about="Start a wizard under a name, or go on with the one that was broken off; answers its "
-        "step. With `fresh` begin anew in any case.",
+        "step. `wizard` is `plane`, or `drift` to check a calibration. With `fresh` begin anew in "
+        "any case.",
         handler=_guarded(_start),
         body=_Start,
         sample='{"name": "table"}',
@@ -273,7 +275,8 @@ CALLS: tuple[_Row, ...] = (
     _Row(
         method="POST",
         path=f"{API}/export",
-        about="Copy a calibration to a file of `exports/`: `.json` whole, `.yaml` its matrix.",
+        about="Copy a calibration to a file of `exports/`: `.json` whole, `.yaml` its matrix, "
+        "or with `form` its frame as another program reads it.",
         handler=_guarded(_export),
         body=_Export,
         sample='{"name": "table", "target": "table.yaml"}',

@@ -84,6 +84,16 @@ def test_fit_homography_without_noise_is_exact() -> None:
     assert fit("homography", tilted()).residuals == pytest.approx(np.zeros((9, 3)), abs=1e-14)
 
 
+@pytest.mark.parametrize("seed", [82, 113, 332])
+def test_fit_homography_whose_horizon_runs_into_the_points_raises(seed: int) -> None:
+    random, marks = np.random.default_rng(seed), (grid(3, 2) - (0.15, 0.12)) / 0.15
+    touched = np.column_stack([marks, np.zeros(6)]) + 0.4 * random.normal(size=(6, 3))
+    pairs = Pairs(marks, touched - touched.mean(axis=0), np.ones(6))
+    with pytest.raises(CalibrationError, match="determine all 11 parameters") as caught:
+        fit("homography", pairs)
+    assert caught.value.code == "COLLINEAR"
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_fit_covariance_equals_numerical_derivatives(name: ModelName) -> None:
     pairs = noisy(WEIGHTS)

@@ -1,9 +1,35 @@
-"""What holds for every plane, in all eight octants, whatever the camera's unit."""
+"""What holds for every plane, in all eight octants, whatever the camera's unit.
+
+Planes are drawn with their origin up to 10 m off in each direction, any turn, normals along and
+against z and x among them, and 10^-6 to 10^3 metres for each unit of the camera. Every property has
+a number, which is in the names of its tests, here and elsewhere:
+
+====  ===============================================================================
+p1    the camera's origin mark maps to the touched origin
+p2    a point on ray A maps onto ray A
+p3    distances are multiplied by the scale
+p4    every result lies in the plane
+p5    the inverse gives the point back
+p6    the frame is right-handed
+p7    a part along ray A heads along ray A, and its heading turns as the part turns
+p8    a rigid change of the robot's base commutes with calibrating
+p9    so does one of the camera
+p10   the order of the points is irrelevant
+p11   the zero vector is finite
+p12   mirrored input is reported
+p13   points in a line and points that are the same are refused
+p14   many are as one
+p15   a moving camera is the static one calibrated anew at the new pose
+p16   stored and loaded, it is the same bit by bit
+====  ===============================================================================
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,15 +37,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from planekit import GRID, SIGMA, Scene, part, scenes, spread
+from rigid import rotations, transforms, yaw
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane, fit_touches
+from smartcam.calibration.frames import Transform
 from smartcam.calibration.geometry import (
     matrix_from_quaternion,
     quaternion_about_z,
     quaternion_multiply,
     rotate_ccw,
 )
+from smartcam.calibration.moving import MovingCamera
+from smartcam.calibration.solvers import chain_of
 
 if TYPE_CHECKING:
     from smartcam.calibration.geometry import Array
@@ -54,7 +84,7 @@ def turn_of(localization: Localization) -> Array:
 
 
 @given(scenes(), places, angles)
-def test_plane_origin_maps_to_touched_origin(
+def test_plane_p1_origin_maps_to_touched_origin(
     scene: Scene, place: tuple[float, float], theta: float
 ) -> None:
     found = sheet(scene, place, theta)
@@ -63,7 +93,7 @@ def test_plane_origin_maps_to_touched_origin(
 
 
 @given(scenes(), places, angles, st.floats(0.01, 0.5))
-def test_plane_points_of_ray_a_map_onto_ray_a(
+def test_plane_p2_points_of_ray_a_map_onto_ray_a(
     scene: Scene, place: tuple[float, float], theta: float, along: float
 ) -> None:
     found = sheet(scene, place, theta)
@@ -72,7 +102,7 @@ def test_plane_points_of_ray_a_map_onto_ray_a(
 
 
 @given(scenes(), places, places)
-def test_plane_distances_are_scaled(
+def test_plane_p3_distances_are_scaled(
     scene: Scene, first: tuple[float, float], second: tuple[float, float]
 ) -> None:
     found, marks = calibrated(scene), np.array([first, second])
@@ -83,7 +113,7 @@ def test_plane_distances_are_scaled(
 
 
 @given(scenes(), places, seeds)
-def test_plane_every_result_lies_in_the_plane(
+def test_plane_p4_every_result_lies_in_the_plane(
     scene: Scene, place: tuple[float, float], seed: int
 ) -> None:
     found = calibrated(scene, seed)
@@ -92,7 +122,7 @@ def test_plane_every_result_lies_in_the_plane(
 
 
 @given(scenes(), places, seeds)
-def test_plane_inverse_gives_the_point_back(
+def test_plane_p5_inverse_gives_the_point_back(
     scene: Scene, place: tuple[float, float], seed: int
 ) -> None:
     found, seen = calibrated(scene, seed), scene.camera(np.array([place]))
@@ -102,7 +132,7 @@ def test_plane_inverse_gives_the_point_back(
 
 
 @given(scenes(), seeds)
-def test_plane_frame_is_right_handed(scene: Scene, seed: int) -> None:
+def test_plane_p6_frame_is_right_handed(scene: Scene, seed: int) -> None:
     found = calibrated(scene, seed)
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
     assert found.rotation.T @ found.rotation == pytest.approx(np.eye(3), abs=1e-12)
@@ -110,7 +140,7 @@ def test_plane_frame_is_right_handed(scene: Scene, seed: int) -> None:
 
 
 @given(scenes(), places, angles, angles)
-def test_plane_heading_follows_the_part(
+def test_plane_p7_heading_follows_the_part(
     scene: Scene, place: tuple[float, float], theta: float, turn: float
 ) -> None:
     found = sheet(scene, place, theta)
@@ -126,7 +156,7 @@ def test_plane_heading_follows_the_part(
 
 
 @given(scenes(), scenes(), places, seeds)
-def test_plane_moving_the_robot_base_moves_results(
+def test_plane_p8_moving_the_robot_base_moves_results(
     scene: Scene, base: Scene, place: tuple[float, float], seed: int
 ) -> None:
     touches, seen = scene.touched(GRID, seed), scene.camera(np.array([place]))
@@ -138,7 +168,7 @@ def test_plane_moving_the_robot_base_moves_results(
 
 
 @given(scenes(), places, angles, st.floats(-3, 3), seeds)
-def test_plane_moving_the_camera_changes_nothing(
+def test_plane_p9_moving_the_camera_changes_nothing(
     scene: Scene, place: tuple[float, float], yaw: float, shift: float, seed: int
 ) -> None:
     touches, marks = scene.touched(GRID, seed), np.array([place])
@@ -149,7 +179,7 @@ def test_plane_moving_the_camera_changes_nothing(
 
 
 @given(scenes(), st.permutations(range(9)), seeds)
-def test_plane_order_of_points_is_irrelevant(scene: Scene, order: list[int], seed: int) -> None:
+def test_plane_p10_order_of_points_is_irrelevant(scene: Scene, order: list[int], seed: int) -> None:
     seen, touches = scene.camera(GRID), scene.touched(GRID, seed)
     first = fit_plane(seen, touches, touch_sigma=SIGMA)
     second = fit_plane(seen[order], touches[order], touch_sigma=SIGMA)
@@ -159,7 +189,7 @@ def test_plane_order_of_points_is_irrelevant(scene: Scene, order: list[int], see
 
 
 @given(scenes(), angles)
-def test_plane_zero_vector_is_finite(scene: Scene, theta: float) -> None:
+def test_plane_p11_zero_vector_is_finite(scene: Scene, theta: float) -> None:
     found = sheet(scene, (0.0, 0.0), theta)
     assert np.isfinite(found.transform([[0.0, 0.0]])).all()
     pose = found.to_robot(part(0.0, 0.0, theta)).pose
@@ -167,7 +197,7 @@ def test_plane_zero_vector_is_finite(scene: Scene, theta: float) -> None:
 
 
 @given(scenes(), seeds)
-def test_plane_mirrored_input_is_reported(scene: Scene, seed: int) -> None:
+def test_plane_p12_mirrored_input_is_reported(scene: Scene, seed: int) -> None:
     mirrored, touches = scene.camera(GRID) * (1, -1), scene.touched(GRID, seed)
     with pytest.raises(CalibrationError, match="y axis points the wrong way") as caught:
         fit_plane(mirrored, touches, touch_sigma=SIGMA, tool_z=-scene.turn[:, 2])
@@ -175,7 +205,7 @@ def test_plane_mirrored_input_is_reported(scene: Scene, seed: int) -> None:
 
 
 @given(scenes(), angles)
-def test_plane_points_in_a_line_are_refused(scene: Scene, yaw: float) -> None:
+def test_plane_p13_points_in_a_line_are_refused(scene: Scene, yaw: float) -> None:
     line = rotate_ccw(np.column_stack([np.linspace(0, 0.3, 5), np.zeros(5)]), yaw)
     with pytest.raises(CalibrationError) as caught:
         fit_plane(scene.camera(line), scene.robot(line))
@@ -186,7 +216,7 @@ def test_plane_points_in_a_line_are_refused(scene: Scene, yaw: float) -> None:
 
 
 @given(scenes(), st.lists(st.tuples(places, angles), min_size=1, max_size=5), seeds)
-def test_plane_many_are_as_one(
+def test_plane_p14_many_are_as_one(
     scene: Scene, lying: list[tuple[tuple[float, float], float]], seed: int
 ) -> None:
     found = calibrated(scene, seed)
@@ -202,7 +232,7 @@ def test_plane_many_are_as_one(
 
 
 @given(scenes(), seeds, st.sampled_from(["auto", "rigid", "similarity", "affine", "homography"]))
-def test_plane_stored_data_give_the_same_bits(scene: Scene, seed: int, model: str) -> None:
+def test_plane_p16_stored_data_give_the_same_bits(scene: Scene, seed: int, model: str) -> None:
     found = fit_plane(
         scene.camera(GRID),
         scene.touched(GRID, seed),
@@ -216,6 +246,32 @@ def test_plane_stored_data_give_the_same_bits(scene: Scene, seed: int, model: st
     assert again.predicted_error(seen).tobytes() == found.predicted_error(seen).tobytes()
 
 
+@given(scenes(), transforms("base", "flange"), rotations(), angles, places, places, angles)
+def test_plane_p15_moving_camera_is_the_static_one_calibrated_anew(
+    scene: Scene,
+    flange: Transform,
+    camera: Array,
+    turn: float,
+    shift: tuple[float, float],
+    place: tuple[float, float],
+    theta: float,
+) -> None:
+    """The camera sees the same picture before and after; ``camera`` is how it is on the flange."""
+    plane = Transform("base", "table", scene.turn, scene.origin)
+    motion = Transform("table", "table", yaw(turn), np.array([*shift, 0.0]))
+    mounted = Transform("flange", "flange", camera, np.array([0.1, 0.0, 0.2]))
+    now = plane @ motion @ plane.inverse() @ flange
+    moved = plane @ motion
+    anew = calibrated(Scene(moved.rotation, moved.translation, scene.scale))
+    there = calibrated(scene)
+    carried = MovingCamera(chain_of(there), flange @ mounted, field=there.robot_points)
+    seen = scene.camera(np.array([place]))[0]
+    one = carried.now(now @ mounted).to_robot([part(seen[0], seen[1], theta)])[0].pose
+    other = anew.to_robot(part(seen[0], seen[1], theta)).pose
+    assert one.position == pytest.approx(other.position, abs=CLOSE)
+    assert abs(np.dot(one.orientation, other.orientation)) == pytest.approx(1.0)
+
+
 @given(scenes(), places, angles)
 def test_plane_touches_and_points_agree(
     scene: Scene, place: tuple[float, float], theta: float
@@ -225,3 +281,14 @@ def test_plane_touches_and_points_agree(
     other = calibrated(scene).to_robot(part(seen[0], seen[1], 0.3)).pose
     assert one.position == pytest.approx(other.position, abs=CLOSE)
     assert abs(np.dot(one.orientation, other.orientation)) == pytest.approx(1.0)
+
+
+def test_plane_properties_each_number_has_a_test() -> None:
+    tests = Path(__file__).parent.glob("test_*.py")
+    found = {
+        int(number)
+        for path in tests
+        for number in re.findall(r"^def test_\w+?_p(\d+)_", path.read_text("utf-8"), re.MULTILINE)
+    }
+    listed = re.findall(r"^p(\d+) ", __doc__ or "", re.MULTILINE)
+    assert found == set(range(1, 17)) == set(map(int, listed))

@@ -10,10 +10,11 @@ import pytest
 from bench import GRID, OFFSET, Bench, say, where
 
 from smartcam.calibration.journal import Journal
+from smartcam.calibration.marks import MAX_MARKS
 from smartcam.calibration.plane import PlaneCalibration
 from smartcam.calibration.sequence import Session
 from smartcam.calibration.store import read_document
-from smartcam.calibration.wizard import MAX_MARKS, plane_wizard
+from smartcam.calibration.wizard import plane_wizard
 
 if TYPE_CHECKING:
     from pathlib import Path

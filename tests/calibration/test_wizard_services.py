@@ -265,7 +265,7 @@ def test_export_as_yaml_is_read_by_pyyaml_and_by_opencv(tmp_path: Path) -> None:
 def test_export_to_another_kind_of_file_is_refused(tmp_path: Path) -> None:
     service = served(tmp_path)
     saved(service, "table")
-    with pytest.raises(CalibrationError, match=r"expected a name that ends in \.json or \.yaml"):
+    with pytest.raises(CalibrationError, match=r"expected a name that ends in one of \.json, \.yaml, "):
         service.export("table", "table.sh")
 
 
@@ -292,3 +292,11 @@ def test_folder_that_is_a_link_itself_is_used(tmp_path: Path) -> None:
     saved(service, "table")
     assert json.loads((tmp_path / "real/table.json").read_text())["kind"] == "plane"
     assert service.folder.path.samefile(tmp_path / "real")
+
+
+def test_export_of_a_text_without_a_format_is_refused(tmp_path: Path) -> None:
+    service = served(tmp_path)
+    saved(service, "table")
+    with pytest.raises(CalibrationError, match=r"table\.txt: expected the format to be named"):
+        service.export("table", "table.txt")
+    assert service.export("table", "table.txt", "tf2") == "exports/table.txt"

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from commandline import Outcome, closed_port, emulators, run
 
-from smartcam.calibration.plane import PlaneCalibration
-from smartcam.cli.calibrating import calibrate
+from smartcam.calibration.plane import PlaneCalibration, fit_plane
+from smartcam.cli.calibrating import STALE, calibrate
 from smartcam.emulator.scene import PIECES
 
 if TYPE_CHECKING:
@@ -92,6 +92,48 @@ def test_calibrate_in_the_terminal_asks_and_shows_errors(url: str, tmp_path: Pat
     assert "  - model " in done.out
     assert "from 6 points" in done.out
     assert "\ndone\n  name: plane\n  file: plane.json\n" in done.out
+
+
+def saved(folder: Path) -> None:
+    """Put a calibration of exact touches into the folder."""
+    marks = [PIECES[name][:2] for name in PIECES]
+    touched = [touch(name) for name in PIECES]
+    fit_plane(marks, touched, touch_sigma=0.0002, tool_z=(0, 0, -1)).save(folder / "plane.json")
+
+
+@pytest.mark.parametrize(("knock", "code"), [(0.0, 0), (0.003, STALE)])
+def test_calibrate_check_tells_by_its_exit_code(
+    url: str, tmp_path: Path, knock: float, code: int
+) -> None:
+    saved(tmp_path)
+    touches = [{**one, "x": one["x"] + knock} for one in TOUCHES]
+    lines = as_lines({"unit": "m"}, {}, {}, *touches, {})
+    done = calibrating(url, tmp_path, lines, "--json", "--check", "plane")
+    assert (done.code, done.err) == (code, "")
+    assert done.lines[-1]["result"]["stale"] is (code == STALE)
+    assert len((tmp_path / "plane.checks.jsonl").read_text().splitlines()) == 2
+
+
+def test_calibrate_check_in_the_terminal_shows_the_verdict(url: str, tmp_path: Path) -> None:
+    saved(tmp_path)
+    typed = [str(value) for value in TOUCHES[0].values()]
+    lines = ["m", "", "", "", *["n"] * 6, *typed, ""]
+    done = calibrating(url, tmp_path, lines, "--check", "plane").done()
+    assert "1. Is plane still true?  (:abort)" in done.out
+    assert ". plane still holds  (:undo, :abort)" in done.out
+    assert "\ndone\n  name: plane\n  stale: no\n  touches: 1\n" in done.out
+
+
+def test_calibrate_check_of_no_calibration_says_so_and_leaves_nothing(tmp_path: Path) -> None:
+    done = calibrating("bvs://127.0.0.1:9", tmp_path, [], "--check", "table")
+    done.failed(2, "no calibration 'table'; there are none: the folder is empty")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_calibrate_check_with_a_name_is_wrong_usage(tmp_path: Path) -> None:
+    done = calibrating("bvs://127.0.0.1:9", tmp_path, [], "--check", "a", "--name", "b")
+    assert done.code == 2
+    assert "--check names the calibration: no --name beside it" in done.err
 
 
 def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:

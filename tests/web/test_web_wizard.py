@@ -10,6 +10,7 @@ import aiohttp
 import pytest
 from sitekit import TOKEN
 
+from smartcam.calibration.drift import drift_wizard
 from smartcam.calibration.folder import Folder
 from smartcam.calibration.services import CalibrationService
 from smartcam.calibration.wizard import plane_wizard
@@ -63,8 +64,11 @@ async def served(folder: Path, token: str | None = None) -> AsyncIterator[World]
         ]
 
     inside = Folder(folder)
-    wizard = plane_wizard(localize=localize, save_to=inside.calibration)
-    service = CalibrationService(inside, [wizard])
+    wizards = (
+        plane_wizard(localize=localize, save_to=inside.calibration),
+        drift_wizard(localize=localize, find=inside.find, record_to=inside.checks),
+    )
+    service = CalibrationService(inside, wizards)
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     try:
         async with (
@@ -99,7 +103,7 @@ async def test_wizard_over_http_makes_a_calibration_that_transforms(tmp_path: Pa
         view = await run_through(world, view)
         assert (view["type"], view["result"]["points"]) == ("result", 4)
         assert (await world.call("GET", "/calibrations"))[1] == {
-            "calibrations": ["table"], "wizards": ["plane"], "name": "table",
+            "calibrations": ["table"], "wizards": ["plane", "drift"], "name": "table",
         }  # fmt: skip
         loaded = await world.post("/load", name="table")
         assert loaded == {"name": "table", "model": "rigid", "robot_frame": "base"}
@@ -108,6 +112,22 @@ async def test_wizard_over_http_makes_a_calibration_that_transforms(tmp_path: Pa
         exported = await world.post("/export", name="table", target="out.yaml")
     assert exported == {"file": "exports/out.yaml"}
     assert (tmp_path / "exports/out.yaml").read_text().startswith("%YAML 1.1\n")
+
+
+async def test_check_over_http_says_that_a_knocked_camera_s_calibration_is_stale(
+    tmp_path: Path,
+) -> None:
+    async with served(tmp_path) as world:
+        await run_through(world, await world.post("/start", name="table"))
+        view = await world.post("/start", name="table", wizard="drift")
+        assert (view["wizard"], view["title"]) == ("drift", "Is table still true?")
+        touches = [{"x": y + 0.002, "y": x, "z": 0.0} for x, y in MARKS]
+        for answers in ({"unit": "m"}, {}, {}, *touches):
+            view = await world.post("/step", token=view["token"], answers=answers)
+        assert view["title"] == "table is stale"
+        view = await world.post("/step", token=view["token"])
+        assert (view["type"], view["result"]["stale"]) == ("result", True)
+    assert {"table.journal", "table.drift.journal", "table.checks.jsonl"} < set(files(tmp_path))
 
 
 async def test_answer_made_again_changes_nothing(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 import pytest_asyncio
 from sitekit import TOKEN
-from test_web_wizard import MARKS, World, served
+from test_web_wizard import MARKS, World, run_through, served
 
 from smartcam.exceptions import NotRunningError
 
@@ -122,12 +122,36 @@ async def test_page_drives_the_wizard_to_a_calibration(page: Page, tmp_path: Pat
         assert await view.how_many("#plot .ellipse") == 4
         assert await view.how_many("#plot .worst") == 1
         assert await view.how_many("#plot .axis-robot") == 2
+        _, step = await view.world.call("GET", "/step")
+        assert await view.how_many("#plot .heat rect") == sum(map(len, step["preview"]["heat"]))
+        await view.see("#legend", "predicted error, 0.")
         await view.answer("What came out", next="accept")
         await view.answer("Save table")
         await view.see("#title", "Done")
         await view.see("#result", "table.json")
         await view.page.click("#again")
         await view.see("#names li", "table")
+
+
+async def test_page_checks_a_calibration(page: Page, tmp_path: Path) -> None:
+    async with opened(page, tmp_path) as view:
+        step = await view.world.post("/start", name="table")
+        await run_through(view.world, step)
+        await page.reload()
+        await page.click("#again")
+        await page.fill("#name", "table")
+        await page.check("#wizards [value=drift]")
+        await page.click("#start-form button")
+        await view.answer("Is table still true?", unit="m")
+        await view.answer("Marks in the camera's field")
+        await view.answer("Which ones will be touched?")
+        for x, y in MARKS:
+            await view.answer("Touch mark", x=y, y=x, z=0.0005)
+        await view.see("#title", "table still holds")
+        assert await view.how_many("#plot .touched") == 4
+        assert await view.how_many("#plot .heat") == 1
+        await view.answer("table still holds")
+        await view.see("#result", "table.checks.jsonl")
 
 
 async def test_page_shows_errors_at_their_inputs_and_keeps_what_was_typed(

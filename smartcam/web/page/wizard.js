@@ -3,6 +3,7 @@
 
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
+const WIZARDS = { plane: "calibrate", drift: "check whether it is still true" };
 let token = null;
 let view = null;
 
@@ -146,7 +147,16 @@ function start(state) {
   $("step").hidden = $("picture").hidden = true;
   $("start").hidden = false;
   $("names").replaceChildren(...state.calibrations.map((name) => make("li", {}, name)));
+  $("wizards").hidden = state.wizards.length < 2;
+  $("wizards").replaceChildren(make("legend", {}, "What to do"), ...state.wizards.map((name, index) => make("label", { class: "check" },
+    make("input", { type: "radio", name: "wizard", value: name, checked: index === 0 }), WIZARDS[name] ?? name)));
   $("name").focus();
+}
+
+// the wizard that is chosen; without wizards to choose from, the service's own
+function chosen() {
+  const one = document.querySelector("#wizards input:checked");
+  return one ? { wizard: one.value } : {};
 }
 
 // ---------------------------------------------------------------------- picture
@@ -171,13 +181,30 @@ function nice(value) {
   return [5, 2, 1].find((step) => step * power <= value) * power;
 }
 
-// whether a place belongs into the picture of some others
-function isNear(place, others) {
-  return [0, 1].every((axis) => {
-    const row = others.map((one) => one[axis]);
-    const [low, high] = [Math.min(...row), Math.max(...row)];
-    return place[axis] > 1.5 * low - 0.5 * high && place[axis] < 1.5 * high - 0.5 * low;
-  });
+// lower left and upper right corner of some places, with room around them
+function around(places) {
+  const [xs, ys] = [0, 1].map((axis) => places.map((one) => one[axis]));
+  const size = Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys)) || 1;
+  const room = 0.25 * size;
+  return [[Math.min(...xs) - room, Math.min(...ys) - room], [Math.max(...xs) + room, Math.max(...ys) + room]];
+}
+
+// cells over the view, rows from below, the stronger the larger the predicted error
+function heatMap(rows, [[left, bottom], [right, top]]) {
+  const [low, high] = spread(rows);
+  const [width, height] = [(right - left) / rows[0].length, (top - bottom) / rows.length];
+  const cells = rows.flatMap((row, number) => row.map((error, column) => shape("rect", {
+    x: left + column * width, y: -(bottom + (number + 1) * height), width, height,
+    "fill-opacity": high > low ? (0.05 + (0.45 * (error - low)) / (high - low)).toFixed(3) : 0.05,
+  })));
+  const group = shape("g", { class: "heat" });
+  group.append(...cells);
+  return group;
+}
+
+function spread(rows) {
+  const errors = rows.flat();
+  return [Math.min(...errors), Math.max(...errors)];
 }
 
 function draw(preview) {
@@ -190,17 +217,15 @@ function draw(preview) {
   const places = points.map((one) => (fitted ? one.at : one.camera));
   const origin = preview.camera_origin;
   const marks = fitted ? [] : preview.marks ?? [];
-  const all = next && !fitted ? [...places, ...marks, next] : [...places];
-  if (fitted && isNear(origin, places)) all.push(origin);
-  const [xs, ys] = [0, 1].map((axis) => all.map((one) => one[axis]));
-  const size = Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys)) || 1;
+  const box = fitted ? preview.view : around(next ? [...places, ...marks, next] : places);
+  const [[left, bottom], [right, top]] = box;
+  const size = Math.max(right - left, top - bottom) / 1.5;
   const margin = 0.25 * size;
-  const [left, right] = [Math.min(...xs) - margin, Math.max(...xs) + margin];
-  const [bottom, top] = [Math.min(...ys) - margin, Math.max(...ys) + margin];
   const dot = size / 90;
   const plot = $("plot");
   plot.setAttribute("viewBox", `${left} ${-top} ${right - left} ${top - bottom}`);
-  const parts = [];
+  const heat = fitted ? preview.heat : null;
+  const parts = heat ? [heatMap(heat, box)] : [];
   const line = (kind, [x, y], [dx, dy]) =>
     parts.push(shape("line", { class: kind, x1: x, y1: -y, x2: x + dx, y2: -(y + dy), "stroke-width": dot / 2.5 }));
   const label = (x, y, text) =>
@@ -249,7 +274,7 @@ function draw(preview) {
   }
   plot.replaceChildren(...parts);
   $("legend").textContent = fitted
-    ? `Dots: touched, the worst in red. Rings: where the camera says. Lines: residuals, dashes: predicted error of the mapped point (95 %), both ${factor} times as large. The robot's axes stand in the corner, the camera's at its origin.`
+    ? `Dots: touched, the worst in red. Rings: where the camera says. Lines: residuals, dashes: predicted error of the mapped point (95 %), both ${factor} times as large. The robot's axes stand in the corner, the camera's at its origin.${heat ? ` Colour, the stronger the larger: predicted error, ${spread(heat).map((error) => error.toFixed(3)).join(" to ")} mm rms.` : ""}`
     : "Marks in the camera's frame: rings are seen, dots are touched, the red ring is next.";
 }
 
@@ -268,7 +293,7 @@ $("start-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   $("start-error").textContent = "";
   try {
-    show(await call("POST", "/start", { name: $("name").value, fresh: $("fresh").checked }));
+    show(await call("POST", "/start", { ...chosen(), name: $("name").value, fresh: $("fresh").checked }));
     $("under").textContent = $("name").value;
   } catch (error) {
     $("start-error").textContent = error.message;

@@ -1,0 +1,152 @@
+"""Samples of a hand-eye calibration as MoveIt keeps them: where the hand was, what the camera saw.
+
+Its solver's tests have JSON, a list of pairs of (4, 4) matrices; its panel saves YAML, a list of
+mappings to 16 numbers, row by row.
+
+Source: github.com/moveit/moveit_calibration, ``pose_samples.json`` and
+``handeye_control_widget.cpp`` (published).
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.calibration.codes import Code
+from smartcam.calibration.formats.plain import (
+    Plain,
+    load_json,
+    load_yaml,
+    mapping,
+    number,
+    real,
+    rigid,
+    sequence,
+)
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.calibration.frames import Transform
+
+__all__ = [
+    "Sample",
+    "compose_json",
+    "compose_yaml",
+    "parse_json",
+    "parse_yaml",
+    "same_frames",
+]
+
+_HAND, _SEEN = "effector_wrt_world", "object_wrt_sensor"
+
+
+class Sample(NamedTuple):
+    """One stop of the robot.
+
+    Attributes:
+        hand: ``T_base_effector``, the effector's pose in the robot's base.
+        seen: ``T_camera_object``, the object's pose in the camera.
+    """
+
+    hand: Transform
+    seen: Transform
+
+
+def parse_json(text: str) -> list[Sample]:
+    """Return the samples of a JSON file; frames are base, effector, camera and object.
+
+    Raises:
+        CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID``.
+    """
+    pairs = [
+        sequence(pair, f"sample {index}", 2)
+        for index, pair in enumerate(sequence(load_json(text), "file"))
+    ]
+    return [_sample(_flat(hand), _flat(seen), index) for index, (hand, seen) in enumerate(pairs)]
+
+
+def parse_yaml(text: str) -> list[Sample]:
+    """Return the samples of a YAML file; frames are base, effector, camera and object.
+
+    Raises:
+        CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID``.
+        MissingExtraError: PyYAML is not installed.
+    """
+    pairs = [
+        mapping(pair, f"sample {index}", [_HAND, _SEEN])
+        for index, pair in enumerate(sequence(load_yaml(text), "file"))
+    ]
+    return [_sample(pair[_HAND], pair[_SEEN], index) for index, pair in enumerate(pairs)]
+
+
+def _flat(matrix: Plain) -> list[Plain]:
+    rows = [sequence(row, "matrix row", 4) for row in sequence(matrix, "matrix", 4)]
+    return [value for row in rows for value in row]
+
+
+def _sample(hand: Plain, seen: Plain, index: int) -> Sample:
+    return Sample(
+        _matrix("base", "effector", hand, f"sample {index}, hand"),
+        _matrix("camera", "object", seen, f"sample {index}, seen"),
+    )
+
+
+def _matrix(target: str, source: str, values: Plain, where: str) -> Transform:
+    read = [number(value, where) for value in sequence(values, where, 16)]
+    return rigid(target, source, [read[i : i + 4] for i in range(0, 16, 4)], where)
+
+
+def compose_json(samples: Sequence[Sample]) -> str:
+    """Return samples as JSON; the frames' names have no place in it.
+
+    Raises:
+        CalibrationError: ``WRONG_FRAME``: samples between other frames than the first one's.
+    """
+    _check(samples)
+    pairs = [[_rows(one.hand), _rows(one.seen)] for one in samples]
+    return f"[{','.join(chr(10) + json.dumps(pair) for pair in pairs)}\n]\n"
+
+
+def compose_yaml(samples: Sequence[Sample]) -> str:
+    """Return samples as YAML; the frames' names have no place in it.
+
+    Raises:
+        CalibrationError: ``WRONG_FRAME``: samples between other frames than the first one's.
+    """
+    _check(samples)
+    text = "".join(
+        f"- {_HAND}: [{_listed(one.hand)}]\n  {_SEEN}: [{_listed(one.seen)}]\n" for one in samples
+    )
+    return text or "[]\n"
+
+
+def _check(samples: Sequence[Sample]) -> None:
+    same_frames([one.hand for one in samples])
+    same_frames([one.seen for one in samples])
+
+
+def same_frames(transforms: Sequence[Transform]) -> None:
+    """See that all are between the same frames, since the file cannot tell.
+
+    Raises:
+        CalibrationError: ``WRONG_FRAME``.
+    """
+    for index, one in enumerate(transforms):
+        if (one.target, one.source) != (transforms[0].target, transforms[0].source):
+            raise CalibrationError(
+                f"number {index}: expected {transforms[0].label} as the first is, got {one.label}",
+                code=Code.WRONG_FRAME,
+                expected=transforms[0].label,
+                got=one.label,
+            )
+
+
+def _rows(transform: Transform) -> list[list[float]]:
+    rows = zip(transform.rotation.tolist(), transform.translation.tolist(), strict=True)
+    return [*([*row, shift] for row, shift in rows), [0.0, 0.0, 0.0, 1.0]]
+
+
+def _listed(transform: Transform) -> str:
+    return ", ".join(real(value) for row in _rows(transform) for value in row)

@@ -1,0 +1,137 @@
+"""What a front-end draws a picture of a wizard's touches from; JSON-able, metres.
+
+A picture of touches that no calibration was made of yet is in the camera's frame, any other one
+along the axes of the plane, from the centre of the touches that the calibration was made of.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.marks import Mark, Touch
+    from smartcam.calibration.plane import PlaneCalibration
+
+__all__ = ["CELLS", "before", "compared", "plain"]
+
+CELLS = 24
+"""Cells of the heat map along its longer side."""
+
+MARGIN = 0.25
+"""Of the extent of what is shown, around it."""
+
+
+def plain(touches: Sequence[Touch]) -> dict[str, Any]:
+    """Return touches as they are: ``points`` of ``label, feature, camera, robot``."""
+    points = [
+        {
+            "label": str(number) if one.what == "mark" else one.what,
+            "feature": one.mark.feature,
+            "camera": [one.mark.x, one.mark.y],
+            "robot": list(one.robot),
+        }
+        for number, one in enumerate(touches, 1)
+    ]
+    return {"points": points}
+
+
+def before(touches: Sequence[Touch], marks: Sequence[Mark], mark: Mark) -> dict[str, Any] | None:
+    """Return the same with the ``marks`` of a picture and the one to be touched ``next``.
+
+    None where no marks are given: the camera does not see what will be touched.
+    """
+    if not marks:
+        return None
+    return {
+        **plain(touches),
+        "marks": [[one.x, one.y] for one in marks],
+        "next": [mark.x, mark.y],
+    }
+
+
+def compared(
+    calibration: PlaneCalibration,
+    touches: Sequence[Touch],
+    seen: Array,
+    offsets: Array,
+    held_out: Array | None = None,
+    *,
+    worst: int,
+) -> dict[str, Any]:
+    """Return touches compared with what a calibration says.
+
+    Args:
+        calibration: the calibration.
+        touches: N of them.
+        seen: (N, 2), the points of the camera that belong to them.
+        offsets: (N, 3), touched minus mapped, metres.
+        held_out: (N, 3), touched minus what the other touches say; NaN or None: not known.
+        worst: index of the touch that stands out.
+
+    Returns:
+        What :func:`plain` does, each point with ``at``, ``residual``, ``held_out`` (or None) and
+        ``covariance`` (2 x 2, of the mapped point; None where no sigma is known); ``worst``,
+        ``camera_origin``, ``robot_axes``; ``view``, the lower left and upper right corner of what
+        is to be shown; ``heat``, rows of predicted errors in mm that cover the view, the lowest row
+        first, or None.
+    """
+    preview = plain(touches)
+    across = calibration.rotation.T
+    centre = calibration.robot_points.mean(axis=0)
+    errors = None if calibration.touch_sigma is None else calibration.covariance_at(seen)
+    for index, point in enumerate(preview["points"]):
+        left_out = None if held_out is None else (across @ held_out[index]).tolist()
+        point["at"] = (across @ (touches[index].robot - centre)).tolist()
+        point["residual"] = (across @ offsets[index]).tolist()
+        point["held_out"] = None if left_out is None or math.isnan(sum(left_out)) else left_out
+        point["covariance"] = (
+            None if errors is None else (across @ errors[index] @ across.T)[:2, :2].tolist()
+        )
+    origin = across @ (calibration.origin - centre)
+    at = np.array([one.robot for one in touches]).reshape(-1, 3)
+    view = _view(np.concatenate([calibration.robot_points, at]) - centre, across, origin)
+    return {
+        **preview,
+        "worst": worst,
+        "camera_origin": origin.tolist(),
+        "robot_axes": across.T.tolist(),
+        "view": view.tolist(),
+        "heat": None if errors is None else _heat(calibration, view, across, centre),
+    }
+
+
+def _view(points: Array, across: Array, origin: Array) -> Array:
+    """Return the corners of what is shown: the points, and the camera's origin if it is near."""
+    flat = (points @ across.T)[:, :2]
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    half = 0.5 * (high - low)
+    if (origin[:2] > low - half).all() and (origin[:2] < high + half).all():
+        low, high = np.minimum(low, origin[:2]), np.maximum(high, origin[:2])
+    margin = MARGIN * float((high - low).max())
+    return np.array([low - margin, high + margin])
+
+
+def _heat(
+    calibration: PlaneCalibration, view: Array, across: Array, centre: Array
+) -> list[list[float]] | None:
+    """Return the predicted errors at the middles of the view's cells, mm."""
+    low, extent = view[0], view[1] - view[0]
+    columns, rows = np.maximum(1, np.round(CELLS * extent / extent.max())).astype(int).tolist()
+    x = low[0] + extent[0] * (np.arange(columns) + 0.5) / columns
+    y = low[1] + extent[1] * (np.arange(rows) + 0.5) / rows
+    middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    try:
+        seen = calibration.inverse(middles @ across[:2] + centre)
+        errors = calibration.predicted_error(seen)
+    except CalibrationError:  # a part of the view is beyond the camera's horizon
+        return None
+    table: list[list[float]] = np.round(1e3 * errors, 5).reshape(rows, columns).tolist()
+    return table
