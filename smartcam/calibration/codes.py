@@ -84,8 +84,6 @@ class Code(enum.StrEnum):
     """Views of several targets where those of one are expected."""
     BAD_VIEW = "BAD_VIEW"
     """A view that fits far worse than the others; it is left out."""
-    UNSUPPORTED = "UNSUPPORTED"
-    """The OpenCV that is installed lacks what is needed."""
     POOR_COVERAGE = "POOR_COVERAGE"
     """The views show the target in too few places, sizes or tilts to tell the lens well."""
     SHEET_NOT_EXACT = "SHEET_NOT_EXACT"

@@ -18,6 +18,7 @@ from smartcam.cli import (
     picking,
     probing,
     recording,
+    sheets,
 )
 from smartcam.cli.options import (
     CONNECTS,
@@ -45,7 +46,8 @@ __all__ = ["command"]
 EPILOG = (
     "Exit codes: 0 done; 1 a fault of ours; 2 wrong usage, a bad layout text included; 3 no "
     "session: nothing listens, silence or garbage, connection lost; 4 a wait in a session ran "
-    "out; 5 the camera refused or is not running; 6 a result is not interpretable."
+    "out; 5 the camera refused or is not running; 6 a result is not interpretable; 7 a calibration "
+    "that was checked is stale."
 )
 
 
@@ -323,6 +325,7 @@ command.add_command(dissecting.dissector)
 command.add_command(recording.record)
 command.add_command(recording.replay)
 command.add_command(recording.pcap)
+command.add_command(sheets.sheet)
 
 
 def _then_show(

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from smartcam.calibration.geometry import Array
 
 __all__ = [
+    "AREA_DIAMETER",
+    "AREA_DISTANCE",
     "MAX_POINTS",
     "Charuco",
     "Checkerboard",
@@ -35,17 +37,27 @@ __all__ = [
 MAX_POINTS = 10_000
 """Of one target."""
 
+AREA_DISTANCE = 0.3
+"""Sides of a square from an outer corner of a checkerboard, along x and along y, to the middle of
+the round area outside of it."""
+
+AREA_DIAMETER = 0.3
+"""Of this area, sides of a square."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Checkerboard:
     """A checkerboard; its points are the corners where four squares meet.
 
+    The outermost square at the origin is black, and the squares reach from (-1, -1) to
+    (columns, rows) sides of one.
+
     Attributes:
         columns: corners along x, at least 3.
         rows: corners along y, at least 3.
         square: side of a square, metres.
-        origin_mark: a dense pattern stands outside of the outer corner next to the origin, and the
-            areas outside of the three other ones are white (thesis 3.2.3.2).
+        origin_mark: the area outside of the outer corner next to the origin is a black dot, and
+            those outside of the three other ones are white (thesis 3.2.3.2).
     """
 
     kind: ClassVar[str] = "checkerboard"
@@ -63,6 +75,23 @@ class Checkerboard:
     def points(self) -> Array:
         """(N, 3), metres, in the target's frame."""
         return _grid(self.columns, self.rows, self.square)
+
+    @property
+    def corner_areas(self) -> Array:
+        """(4, 2), metres: middles of the round areas outside of the outer corners.
+
+        The first is the origin's, the others follow counter-clockwise as one reads the sheet: at
+        the end of the ray A, opposite, at the end of the ray B.
+        """
+        low = -self.square * (1 + AREA_DISTANCE)
+        right = self.square * (self.columns + AREA_DISTANCE)
+        top = self.square * (self.rows + AREA_DISTANCE)
+        return np.array([[low, low], [right, low], [right, top], [low, top]])
+
+    @property
+    def corner_area_diameter(self) -> float:
+        """Of each of the ``corner_areas``, and of the origin's dot, metres."""
+        return AREA_DIAMETER * self.square
 
     @property
     def turned_alike(self) -> bool:
@@ -140,15 +169,15 @@ class CircleGrid:
     def __post_init__(self) -> None:
         _check_counts(self.kind, self.columns, self.rows)
         _check_lengths(self.kind, spacing=self.spacing, diameter=self.diameter)
-        largest = max(self.diameter, self.origin_diameter or 0.0)
+        between = (self.diameter + (self.origin_diameter or self.diameter)) / 2
         apart = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
-        if largest >= apart:
+        if between >= apart:
             raise CalibrationError(
-                f"circles: expected dots smaller than their distance ({apart:g} m), "
-                f"got a diameter of {largest:g} m",
+                f"circles: expected dots that do not touch each other at a distance of {apart:g} "
+                f"m, got a mean diameter of two neighbours of {between:g} m",
                 code=Code.SHAPE,
                 expected=apart,
-                got=largest,
+                got=between,
             )
         if self.origin_diameter is not None and self.origin_diameter <= self.diameter:
             raise CalibrationError(
@@ -211,8 +240,9 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:
-    x, y = np.meshgrid(np.arange(columns) * spacing, np.arange(rows) * spacing)
-    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    points = np.zeros((columns * rows, 3))
+    points[:, 0] = np.tile(np.arange(columns) * spacing, rows)
+    points[:, 1] = np.repeat(np.arange(rows) * spacing, columns)
     return points
 
 
