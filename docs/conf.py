@@ -394,7 +394,8 @@ def _constant_doc(module: Any, name: str) -> str:
     """Return the text that stands below a constant in the source."""
     body = ast.parse(inspect.getsource(module)).body
     for node, following in itertools.pairwise(body):
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name:
+        targets = getattr(node, "targets", [getattr(node, "target", None)])
+        if name in {getattr(target, "id", None) for target in targets}:
             text = getattr(getattr(following, "value", None), "value", "")
             return text if isinstance(text, str) else ""
     return ""

@@ -97,7 +97,8 @@ class Interpretation:
 
     Raises:
         ConfigurationError: the specification is wrong (a layout text with the position), or the
-            calibration is none, or cannot apply to what the specification gives.
+            calibration is none, or was made with y taken the other way, or cannot apply to what
+            the specification gives.
     """
 
     def __init__(self, spec: Any, *, lenient: bool, y_down: bool, calibration: Any = None) -> None:
@@ -117,7 +118,7 @@ class Interpretation:
                 self._by_application[application] = _way(resolve(one, lenient=lenient))
         else:
             self._one = _way(resolve(spec, lenient=lenient))
-        self._calibrations = None if calibration is None else _Calibrations(calibration)
+        self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None:
             if self._one is not None:
                 self._calibrations.check(None, self._one.interpreter)
@@ -238,16 +239,18 @@ class _Calibrations:
 
     Args:
         given: what ``calibration`` accepts, but None.
+        y_down: the camera's y axis points down.
 
     Raises:
-        ConfigurationError: it is no calibration, and no mapping from application ids to some.
+        ConfigurationError: it is no calibration, and no mapping from application ids to some; or
+            one that was made with y taken the other way.
     """
 
-    def __init__(self, given: Any) -> None:
+    def __init__(self, given: Any, y_down: bool) -> None:
         self._one: Calibration | None = None
         self._by_application: dict[int, Calibration | None] | None = None
         if hasattr(given, "to_robot") or not hasattr(given, "items"):
-            self._one = _calibration(given)
+            self._one = _calibration(given, y_down)
             return
         self._by_application = {}
         for application, one in given.items():
@@ -256,7 +259,7 @@ class _Calibrations:
                     f"calibration: a mapping goes from application id to a calibration or None; "
                     f"{application!r} is no id"
                 )
-            self._by_application[application] = None if one is None else _calibration(one)
+            self._by_application[application] = None if one is None else _calibration(one, y_down)
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
         """Raise where no value of an interpreter would ever pass.
@@ -337,13 +340,19 @@ class _Calibrations:
         return known[application]
 
 
-def _calibration(given: Any) -> Calibration:
-    """Return what was given; raise where it cannot be a calibration."""
+def _calibration(given: Any, y_down: bool) -> Calibration:
+    """Return what was given; raise where it is no calibration, or one that would mirror poses."""
     method = getattr(given, "to_robot", None)
     if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):
         raise ConfigurationError(
             "calibration: expected an object with a method to_robot(localizations) that is not "
             f"async, such as PlaneCalibration.load(FILE) gives, got {given!r:.80}"
+        )
+    made: object = getattr(given, "y_down", None)
+    if made is not None and made != y_down:
+        raise ConfigurationError(
+            f"calibration: it was made with y_down={made}, so with y_down={y_down} its poses would "
+            f"be mirrored; expected y_down={made}"
         )
     return cast("Calibration", given)
 

@@ -191,7 +191,8 @@ class Calibration(Protocol):
     """What brings localizations into a robot's frame.
 
     The option ``calibration`` takes any object with this method, such as a
-    :class:`~smartcam.calibration.PlaneCalibration`.
+    :class:`~smartcam.calibration.PlaneCalibration`. If it has an attribute ``y_down`` that is not
+    None, the camera's setting must be the same.
     """
 
     def to_robot(self, localizations: list[Localization], /) -> list[Localization]:

@@ -60,6 +60,7 @@ def drift_wizard(
     find: Callable[[str], Path],
     record_to: Callable[[str], Path],
     read_robot: ReadRobot | None = None,
+    y_down: bool | None = None,
 ) -> Wizard:
     """Return the wizard.
 
@@ -78,6 +79,8 @@ def drift_wizard(
         find: returns the file of a calibration by its name, or raises CalibrationError.
         record_to: returns the file of its checks.
         read_robot: reads the robot's pose; None: it is typed.
+        y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
+            known. A calibration that was made the other way is refused.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
@@ -86,9 +89,11 @@ def drift_wizard(
             localize=localize,
             read_robot=read_robot,
             feature=str(parameters.get("feature") or ""),
+            y_down=y_down,
         )
         about = await ask(
-            _about(name, parameters, typed=read_robot is None), partial(_loaded, find, name)
+            _about(name, parameters, typed=read_robot is None),
+            partial(_loaded, find, name, station),
         )
         check = _Check(name=name, about=about, station=station, record_to=record_to)
         return await check.run()
@@ -162,12 +167,15 @@ def _about(name: str, parameters: Mapping[str, Any], *, typed: bool) -> Step:
     )
 
 
-async def _loaded(find: Callable[[str], Path], name: str, answers: Answers) -> dict[str, Any]:
+async def _loaded(
+    find: Callable[[str], Path], name: str, station: Station, answers: Answers
+) -> dict[str, Any]:
     """Return what the file of a calibration holds, so that a check that is resumed has the same."""
     from smartcam.calibration.plane import PlaneCalibration
 
     file = find(name)
     calibration = PlaneCalibration.load(file)
+    station.check_y_down(calibration.y_down, f"{name} was made")
     if calibration.touch_sigma is None and answers["touch_sigma"] is None:
         raise CalibrationError(
             f"{name} does not tell how well a touch repeats: expected the touches' sigma",
@@ -217,6 +225,7 @@ class _Check:
         return np.array([(one.mark.x, one.mark.y) for one in self.touches])
 
     async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
+        self.station.check_y_down(self.calibration.y_down, f"{self.name} was made")
         rows = await self.station.picture(answers)
         wanted = self.calibration.camera_frame
         frames = {row["frame_id"] for row in rows} - {wanted}

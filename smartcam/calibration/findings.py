@@ -18,6 +18,8 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import NDArray
+
     from smartcam.calibration.choice import Candidates
     from smartcam.calibration.fitting import Fit, Frame, ModelName, Pairs
     from smartcam.calibration.geometry import Array
@@ -56,6 +58,7 @@ class Evidence(NamedTuple):
         place: centre and size of the points.
         nominal_scale: metres for each unit of the camera; None where it was not given.
         side: the cosine between tool and normal, None where the tool's axis was not given.
+        numbers: (N,), what texts call the points.
     """
 
     pairs: Pairs
@@ -68,6 +71,7 @@ class Evidence(NamedTuple):
     place: Frame
     nominal_scale: float | None
     side: float | None
+    numbers: NDArray[np.intp]
 
 
 def findings(evidence: Evidence) -> tuple[Remark, ...]:
@@ -143,7 +147,8 @@ def _planarity(evidence: Evidence) -> Iterator[Remark]:
             Code.NOT_PLANAR,
             f"the touched points lie {mm * math.sqrt(squared / count):.3g} mm rms out of a plane, "
             f"where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
-            f"point {worst} is the furthest, {mm * abs(float(out[worst])):.3g} mm",
+            f"point {evidence.numbers[worst]} is the furthest, "
+            f"{mm * abs(float(out[worst])):.3g} mm",
         )
 
 
@@ -157,8 +162,9 @@ def _fit(evidence: Evidence) -> Iterator[Remark]:
         residual = 1e3 * evidence.place.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
         yield Remark(
             Code.OUTLIER,
-            f"point {worst} fits far worse than the others: its residual of {residual:.3g} mm "
-            f"comes by chance once in {1 / max(chances[worst], 1e-12):.3g} touches",
+            f"point {evidence.numbers[worst]} fits far worse than the others: its residual of "
+            f"{residual:.3g} mm comes by chance once in {1 / max(chances[worst], 1e-12):.3g} "
+            "touches",
         )
         return
     noise = _noise(evidence, 0.0, 0)
@@ -232,7 +238,8 @@ def _held_out(evidence: Evidence) -> Iterator[Remark]:
     elif len(missing):
         yield Remark(
             Code.NOT_HELD_OUT,
-            f"without point {missing[0]} the others give no calibration: nothing checks it",
+            f"without point {evidence.numbers[missing[0]]} the others give no calibration: "
+            "nothing checks it",
         )
 
 

@@ -115,17 +115,21 @@ class Station:
         localize: takes a picture.
         read_robot: reads the robot's pose; None: it is typed.
         feature: only localizations of this name are marks; empty: all of them.
+        y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
+            known.
     """
 
     localize: Localize
     read_robot: ReadRobot | None
     feature: str = ""
+    y_down: bool | None = None
 
     async def picture(self, _answers: Answers) -> list[dict[str, Any]]:
         """Take a picture: the action of a step.
 
         Returns:
-            A row for each mark: ``feature_id, quality, photo_index, frame_id, x, y, theta``.
+            A row for each mark: ``feature_id, quality, photo_index, frame_id, x, y, theta,
+            y_down``.
 
         Raises:
             CalibrationError: TOO_FEW: no mark; SHAPE: more than :data:`MAX_MARKS`.
@@ -142,6 +146,7 @@ class Station:
                 "x": one.pose.position.x,
                 "y": one.pose.position.y,
                 "theta": one.pose.orientation.theta,
+                "y_down": self.y_down,
             }
             for one in found
             if self.feature in {"", one.feature_id}
@@ -155,6 +160,25 @@ class Station:
                 got=len(rows),
             )
         return rows
+
+    def check_y_down(self, before: bool | None, what: str) -> None:
+        """Raise where the camera's y axis is taken another way than before.
+
+        Args:
+            before: how it was taken then; None: not known.
+            what: what was made then, for people.
+
+        Raises:
+            CalibrationError: MIRRORED.
+        """
+        if None not in {before, self.y_down} and before != self.y_down:
+            raise CalibrationError(
+                f"{what} with y_down={before}, now it is {self.y_down}, and everything would be "
+                f"mirrored; expected y_down={before}",
+                code=Code.MIRRORED,
+                got=self.y_down,
+                expected=before,
+            )
 
     async def touch(
         self,

@@ -122,8 +122,13 @@ class MovingCamera:
             self._check_time(pose, image_at)
         motion = pose.undated() @ self._calibrated_at.undated().inverse()
         self._check_plane(motion)
-        camera_frame = self._static.camera_frame if isinstance(self._static, Chain) else None
-        return Chain([self._static, Moved(motion)], frame=pose.target, camera_frame=camera_frame)
+        static = self._static if isinstance(self._static, Chain) else Chain([self._static])
+        return Chain(
+            [self._static, Moved(motion)],
+            frame=pose.target,
+            camera_frame=static.camera_frame,
+            y_down=static.y_down,
+        )
 
     def _check_frames(self, pose: Transform) -> None:
         wanted = self._calibrated_at

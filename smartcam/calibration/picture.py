@@ -49,6 +49,7 @@ text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px }
 stroke-width: 2 }
 .camera-name { fill: #777 } .robot-name { fill: #1f5fbf }
 .touch { fill: #333 } .residual { stroke: #c0392b; stroke-width: 1.5 }
+.left-out { stroke: #777; stroke-width: 1.5 }
 .ellipse { fill: none; stroke: #7d3c98 } .part { stroke: #0b7a4b; fill: none; stroke-width: 1.5 }
 .part-name { fill: #0b7a4b }"""
 
@@ -78,7 +79,9 @@ def draw(
     Grey is the camera's frame, blue the directions of the robot's axes as they lie in the plane:
     the longer, the flatter they lie. Black points were touched; from each a red line goes to where
     the touch says that it is, its residual. The background is the predicted error, violet ellipses
-    hold 95 % of it. Where nothing tells how well points were touched, both are missing.
+    hold 95 % of it. Where nothing tells how well points were touched, both are missing. Points that
+    a robust fit left out are grey crosses, without residual and ellipse; one that lies far beyond
+    the others is not shown.
 
     Args:
         calibration: what is shown.
@@ -109,7 +112,11 @@ def draw(
 
 
 def _view(calibration: PlaneCalibration, parts: Array) -> _View:
-    shown = np.concatenate([calibration.camera_points, parts])
+    shown = np.concatenate([_counted(calibration), parts])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    half, others = 0.5 * (high - low), calibration.camera_points[[*calibration.outliers]]
+    near = others[((others > low - half) & (others < high + half)).all(axis=1)]
+    shown = np.concatenate([shown, near])
     low, high = shown.min(axis=0), shown.max(axis=0)
     margin = MARGIN * float((high - low).max())
     low, high = low - margin, high + margin
@@ -120,7 +127,7 @@ def _enlargement(calibration: PlaneCalibration, view: _View) -> float:
     """Return 1, 2 or 5 times a power of ten, by which the errors become well visible."""
     sizes = np.linalg.norm(_residuals(calibration), axis=1) * view.zoom
     if calibration.touch_sigma is not None:
-        ellipses = _ellipses(calibration, calibration.camera_points) * view.zoom
+        ellipses = _ellipses(calibration, _counted(calibration)) * view.zoom
         sizes = np.concatenate([sizes, np.linalg.norm(ellipses, axis=2).max(axis=1)])
     largest = float(sizes.max())
     if not largest > 1e-9 * WIDTH:
@@ -130,10 +137,16 @@ def _enlargement(calibration: PlaneCalibration, view: _View) -> float:
     return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
 
+def _counted(calibration: PlaneCalibration) -> Array:
+    """Return the camera's points that the calibration was made of, (N, 2)."""
+    counted: Array = calibration.camera_points[calibration.weights > 0.0]
+    return counted
+
+
 def _residuals(calibration: PlaneCalibration) -> Array:
-    """Return the residuals as the camera would see them, (N, 2)."""
-    touched: Array = calibration.inverse(calibration.robot_points)
-    return touched - calibration.camera_points
+    """Return the residuals of the points that count as the camera would see them, (N, 2)."""
+    touched: Array = calibration.inverse(calibration.robot_points[calibration.weights > 0.0])
+    return touched - _counted(calibration)
 
 
 def _ellipses(calibration: PlaneCalibration, points: Array) -> Array:
@@ -233,14 +246,22 @@ def _axis(start: Array, along: Array, kind: str, name: str) -> Iterator[str]:
 
 
 def _touches(calibration: PlaneCalibration, view: _View, larger: float) -> Iterator[str]:
-    points = calibration.camera_points
+    points = _counted(calibration)
     ends = view.pixels(points + larger * _residuals(calibration))
     if calibration.touch_sigma is not None:
         yield from _outlines(points, _ellipses(calibration, points), view, larger)
-    for number, (place, end) in enumerate(zip(view.pixels(points), ends, strict=True)):
+    numbers = 1 + np.flatnonzero(calibration.weights)
+    for number, place, end in zip(numbers, view.pixels(points), ends, strict=True):
         yield _line(place, end, "residual")
         yield f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="4" class="touch"/>'
-        yield _text(place, str(number + 1), beside=(7, -7))
+        yield _text(place, str(number), beside=(7, -7))
+    for index in calibration.outliers:
+        point = calibration.camera_points[index]
+        if (point > view.low).all() and (point < view.high).all():
+            place = view.pixels(point[None])[0]
+            for stroke in (np.array([5.0, 5.0]), np.array([5.0, -5.0])):
+                yield _line(place - stroke, place + stroke, "left-out")
+            yield _text(place, str(1 + index), beside=(7, -7))
 
 
 def _parts(
@@ -271,7 +292,9 @@ def _legend(calibration: PlaneCalibration, view: _View, larger: float, title: st
     if title:
         yield _text((BORDER, 30), title, "title")
     error = calibration.held_out_error
-    count = len(calibration.camera_points)
+    count = str(len(calibration.camera_points))
+    if calibration.outliers:
+        count = f"{len(_counted(calibration))} of {count}"
     yield _text(
         (BORDER, foot),
         f"{calibration.model}, {count} touches; held-out error "
@@ -279,7 +302,8 @@ def _legend(calibration: PlaneCalibration, view: _View, larger: float, title: st
     )
     yield _text(
         (BORDER, foot + 25),
-        f"residuals (red) and 95 % ellipses (violet) {larger:g} times larger than they are",
+        f"residuals (red) and 95 % ellipses (violet) {larger:g} times larger than they are"
+        + ("; crosses: left out" if calibration.outliers else ""),
     )
     bar, name = _bar(calibration, view)
     start = np.array([BORDER + WIDTH - 220 - bar, foot])

@@ -27,7 +27,7 @@ from smartcam.calibration.findings import Evidence, check_side, findings
 from smartcam.calibration.fitting import MODELS, Fit, Frame, ModelName, sensitivity
 from smartcam.calibration.geometry import as_points, as_vector
 from smartcam.calibration.mapping import PlaneMap
-from smartcam.calibration.robust import agreeing, renumbered
+from smartcam.calibration.robust import agreeing
 from smartcam.calibration.samples import (
     check_lever,
     check_positive,
@@ -114,7 +114,10 @@ class PlaneCalibration:
         height: of the plane over the touched one, metres; see :meth:`at_height`.
         robot_frame: name of the frame that poses are given in.
         camera_frame: name of the frame that they must come in; None for any.
-        warnings: what one should know before using it.
+        y_down: whether the camera's y axis pointed down and was turned up before the points came,
+            as :func:`smartcam.connect` does with ``y_down``; None: not known.
+        warnings: what one should know before using it; their texts number the points from 1, as
+            pictures and wizards do.
     """
 
     model: ModelName | Literal["touches"]
@@ -135,6 +138,7 @@ class PlaneCalibration:
     height: float = 0.0
     robot_frame: str = "robot"
     camera_frame: str | None = None
+    y_down: bool | None = None
     warnings: tuple[Remark, ...] = ()
 
     def __post_init__(self) -> None:
@@ -441,6 +445,7 @@ def fit_plane(
     robust: bool = False,
     robot_frame: str = "robot",
     camera_frame: str | None = None,
+    y_down: bool | None = None,
 ) -> PlaneCalibration:
     """Return the map from the camera's plane to the robot, fitted to points that both have seen.
 
@@ -465,6 +470,8 @@ def fit_plane(
             ``touch_sigma``: without it fewer are found, and only such as are further off.
         robot_frame: name of the frame that poses will be given in.
         camera_frame: name of the frame that localizations must come in; None for any.
+        y_down: whether the camera's y axis points down and was turned up before the points came;
+            None: not known. Kept, and compared where the calibration is used; nothing is turned.
 
     Raises:
         CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
@@ -507,6 +514,7 @@ def fit_plane(
         place=place,
         nominal_scale=nominal,
         side=None if side is None else check_side(plane.frame[:, 2], side),
+        numbers=1 + kept,
     )
     estimate = _estimated(fitted, pairs.weights)
     if robust and touch_sigma is None and estimate is not None:
@@ -538,7 +546,8 @@ def fit_plane(
         tool_z=side,
         robot_frame=robot_frame,
         camera_frame=camera_frame,
-        warnings=tuple(renumbered(findings(evidence), kept)),
+        y_down=y_down,
+        warnings=findings(evidence),
     )
     remarks = [_left_out(found, index, parts[index]) for index in found.outliers]
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
@@ -558,8 +567,8 @@ def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
     variance += float(found.predicted_error(found.camera_points[index : index + 1])[0]) ** 2
     return Remark(
         Code.OUTLIER,
-        f"point {index} is left out: it lies {1e3 * distance:.3g} mm from where the others say, "
-        f"where touching explains {1e3 * math.sqrt(variance):.3g} mm rms",
+        f"point {1 + index} is left out: it lies {1e3 * distance:.3g} mm from where the others "
+        f"say, where touching explains {1e3 * math.sqrt(variance):.3g} mm rms",
     )
 
 

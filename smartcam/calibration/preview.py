@@ -14,7 +14,7 @@ import numpy as np
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from smartcam.calibration.geometry import Array
     from smartcam.calibration.marks import Mark, Touch
@@ -65,6 +65,7 @@ def compared(
     held_out: Array | None = None,
     *,
     worst: int,
+    left_out: Collection[int] = (),
 ) -> dict[str, Any]:
     """Return touches compared with what a calibration says.
 
@@ -75,29 +76,37 @@ def compared(
         offsets: (N, 3), touched minus mapped, metres.
         held_out: (N, 3), touched minus what the other touches say; NaN or None: not known.
         worst: index of the touch that stands out.
+        left_out: indices of touches that do not count.
 
     Returns:
-        What :func:`plain` does, each point with ``at``, ``residual``, ``held_out`` (or None) and
-        ``covariance`` (2 x 2, of the mapped point; None where no sigma is known); ``worst``,
-        ``camera_origin``, ``robot_axes``; ``view``, the lower left and upper right corner of what
-        is to be shown; ``heat``, rows of predicted errors in mm that cover the view, the lowest row
-        first, or None.
+        What :func:`plain` does, each point with ``at``, ``residual``, ``left_out``, ``held_out``
+        (or None) and ``covariance`` (2 x 2, of the mapped point; None where no sigma is known);
+        ``worst``, ``camera_origin``, ``robot_axes``; ``view``, the lower left and upper right
+        corner of what is to be shown; ``heat``, rows of predicted errors in mm that cover the
+        view, the lowest row first, or None.
     """
     preview = plain(touches)
     across = calibration.rotation.T
-    centre = calibration.robot_points.mean(axis=0)
+    counted = calibration.robot_points[calibration.weights > 0.0]
+    centre = counted.mean(axis=0)
     errors = None if calibration.touch_sigma is None else calibration.covariance_at(seen)
     for index, point in enumerate(preview["points"]):
-        left_out = None if held_out is None else (across @ held_out[index]).tolist()
+        without = None if held_out is None else (across @ held_out[index]).tolist()
+        out = index in left_out
         point["at"] = (across @ (touches[index].robot - centre)).tolist()
         point["residual"] = (across @ offsets[index]).tolist()
-        point["held_out"] = None if left_out is None or math.isnan(sum(left_out)) else left_out
+        point["left_out"] = out
+        point["held_out"] = None if out or without is None or math.isnan(sum(without)) else without
         point["covariance"] = (
-            None if errors is None else (across @ errors[index] @ across.T)[:2, :2].tolist()
+            None if out or errors is None else (across @ errors[index] @ across.T)[:2, :2].tolist()
         )
     origin = across @ (calibration.origin - centre)
     at = np.array([one.robot for one in touches]).reshape(-1, 3)
-    view = _view(np.concatenate([calibration.robot_points, at]) - centre, across, origin)
+    off = np.isin(np.arange(len(at)), [*left_out])
+    view = _view(
+        across @ (np.concatenate([counted, at[~off]]) - centre).T,
+        np.column_stack([origin, across @ (at[off] - centre).T]),
+    )
     return {
         **preview,
         "worst": worst,
@@ -108,13 +117,14 @@ def compared(
     }
 
 
-def _view(points: Array, across: Array, origin: Array) -> Array:
-    """Return the corners of what is shown: the points, and the camera's origin if it is near."""
-    flat = (points @ across.T)[:, :2]
-    low, high = flat.min(axis=0), flat.max(axis=0)
+def _view(points: Array, others: Array) -> Array:
+    """Return the corners of what is shown: the points (3, N), and others (3, K) that are near."""
+    low, high = points[:2].min(axis=1), points[:2].max(axis=1)
     half = 0.5 * (high - low)
-    if (origin[:2] > low - half).all() and (origin[:2] < high + half).all():
-        low, high = np.minimum(low, origin[:2]), np.maximum(high, origin[:2])
+    flat = others[:2].T
+    near = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
+    shown = np.vstack([low, high, near])
+    low, high = shown.min(axis=0), shown.max(axis=0)
     margin = MARGIN * float((high - low).max())
     return np.array([low - margin, high + margin])
 

@@ -18,20 +18,19 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from smartcam.calibration.chance import Noise
 from smartcam.calibration.choice import NEGLIGIBLE, squares
-from smartcam.calibration.codes import Code, Remark
+from smartcam.calibration.codes import Code
 from smartcam.calibration.extra import load
 from smartcam.calibration.fitting import MODELS, Fit, ModelName, Pairs, apply, fit, sensitivity
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 
     Mask = NDArray[np.bool_]
 
-__all__ = ["LEAST_POINTS", "MOST_SUBSETS", "agreeing", "renumbered"]
+__all__ = ["LEAST_POINTS", "MOST_SUBSETS", "agreeing"]
 
 LEAST_POINTS = 6
 """Below it the points that agree are hardly more than a map has need of."""
@@ -143,20 +142,6 @@ def agreeing(
     mask = np.empty(count, dtype=np.bool_)
     mask[order] = found.mask
     return mask
-
-
-def renumbered(remarks: Iterable[Remark], numbers: NDArray[np.intp]) -> list[Remark]:
-    """Return remarks about some of the points with the points' numbers among all.
-
-    Args:
-        remarks: that speak of ``point 0`` to ``point n - 1``.
-        numbers: (n,), what these are among all.
-    """
-
-    def among_all(found: re.Match[str]) -> str:
-        return f"point {numbers[int(found[1])]}"
-
-    return [Remark(one.code, re.sub(r"\bpoint (\d+)", among_all, one.text)) for one in remarks]
 
 
 def _about_median(camera: Array, robot: Array, weights: Array) -> tuple[Pairs, float]:

@@ -334,6 +334,8 @@ class Chain:
         solvers: in the order in which they are applied.
         frame: name of the frame that they lead to; it stands in the headers of :meth:`to_robot`.
         camera_frame: name of the frame that localizations must come in; None for any.
+        y_down: whether the camera's y axis points down and is turned up before they come, as
+            :func:`smartcam.connect` does and compares; None: not known.
     """
 
     def __init__(
@@ -342,14 +344,21 @@ class Chain:
         *,
         frame: str = "robot",
         camera_frame: str | None = None,
+        y_down: bool | None = None,
     ) -> None:
         self.solvers: tuple[Solver, ...] = tuple(solvers)
         self.frame: str = frame
         self.camera_frame: str | None = camera_frame
+        self.y_down: bool | None = y_down
 
     def then(self, *solvers: Solver) -> Chain:
         """Return a chain with these behind its own."""
-        return Chain([*self.solvers, *solvers], frame=self.frame, camera_frame=self.camera_frame)
+        return Chain(
+            [*self.solvers, *solvers],
+            frame=self.frame,
+            camera_frame=self.camera_frame,
+            y_down=self.y_down,
+        )
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses behind the last solver."""
@@ -418,9 +427,10 @@ def chain_of(
         are ignored.
     """
     frame, camera_frame = calibration.robot_frame, calibration.camera_frame
+    y_down = calibration.y_down
     if calibration.model in {"affine", "homography"}:
         projection = PlaneProjection(calibration.matrix)
-        return Chain([projection], frame=frame, camera_frame=camera_frame)
+        return Chain([projection], frame=frame, camera_frame=camera_frame, y_down=y_down)
     sheet = np.array(origin, dtype=np.float64).reshape(2)
     turned = matrix_from_quaternion(quaternion_about_z(theta))
     return Chain(
@@ -430,4 +440,5 @@ def chain_of(
         ],
         frame=frame,
         camera_frame=camera_frame,
+        y_down=y_down,
     )

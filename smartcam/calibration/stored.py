@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictBool, ValidationError
 
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.fitting import Frame, ModelName
@@ -71,6 +71,7 @@ class PlaneData(_Stored):
     height: FiniteFloat = Field(0.0, description="over the touched plane, m")
     robot_frame: str
     camera_frame: str | None = None
+    y_down: StrictBool | None = Field(None, description="y was turned up; null: not known")
     warnings: list[RemarkData]
 
 
@@ -105,6 +106,7 @@ def to_data(calibration: PlaneCalibration) -> dict[str, Any]:
         "height": calibration.height,
         "robot_frame": calibration.robot_frame,
         "camera_frame": calibration.camera_frame,
+        "y_down": calibration.y_down,
         "warnings": [{"code": one.code.value, "text": one.text} for one in calibration.warnings],
     }
 
@@ -144,6 +146,7 @@ def from_data(data: Mapping[str, Any]) -> PlaneCalibration:
         height=stored.height,
         robot_frame=stored.robot_frame,
         camera_frame=stored.camera_frame,
+        y_down=stored.y_down,
         warnings=tuple(Remark(one.code, one.text) for one in stored.warnings),
     )
 

@@ -68,6 +68,7 @@ def fit_touches(
     tool_z: ArrayLike | None = None,
     robot_frame: str = "robot",
     camera_frame: str | None = None,
+    y_down: bool | None = None,
 ) -> PlaneCalibration:
     """Return the map from the camera's plane to the robot, from touches of the sheet's rays.
 
@@ -85,6 +86,8 @@ def fit_touches(
         tool_z: (3,), direction of the tool's axis, into the plane, when it touched.
         robot_frame: name of the frame that poses will be given in.
         camera_frame: name of the frame that localizations must come in; None for any.
+        y_down: whether the camera's y axis points down and was turned up before the origin came;
+            None: not known. Kept, and compared where the calibration is used; nothing is turned.
 
     Returns:
         A calibration with the model ``touches``. Its camera points are where the touches are on
@@ -145,6 +148,7 @@ def fit_touches(
         tool_z=axis,
         robot_frame=robot_frame,
         camera_frame=camera_frame,
+        y_down=y_down,
         warnings=_remarks(sheet, freedom, touch_sigma, nominal_scale, side),
     )
 

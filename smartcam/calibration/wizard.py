@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam.calibration.codes import Code
 from smartcam.calibration.marks import SIGMA, UNIT, Mark, Station, Touch, choose, with_default
 from smartcam.calibration.preview import before, compared, plain
+from smartcam.calibration.robust import LEAST_POINTS
 from smartcam.calibration.sequence import Wizard, ask
 from smartcam.calibration.steps import Number, Option, Step, Text
 from smartcam.calibration.store import write
@@ -56,8 +57,16 @@ _SIDES: Mapping[str, tuple[float, float, float] | None] = {
 }
 
 
+_SIGNS_OF_OUTLIERS = frozenset({Code.OUTLIER, Code.POOR_FIT, Code.NOT_PLANAR})
+"""Warnings after which points may be left out; two that are wrong can hide each other."""
+
+
 def plane_wizard(
-    *, localize: Localize, save_to: Callable[[str], Path], read_robot: ReadRobot | None = None
+    *,
+    localize: Localize,
+    save_to: Callable[[str], Path],
+    read_robot: ReadRobot | None = None,
+    y_down: bool | None = None,
 ) -> Wizard:
     """Return the wizard.
 
@@ -66,12 +75,15 @@ def plane_wizard(
     ``tool``, ``unit`` (mm, m), ``side``, ``touch_sigma`` (mm); ``feature``: only marks of this name
     count.
 
-    Its result: ``name, file, model, points, residual_mm, held_out_mm, predicted_mm, remarks``.
+    Its result: ``name, file, model, points, left_out`` (numbers of points, from 1)``, residual_mm,
+    held_out_mm, predicted_mm, remarks``. Points left out count in none of the errors.
 
     Args:
         localize: takes a picture.
         save_to: returns the file for a name.
         read_robot: reads the robot's pose; None: it is typed.
+        y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
+            known. It is kept with the calibration, and the same for all of its pictures.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
@@ -83,6 +95,7 @@ def plane_wizard(
                 localize=localize,
                 read_robot=read_robot,
                 feature=str(parameters.get("feature") or ""),
+                y_down=y_down,
             ),
         )
         calibration = await (work.rays() if about["method"] == "rays" else work.marks())
@@ -172,8 +185,20 @@ class _Work:
         self._station = station
         self._marks: list[Mark] = []
         self._points: list[Touch] = []
+        self._y_down: bool | None = None
+        self._robust = False
 
     # ------------------------------------------------------------------ what is done
+
+    async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
+        self._station.check_y_down(self._y_down, "the picture before was taken")
+        return await self._station.picture(answers)
+
+    def _seen(self, rows: Sequence[Mapping[str, Any]]) -> list[Mark]:
+        """Return the marks of a picture, and remember which way its y axis was taken."""
+        told = [row.get("y_down") for row in rows]
+        self._y_down = next((one for one in told if one is not None), self._y_down)
+        return [Mark.of(row) for row in rows]
 
     async def save(
         self, file: Path, calibration: PlaneCalibration, _answers: Answers
@@ -245,8 +270,8 @@ class _Work:
             "must not hide the origin mark.",
             button="Take a picture",
         )
-        rows = (await ask(step, self._station.picture)).outcome
-        origin = await _choose_origin([Mark.of(row) for row in rows])
+        rows = (await ask(step, self._picture)).outcome
+        origin = await _choose_origin(self._seen(rows))
         for letter, what in (
             ("O", "the origin mark"),
             ("A", "a point of ray A, as far out as it goes"),
@@ -291,6 +316,8 @@ class _Work:
                 case "remove":
                     del self._points[index]
                     picture = len(self._points) < 3
+                case "robust" | "all":
+                    self._robust = choice["next"] == "robust"
                 case _:
                     pass
 
@@ -305,8 +332,8 @@ class _Work:
             button="Take a picture",
             notes=(f"{done} points so far",) if done else (),
         )
-        rows = (await ask(step, self._station.picture)).outcome
-        marks = await choose([Mark.of(row) for row in rows])
+        rows = (await ask(step, self._picture)).outcome
+        marks = await choose(self._seen(rows))
         if done + len(marks) > MAX_POINTS:
             raise CalibrationError(
                 f"{done + len(marks)} points, expected {MAX_POINTS} at most",
@@ -327,11 +354,15 @@ class _Work:
             "redo": "touch a point again",
             "remove": "remove a point",
         }
-        worst = 1
+        point = 1
         if calibration is None:
             del options["accept"]
         else:
-            worst = int(calibration.worst) + 1
+            point = 1 + min(calibration.outliers, default=calibration.worst)
+        if self._robust:
+            options["all"] = "count all points, also those that do not agree with the others"
+        elif count >= LEAST_POINTS and _doubtful(calibration):
+            options["robust"] = "leave out the points that do not agree with the others"
         return Step(
             id="review",
             title="What came out",
@@ -340,11 +371,11 @@ class _Work:
                 Option(name="next", label="What next", options=options),
                 Number(
                     name="point",
-                    label="Point, for the last two; the worst one stands there",
+                    label="Point, to touch again or to remove; the worst one stands there",
                     integer=True,
                     minimum=1,
                     maximum=count,
-                    default=worst,
+                    default=point,
                 ),
             ),
             preview=self.preview(calibration),
@@ -378,6 +409,7 @@ class _Work:
             tool_z=self._tool_z(),
             robot_frame=self._about["robot_frame"],
             camera_frame=self._about["camera_frame"] or None,
+            y_down=self._y_down,
         )
 
     def _try_fit(self) -> tuple[PlaneCalibration | None, list[str]]:
@@ -390,8 +422,10 @@ class _Work:
                 touch_sigma=self._sigma(),
                 nominal_scale=1.0 if self._about["camera_unit"] == "m" else None,
                 tool_z=self._tool_z(),
+                robust=self._robust and len(self._points) >= LEAST_POINTS,
                 robot_frame=self._about["robot_frame"],
                 camera_frame=self._about["camera_frame"] or None,
+                y_down=self._y_down,
             )
         except CalibrationError as exc:
             return None, [f"{exc.code}: {exc}"]
@@ -408,19 +442,29 @@ class _Work:
             calibration.residuals,
             calibration.leave_one_out,
             worst=calibration.worst,
+            left_out=calibration.outliers,
         )
 
 
+def _doubtful(calibration: PlaneCalibration | None) -> bool:
+    """Return whether a point or more may be wrong."""
+    if calibration is None:
+        return True
+    return any(remark.code in _SIGNS_OF_OUTLIERS for remark in calibration.warnings)
+
+
 def _figures(calibration: PlaneCalibration) -> dict[str, Any]:
-    residual = math.sqrt(float((calibration.residuals**2).sum(axis=1).mean()))
+    counted = calibration.weights > 0.0
+    residual = math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
     held_out = calibration.held_out_error
     predicted = None
     if calibration.touch_sigma is not None:
-        at_points = calibration.predicted_error(calibration.camera_points)
+        at_points = calibration.predicted_error(calibration.camera_points[counted])
         predicted = 1e3 * math.sqrt(float((at_points**2).mean()))
     return {
         "model": calibration.model,
-        "points": len(calibration.robot_points),
+        "points": int(counted.sum()),
+        "left_out": [1 + index for index in calibration.outliers],
         "residual_mm": 1e3 * residual,
         "held_out_mm": None if held_out is None else 1e3 * held_out,
         "predicted_mm": predicted,
@@ -431,7 +475,9 @@ def _figures(calibration: PlaneCalibration) -> dict[str, Any]:
 def _summary(calibration: PlaneCalibration) -> list[str]:
     """Return what people should know of a calibration, a line each."""
     figures = _figures(calibration)
-    lines = [f"model {figures['model']} from {figures['points']} points"]
+    left_out = len(figures["left_out"])
+    of = f" of {figures['points'] + left_out}" if left_out else ""
+    lines = [f"model {figures['model']} from {figures['points']}{of} points"]
     lines.append(f"residual {figures['residual_mm']:.3f} mm rms: how well the points fit")
     if figures["held_out_mm"] is not None:
         lines.append(

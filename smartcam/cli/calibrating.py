@@ -130,7 +130,7 @@ def calibrate(
             service = _service(url, folder, options)
             try:
                 if check is not None:
-                    service.folder.find(check)
+                    options.check_y_down(service.load(check), f"--check {check}")
                 service.start(
                     check or name or KIND,
                     KIND if check is None else WIZARD,
@@ -180,8 +180,13 @@ def _service(url: str, folder: str, options: Options) -> CalibrationService:
     except OSError as exc:
         raise ConfigurationError(f"--folder {folder}: {exc.strerror}") from exc
     wizards = (
-        plane_wizard(localize=localize, save_to=inside.calibration),
-        drift_wizard(localize=localize, find=inside.find, record_to=inside.checks),
+        plane_wizard(localize=localize, save_to=inside.calibration, y_down=options.y_down),
+        drift_wizard(
+            localize=localize,
+            find=inside.find,
+            record_to=inside.checks,
+            y_down=options.y_down,
+        ),
     )
     return CalibrationService(inside, wizards)
 
@@ -326,7 +331,7 @@ def _end_text(view: Mapping[str, Any]) -> str:
 
 def _result_text(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(map(_result_text, value))
+        return ", ".join(map(_result_text, value)) or "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else "-" if value is None else str(value)

@@ -177,6 +177,22 @@ class Options:
         """Return the bound of a step, seconds."""
         return default if self.timeout is None else self.timeout
 
+    def check_y_down(self, calibration: PlaneCalibration, what: str) -> None:
+        """Raise where ``--y-down`` is not as it was when a calibration was made.
+
+        Args:
+            calibration: the calibration.
+            what: the option that names it.
+
+        Raises:
+            ConfigurationError: says what to do with ``--y-down``.
+        """
+        if calibration.y_down is not None and calibration.y_down != self.y_down:
+            made, then = ("with", "give it") if calibration.y_down else ("without", "leave it out")
+            raise ConfigurationError(
+                f"{what}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
+            )
+
     @contextmanager
     def camera(self, url: str) -> Iterator[SmartCamera]:
         """Give an unopened camera; the trace file is open around it.
@@ -186,6 +202,8 @@ class Options:
             ConfigurationError: a file cannot be opened, or an option cannot work.
         """
         calibration = None if self.calibration is None else _calibration(self.calibration)
+        if calibration is not None:
+            self.check_y_down(calibration, f"--calibration {self.calibration}")
         with self.tracing() as trace:
             yield connect(
                 camera_url(url),

@@ -37,7 +37,13 @@ def calibrated(seed: int = 1, sigma: float | None = SIGMA, **options: Any) -> Pl
 
 
 def begin(
-    tmp_path: Path, bench: Bench, *, reads: bool = False, journal: Path | None = None, **more: Any
+    tmp_path: Path,
+    bench: Bench,
+    *,
+    reads: bool = False,
+    journal: Path | None = None,
+    y_down: bool | None = None,
+    **more: Any,
 ) -> Session:
     folder = Folder(tmp_path)
     wizard = drift_wizard(
@@ -45,6 +51,7 @@ def begin(
         find=folder.find,
         record_to=folder.checks,
         read_robot=bench.read_robot if reads else None,
+        y_down=y_down,
     )
     opened = None if journal is None else Journal(journal)
     return Session(wizard, opened, parameters={"name": "table", **more})
@@ -168,6 +175,48 @@ async def test_check_resumed_uses_the_calibration_that_it_began_with(tmp_path: P
     session = begin(tmp_path, bench, journal=journal)
     view = await touch(session, bench)
     assert view["title"] == "table still holds"
+    session.close()
+
+
+async def test_check_with_another_y_down_than_the_calibration_keeps_the_step(
+    tmp_path: Path,
+) -> None:
+    saved(tmp_path, calibrated(y_down=True))
+    session = begin(tmp_path, Bench(), y_down=False)
+    view = await session.submit(session.token)
+    assert (view["step"], view["errors"]) == ("about", {
+        "base": "table was made with y_down=True, now it is False, and everything would be "
+        "mirrored; expected y_down=True"
+    })  # fmt: skip
+    session.close()
+
+
+async def test_check_resumed_with_another_y_down_takes_no_picture(tmp_path: Path) -> None:
+    saved(tmp_path, calibrated(y_down=False))
+    bench, journal = Bench(GRID[:1]), tmp_path / "table.drift.journal"
+    session = begin(tmp_path, bench, journal=journal, y_down=False)
+    await say(session)
+    session.close()
+    session = begin(tmp_path, bench, journal=journal, y_down=True)
+    view = await session.submit(session.token)
+    assert view["errors"]["base"].startswith("table was made with y_down=False, now it is True")
+    assert bench.pictures == 0
+    session.close()
+
+
+async def test_check_of_a_calibration_with_a_point_left_out_does_not_count_it(
+    tmp_path: Path,
+) -> None:
+    touched = np.array([where(*mark) for mark in GRID])
+    touched[4] += 1000.0
+    saved(tmp_path, fit_plane(GRID, touched, touch_sigma=SIGMA, robust=True))
+    bench = Bench([GRID[4]], SIGMA)
+    session = begin(tmp_path, bench)
+    await say(session)
+    view = await touch(session, bench)
+    assert view["title"] == "table still holds"
+    assert np.ptp(view["preview"]["view"], axis=0).max() < 0.5
+    assert [one["left_out"] for one in view["preview"]["points"]] == [False]
     session.close()
 
 

@@ -162,6 +162,14 @@ def test_moving_camera_takes_the_poses_of_its_own_camera_only() -> None:
         one.now(FLANGE).to_robot([localization(0, 0)])
 
 
+def test_moving_camera_knows_the_y_down_of_its_chain() -> None:
+    field = TABLE_POSE.apply(TABLE)
+    static = Chain([], y_down=True)
+    assert MovingCamera(static, FLANGE, field=field).now(FLANGE).y_down is True
+    alone = MovingCamera(Moved(FLANGE), FLANGE, field=field)
+    assert (alone.now(FLANGE).y_down, alone.now(FLANGE).camera_frame) == (None, None)
+
+
 def test_moving_camera_field_that_is_no_plane_is_refused() -> None:
     static = Chain([])
     with refused("TOO_FEW", "3 points of the field or more, got 2"):

@@ -100,6 +100,32 @@ def test_picture_ellipse_of_many_touches_is_a_circle_of_95_percent() -> None:
     np.testing.assert_allclose(radii, 2e-4 / 3 * 2.4477 * larger * zoom, rtol=0.01)
 
 
+@pytest.mark.parametrize("far", [1e-2, 1000.0])
+def test_picture_of_points_left_out_has_crosses_and_else_nothing_of_them(far: float) -> None:
+    touched = np.array(calibration().robot_points)
+    touched[8] += far
+    one = fit_plane(GRID, touched, model="similarity", touch_sigma=2e-4, robust=True)
+    picture = draw(one)
+    assert one.outliers == (8,)
+    assert len(elements(picture, "left-out")) == 2
+    assert [len(elements(picture, kind)) for kind in ("touch", "residual", "ellipse")] == [8, 8, 8]
+    assert [text for text in texts(picture) if text.isdecimal()] == [*map(str, range(1, 10))]
+    assert any(text.startswith("similarity, 8 of 9 touches;") for text in texts(picture))
+    assert any(text.endswith("larger than they are; crosses: left out") for text in texts(picture))
+    assert enlargement(picture) >= 50
+
+
+def test_picture_of_a_mark_seen_far_away_and_left_out_does_not_show_it() -> None:
+    seen = GRID.copy()
+    seen[3] += 100.0
+    one = fit_plane(
+        seen, calibration().robot_points, model="similarity", touch_sigma=2e-4, robust=True
+    )
+    assert one.outliers == (3,)
+    assert elements(draw(one), "left-out") == []
+    assert len(elements(draw(one), "touch")) == 8
+
+
 def test_picture_without_a_sigma_has_no_errors_to_show() -> None:
     touched = GRID[[0, 2, 6]] @ ROTATION[:, :2].T
     one = fit_plane(GRID[[0, 2, 6]], touched, model="affine")

@@ -89,7 +89,7 @@ def test_fit_plane_auto_leaves_out_a_model_that_is_not_determined() -> None:
     found = fit_plane(marks, SCENE.touched(marks, 1), tool_z=DOWN, touch_sigma=SIGMA)
     assert found.model == "similarity"
     assert found.candidates["homography"] is None
-    assert "without point 4 the others give no" in said(found, "NOT_HELD_OUT")
+    assert "without point 5 the others give no" in said(found, "NOT_HELD_OUT")
 
 
 def test_fit_plane_weights_count_like_repeated_touches() -> None:
@@ -149,7 +149,7 @@ def test_fit_plane_with_a_bump_of_2_mm_names_it(index: int) -> None:
     touches = SCENE.touched(GRID, 1)
     touches[index] += 0.002 * SCENE.turn[:, 2]
     text = said(fit_plane(GRID, touches, touch_sigma=SIGMA, tool_z=DOWN), "NOT_PLANAR")
-    assert f"point {index} is the furthest" in text
+    assert f"point {1 + index} is the furthest" in text
 
 
 def test_fit_plane_with_a_bump_of_1_mm_in_the_middle_usually_warns() -> None:
@@ -168,7 +168,7 @@ def test_fit_plane_with_an_outlier_names_it() -> None:
     for sigma in (None, SIGMA):
         found = fit_plane(GRID, touches, touch_sigma=sigma, tool_z=DOWN, model="similarity")
         assert found.worst == 7
-        assert "point 7 fits far worse" in said(found, "OUTLIER")
+        assert "point 8 fits far worse" in said(found, "OUTLIER")
 
 
 def test_fit_plane_with_worse_touches_than_given_warns() -> None:
@@ -260,6 +260,23 @@ def test_check_of_an_untouched_cell_is_stale_as_seldom_as_said() -> None:
     assert knocked >= 290
 
 
+def test_check_of_one_mark_again_and_again_sees_a_shift_the_better() -> None:
+    knocked, sigma = 0, 1.4 * SIGMA
+    corner = GRID[[0] * 5]
+    for seed in range(200):
+        touches = SCENE.touched(GRID, seed, sigma)
+        found = fit_plane(GRID, touches, touch_sigma=sigma, model="similarity")
+        again = SCENE.touched(corner, seed + 5000, sigma) + 0.001 * SCENE.turn[:, 2]
+        knocked += found.check(corner, again).stale
+    assert knocked >= 160  # the 15 coordinates without the one shift: 130
+
+
+def test_check_of_one_touch_far_off_among_many_finds_it_stale() -> None:
+    again = SCENE.touched(GRID, 7)
+    again[4] += 0.002 * SCENE.turn[:, 0]
+    assert healthy().check(GRID, again).stale
+
+
 def test_check_with_an_estimated_sigma_knows_how_well_it_is_known() -> None:
     found = fit_plane(CORNERS, SCENE.touched(CORNERS, 3), model="similarity")
     given = fit_plane(
@@ -272,6 +289,24 @@ def test_check_with_an_estimated_sigma_knows_how_well_it_is_known() -> None:
 def test_check_of_points_that_do_not_pair_raises() -> None:
     with pytest.raises(CalibrationError, match=r"camera points \(2\), one at least, got 1"):
         healthy().check(GRID[:2], SCENE.robot(GRID[:1]))
+
+
+@pytest.mark.parametrize("y_down", [True, False, None])
+def test_fit_plane_y_down_is_kept_with_all_that_is_made_of_it(y_down: bool | None) -> None:
+    found = fit_plane(GRID, SCENE.robot(GRID), y_down=y_down)
+    raised = found.at_height(0.02, SCENE.origin + SCENE.turn[:, 2])
+    again = PlaneCalibration.from_data(json.loads(json.dumps(raised.to_data())))
+    assert (found.y_down, raised.y_down, again.y_down) == (y_down,) * 3
+    assert found.matrix.tobytes() == fit_plane(GRID, SCENE.robot(GRID)).matrix.tobytes()
+
+
+def test_from_data_of_a_file_without_y_down_does_not_know_it() -> None:
+    data = fit_plane(GRID, SCENE.robot(GRID), y_down=True).to_data()
+    del data["y_down"]
+    assert PlaneCalibration.from_data(data).y_down is None
+    with pytest.raises(CalibrationError, match="stored plane calibration: y_down: ") as caught:
+        PlaneCalibration.from_data({**data, "y_down": "yes"})
+    assert caught.value.code == "SHAPE"
 
 
 def test_at_height_puts_the_point_on_the_ray() -> None:

@@ -49,6 +49,12 @@ def test_fit_touches_says_what_nothing_checks() -> None:
     )
 
 
+@pytest.mark.parametrize("y_down", [True, False, None])
+def test_fit_touches_y_down_is_kept(y_down: bool | None) -> None:
+    found = fitted(1, y_down=y_down)
+    assert PlaneCalibration.from_data(found.to_data()).y_down is y_down
+
+
 def test_fit_touches_without_sigma_estimates_it_badly_and_says_so() -> None:
     found = fitted(1, touch_sigma=None, tool_z=-SCENE.turn[:, 2])
     assert found.warnings[0].code == "UNVERIFIED"

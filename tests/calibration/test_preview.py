@@ -81,6 +81,24 @@ def test_compared_without_a_sigma_has_no_heat_and_no_covariance() -> None:
     assert [one["covariance"] for one in preview["points"]] == [None] * 3
 
 
+@pytest.mark.parametrize(("off", "shown"), [(0.02, True), (1000.0, False)])
+def test_compared_marks_what_is_left_out_and_counts_it_nowhere(off: float, shown: bool) -> None:
+    touched = SCENE.touched(GRID, 1)
+    touched[2] += off * SCENE.turn[:, 0]
+    found = fit_plane(GRID, touched, touch_sigma=SIGMA, model="similarity", robust=True)
+    assert found.outliers == (2,)
+    done = touches(GRID, touched)
+    preview = compared(
+        found, done, GRID, found.residuals, found.leave_one_out, worst=found.worst, left_out=(2,)
+    )
+    (one,) = (point for point in preview["points"] if point["left_out"])
+    assert (one["label"], one["held_out"], one["covariance"]) == ("3", None, None)
+    low, high = np.array(preview["view"])
+    at = np.array(one["at"][:2])
+    assert ((low < at) & (at < high)).all() == shown
+    assert (high - low).max() < 0.6
+
+
 def test_compared_beyond_the_horizon_has_no_heat() -> None:
     seen = GRID / (1.0 + 2.5 * GRID[:, :1])
     found = fit_plane(seen, SCENE.robot(GRID), touch_sigma=SIGMA, model="homography")

@@ -284,6 +284,14 @@ def test_chain_of_a_calibration_for_one_camera_refuses_another_ones_poses() -> N
         assert chain.to_robot([]) == []
 
 
+@pytest.mark.parametrize("y_down", [True, False, None])
+@pytest.mark.parametrize("model", ["similarity", "affine"])
+def test_chain_of_a_calibration_knows_its_y_down(model: PlaneModel, y_down: bool | None) -> None:
+    touched = np.column_stack([GRID, np.zeros(len(GRID))])
+    chain = chain_of(fit_plane(GRID, touched, model=model, y_down=y_down))
+    assert (chain.y_down, chain.then(ToolOffset.facing()).y_down) == (y_down, y_down)
+
+
 def test_chain_with_a_height_says_what_a_raised_calibration_says() -> None:
     rotation = rotation_about(np.array([0.2, -0.1, 1]), 0.7)
     touched = GRID @ rotation[:, :2].T + [0.5, -0.4, 0.1]

@@ -20,13 +20,23 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def begin(folder: Path, bench: Bench, *, reads: bool = False, **parameters: Any) -> Session:
+def begin(
+    folder: Path,
+    bench: Bench,
+    *,
+    reads: bool = False,
+    y_down: bool | None = None,
+    journal: Path | None = None,
+    **parameters: Any,
+) -> Session:
     wizard = plane_wizard(
         localize=bench.localize,
         save_to=lambda name: folder / f"{name}.json",
         read_robot=bench.read_robot if reads else None,
+        y_down=y_down,
     )
-    return Session(wizard, parameters={"name": "table", **parameters})
+    opened = None if journal is None else Journal(journal)
+    return Session(wizard, opened, parameters={"name": "table", **parameters})
 
 
 async def touch_all(session: Session, bench: Bench) -> dict[str, Any]:
@@ -117,6 +127,124 @@ async def test_wrong_touch_is_named_the_worst_and_touched_again(tmp_path: Path) 
     await say(session, {"next": "accept"})
     view = await say(session)
     assert view["result"]["held_out_mm"] < 0.4
+
+
+async def touch_some_wrong(session: Session, bench: Bench, wrong: set[int]) -> dict[str, Any]:
+    """Touch all nine marks, those of these numbers 5 mm off; return the review."""
+    await say(session, {"touch_sigma": 0.2})
+    await say(session)
+    view = await say(session)
+    for number, mark in enumerate(GRID, 1):
+        answer = bench.touch_mm(*mark)
+        view = await say(session, {**answer, "x": answer["x"] + 5.0 * (number in wrong)})
+    assert view["step"] == "review"
+    return view
+
+
+def choices(view: dict[str, Any]) -> list[str]:
+    return [one["const"] for one in view["schema"]["properties"]["next"]["oneOf"]]
+
+
+async def test_wrong_touches_can_be_left_out_and_count_nowhere(tmp_path: Path) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    view = await touch_some_wrong(session, bench, {3, 6})
+    assert choices(view) == ["accept", "more", "redo", "remove", "robust"]
+    view = await say(session, {"next": "robust"})
+    assert view["notes"][0] == "model rigid from 7 of 9 points"
+    said = [note.partition(" is left out")[0] for note in view["notes"] if "left out" in note]
+    assert said == ["OUTLIER: point 3", "OUTLIER: point 6"]
+    assert (choices(view)[-1], view["defaults"]["point"]) == ("all", 3)
+    left_out = [one["label"] for one in view["preview"]["points"] if one["left_out"]]
+    assert left_out == ["3", "6"]
+    await say(session)
+    result = (await say(session))["result"]
+    assert (result["points"], result["left_out"]) == (7, [3, 6])
+    assert max(result["residual_mm"], result["held_out_mm"]) < 0.8
+    assert PlaneCalibration.load(tmp_path / "table.json").outliers == (2, 5)
+
+
+async def test_points_left_out_can_count_again_or_be_touched_again(tmp_path: Path) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    plain = await touch_some_wrong(session, bench, {4})
+    await say(session, {"next": "robust"})
+    view = await say(session, {"next": "all"})
+    assert (view["notes"], choices(view)) == (plain["notes"], choices(plain))
+    await say(session, {"next": "robust"})
+    view = await say(session, {"next": "redo"})
+    assert view["title"] == "Touch point 4 again"
+    view = await say(session, bench.touch_mm(*GRID[3]))
+    assert view["notes"][0].endswith("from 9 points")
+    session.close()
+
+
+async def test_points_that_agree_are_not_offered_to_be_left_out(tmp_path: Path) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    assert "robust" not in choices(await touch_some_wrong(session, bench, set()))
+    session.close()
+
+
+async def test_points_left_out_down_to_five_all_count(tmp_path: Path) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    await touch_some_wrong(session, bench, {4})
+    view = await say(session, {"next": "robust"})
+    for _ in range(4):
+        view = await say(session, {"next": "remove"})
+    assert view["notes"][0].endswith("from 5 points")
+    session.close()
+
+
+async def test_wizard_resumed_leaves_out_the_same_points(tmp_path: Path) -> None:
+    bench, journal = Bench(sigma=0.0002), tmp_path / "table.journal"
+    session = begin(tmp_path, bench, journal=journal)
+    await touch_some_wrong(session, bench, {3, 6})
+    before = await say(session, {"next": "robust"})
+    session.close()
+    session = begin(tmp_path, bench, journal=journal)
+    assert session.current == before
+    await say(session)
+    assert (await say(session))["result"]["left_out"] == [3, 6]
+    session.close()
+
+
+@pytest.mark.parametrize("y_down", [True, False, None])
+@pytest.mark.parametrize("method", ["marks", "rays"])
+async def test_wizard_keeps_y_down_with_the_calibration(
+    tmp_path: Path, y_down: bool | None, method: str
+) -> None:
+    bench = Bench(marks=GRID[:1] if method == "rays" else [GRID[0], GRID[2], GRID[6]])
+    session = begin(tmp_path, bench, y_down=y_down, method=method)
+    view = await say(session)
+    if method == "rays":
+        await say(session)
+        await say(session)
+        for mark in (GRID[0], GRID[2], GRID[6]):
+            view = await say(session, bench.touch_mm(*mark))
+    else:
+        view = await touch_all(session, bench)
+    assert view["step"] == "review"
+    await say(session)
+    await say(session)
+    assert PlaneCalibration.load(tmp_path / "table.json").y_down is y_down
+
+
+async def test_wizard_resumed_with_another_y_down_takes_no_picture(tmp_path: Path) -> None:
+    bench, journal = Bench(marks=GRID[:1]), tmp_path / "table.journal"
+    session = begin(tmp_path, bench, y_down=True, journal=journal)
+    await say(session)
+    await touch_all(session, bench)
+    session.close()
+    session = begin(tmp_path, bench, y_down=False, journal=journal)
+    view = await session.submit(session.token)
+    assert view["errors"] == {
+        "base": "the picture before was taken with y_down=True, now it is False, and everything "
+        "would be mirrored; expected y_down=True"
+    }
+    assert bench.pictures == 1
+    session.close()
 
 
 async def test_marks_in_a_line_are_told_and_more_can_be_added(tmp_path: Path) -> None:

@@ -76,6 +76,7 @@ def test_calibrate_in_json_gives_a_calibration(url: str, tmp_path: Path) -> None
     assert (result["file"], result["points"]) == ("plane.json", 7)
     assert result["held_out_mm"] < 1.0
     calibration = PlaneCalibration.load(tmp_path / "plane.json")
+    assert calibration.y_down is False
     assert calibration.transform([PIECES["square"][:2]])[0] == pytest.approx(
         touch("square"), abs=0.001
     )
@@ -92,6 +93,29 @@ def test_calibrate_in_the_terminal_asks_and_shows_errors(url: str, tmp_path: Pat
     assert "  - model " in done.out
     assert "from 6 points" in done.out
     assert "\ndone\n  name: plane\n  file: plane.json\n" in done.out
+
+
+def test_calibrate_y_down_is_kept_and_wanted_by_the_check(url: str, tmp_path: Path) -> None:
+    lines = as_lines({**ABOUT, "side": "unknown"}, {}, {}, *TOUCHES, {}, {})
+    calibrating(url, tmp_path, lines, "--json", "--y-down").done()
+    assert PlaneCalibration.load(tmp_path / "plane.json").y_down is True
+    calibrating(url, tmp_path, [], "--check", "plane").failed(
+        2, "--check plane: it was made with --y-down: give it here, too, or poses are mirrored"
+    )
+    assert not (tmp_path / "plane.drift.journal").exists()
+    done = calibrating(url, tmp_path, ['{"do": "abort"}'], "--json", "--check", "plane", "--y-down")
+    assert (done.code, done.lines[0]["step"]) == (130, "about")
+
+
+def test_calibrate_resumed_with_another_y_down_takes_no_picture(url: str, tmp_path: Path) -> None:
+    only = {f"mark_{number}": number == 1 for number in range(1, 8)}
+    lines = as_lines(ABOUT, {}, only, TOUCHES[0])
+    calibrating(url, tmp_path, lines, "--json")
+    done = calibrating(url, tmp_path, as_lines({}), "--json", "--y-down")
+    assert [line["step"] for line in done.lines] == ["picture", "picture"]
+    assert done.lines[1]["errors"]["base"].startswith(
+        "the picture before was taken with y_down=False, now it is True"
+    )
 
 
 def saved(folder: Path) -> None:

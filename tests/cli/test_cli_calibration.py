@@ -91,6 +91,24 @@ def test_trigger_calibration_with_a_frame_wants_the_camera_named_so(
     assert result["value"][0]["pose"]["header"]["frame_id"] == "robot"
 
 
+@pytest.mark.parametrize(
+    ("y_down", "options", "text"),
+    [
+        (True, (), "it was made with --y-down: give it here, too, or poses are mirrored"),
+        (False, ("--y-down",), "it was made without --y-down: leave it out here, too"),
+    ],
+)
+def test_trigger_calibration_with_another_y_down_says_what_to_give(
+    seven: list[str], tmp_path: Path, y_down: bool, options: tuple[str, ...], text: str
+) -> None:
+    path = tmp_path / "table.json"
+    calibrated(y_down=y_down).save(path)
+    told = [*seven, "--calibration", str(path)]
+    run(*told, *options).failed(2, f"--calibration {path}: {text}")
+    (result,) = run(*told, *(() if options else ("--y-down",)), "--json").done().lines
+    assert len(result["value"]) == len(PIECES)
+
+
 def test_trigger_calibration_without_interpret_as_says_what_to_give(url: str, table: str) -> None:
     outcome = run("trigger", url, "--calibration", table)
     outcome.failed(2, "as with interpret_as='localizations', got the interpreter 'raw'")

@@ -86,7 +86,7 @@ async def test_pick_warns_of_marks_that_lie_in_no_plane(
     await pick(Options(), str(tmp_path / "pick.svg"), 1)
     out = capsys.readouterr().out
     assert "   NOT_PLANAR: " in out
-    assert "point 4 is the furthest" in out
+    assert "point 5 is the furthest" in out
 
 
 async def test_pick_with_a_picture_that_cannot_be_written_says_so(tmp_path: Path) -> None:

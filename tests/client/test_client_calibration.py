@@ -155,6 +155,7 @@ async def test_calibration_stands_behind_y_down() -> None:
         [(*corner, 0.0) for corner in CORNERS],
         tool_z=(0.0, 0.0, -1.0),
         camera_frame="cell",
+        y_down=True,
     )
     async with EmulatedCamera([application], active=31) as emulator:
         emulator.device.scene = scene
@@ -422,6 +423,42 @@ def test_calibration_that_does_not_go_with_the_interpreters_is_refused(
     specs = {7: "localizations", 5: "x: real32"}
     with pytest.raises(ConfigurationError, match=f"^calibration: {text}"):
         smartcam.connect("bvs://h", interpret_as=specs, calibration=calibration)
+
+
+_PLACES = CORNERS @ TURN[:, :2].T + SHIFT
+_HERE = Transform.from_quaternion("robot", "flange", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("y_down", [True, False])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda one: one,
+        lambda one: {5: None, 7: one},
+        chain_of,
+        lambda one: MovingCamera(chain_of(one), _HERE, field=one.robot_points).now(_HERE),
+    ],
+)
+def test_calibration_made_with_the_other_y_down_is_refused(make: Any, y_down: bool) -> None:
+    calibration = make(fit_plane(CORNERS, _PLACES, y_down=y_down))
+    options: dict[str, Any] = {"interpret_as": "localizations", "calibration": calibration}
+    with pytest.raises(
+        ConfigurationError,
+        match=f"^calibration: it was made with y_down={y_down}, .* expected y_down={y_down}$",
+    ):
+        smartcam.connect("bvs://h", y_down=not y_down, **options)
+    assert smartcam.connect("bvs://h", y_down=y_down, **options).settings.y_down is y_down
+
+
+@pytest.mark.parametrize("calibration", [Nearby(), CALIBRATION])
+@pytest.mark.parametrize("y_down", [True, False])
+def test_calibration_that_does_not_know_its_y_down_is_taken(
+    calibration: Calibration, y_down: bool
+) -> None:
+    camera = smartcam.connect(
+        "bvs://h", interpret_as="localizations", calibration=calibration, y_down=y_down
+    )
+    assert camera.settings.calibration is calibration
 
 
 # ---------------------------------------------------------------------- cost

@@ -133,6 +133,23 @@ async def test_page_drives_the_wizard_to_a_calibration(page: Page, tmp_path: Pat
         await view.see("#names li", "table")
 
 
+async def test_page_shows_what_is_left_out_as_crosses(page: Page, tmp_path: Path) -> None:
+    async with opened(page, tmp_path) as view:
+        await begin(view)
+        for x, y, z in TOUCHES:
+            await view.answer("Touch mark", x=y, y=x, z=z)
+        await view.answer("What came out", next="more")
+        await view.answer("Marks in the camera's field")
+        await view.answer("Which ones will be touched?")
+        for number, (x, y) in enumerate(MARKS):
+            await view.answer("Touch mark", x=y + 0.02 * (number == 1), y=x, z=0.0)
+        await view.answer("What came out", next="robust")
+        await view.see("#legend", "Crosses: left out.")
+        assert await view.how_many("#plot .left-out") == 2
+        assert await view.how_many("#plot .touched") == 7
+        assert await view.how_many("#plot .residual") == 7
+
+
 async def test_page_checks_a_calibration(page: Page, tmp_path: Path) -> None:
     async with opened(page, tmp_path) as view:
         step = await view.world.post("/start", name="table")

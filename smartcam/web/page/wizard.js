@@ -233,8 +233,9 @@ function draw(preview) {
 
   let factor = 1;
   if (fitted) {
-    const worst = Math.max(...points.map((one) => Math.hypot(one.residual[0], one.residual[1])),
-      ...points.map((one) => (one.covariance ? ellipse(one.covariance)[0] : 0)));
+    const counted = points.filter((one) => !one.left_out);
+    const worst = Math.max(...counted.map((one) => Math.hypot(one.residual[0], one.residual[1])),
+      ...counted.map((one) => (one.covariance ? ellipse(one.covariance)[0] : 0)));
     factor = worst > 0 ? nice(Math.max(1, (0.12 * size) / worst)) : 1;
     const corner = [left + 0.6 * margin, top - 0.65 * margin];
     preview.robot_axes.forEach(([x, y], index) => {
@@ -248,6 +249,12 @@ function draw(preview) {
   }
   points.forEach((one, index) => {
     const [x, y] = places[index];
+    if (one.left_out) {
+      line("left-out", [x - dot, y - dot], [2 * dot, 2 * dot]);
+      line("left-out", [x - dot, y + dot], [2 * dot, -2 * dot]);
+      label(x, y, one.label);
+      return;
+    }
     if (fitted) {
       const [rx, ry] = one.residual;
       parts.push(shape("circle", { class: "seen", cx: x - rx, cy: -(y - ry), r: 1.8 * dot, "stroke-width": dot / 3 }));
@@ -274,7 +281,7 @@ function draw(preview) {
   }
   plot.replaceChildren(...parts);
   $("legend").textContent = fitted
-    ? `Dots: touched, the worst in red. Rings: where the camera says. Lines: residuals, dashes: predicted error of the mapped point (95 %), both ${factor} times as large. The robot's axes stand in the corner, the camera's at its origin.${heat ? ` Colour, the stronger the larger: predicted error, ${spread(heat).map((error) => error.toFixed(3)).join(" to ")} mm rms.` : ""}`
+    ? `Dots: touched, the worst in red. Rings: where the camera says. Lines: residuals, dashes: predicted error of the mapped point (95 %), both ${factor} times as large.${points.some((one) => one.left_out) ? " Crosses: left out." : ""} The robot's axes stand in the corner, the camera's at its origin.${heat ? ` Colour, the stronger the larger: predicted error, ${spread(heat).map((error) => error.toFixed(3)).join(" to ")} mm rms.` : ""}`
     : "Marks in the camera's frame: rings are seen, dots are touched, the red ring is next.";
 }
 
