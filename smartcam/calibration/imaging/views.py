@@ -26,9 +26,9 @@ class TargetView:
         ids: (N,), numbers of the points that were found, ascending.
         points: (N, 2), where they are, pixels.
         covariance: (N, 2, 2), of each, pixels^2, as the noise of the image leads to.
-        margin: how clearly the origin was told from the other corners, in grey levels of 255 (dark
-            corner), or as the ratio by which the larger dot is larger; None where the target says
-            it by itself (ids), or where it looks the same when turned.
+        margin: how clearly the origin was told from the other corners: by how many grey levels of
+            255 its mark, or the rim by which its dot is larger, is darker there; None where the
+            target says it by itself (ids, colours of squares), or looks the same when turned.
         name: of the image, for messages.
     """
 

@@ -1,0 +1,233 @@
+"""Targets in images: found, with their points and origin where they are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from drawnkit import STRAIGHT, drawn
+from imaging_scenes import refused
+
+from smartcam.calibration.codes import Code
+from smartcam.calibration.imaging.detection import find_target
+from smartcam.calibration.imaging.targets import Charuco, Checkerboard, CircleGrid, Target
+from smartcam.exceptions import CalibrationError
+
+PLAIN = Checkerboard(columns=9, rows=6, square=0.025)
+DARK = Checkerboard(columns=9, rows=7, square=0.025, origin_mark=True)
+CHARUCO = Charuco(columns=8, rows=6, square=0.03, marker=0.02)
+DOTS = CircleGrid(columns=10, rows=8, spacing=0.02, diameter=0.01, origin_diameter=0.016)
+TARGETS: list[Target] = [
+    PLAIN,
+    DARK,
+    Checkerboard(columns=7, rows=7, square=0.025, origin_mark=True),
+    CHARUCO,
+    Charuco(columns=8, rows=6, square=0.03, marker=0.02, legacy_pattern=True),
+    Charuco(columns=5, rows=7, square=0.03, marker=0.018, dictionary="DICT_4X4_50"),
+    DOTS,
+    CircleGrid(columns=7, rows=7, spacing=0.02, diameter=0.01, origin_diameter=0.015),
+    CircleGrid(columns=4, rows=11, spacing=0.04, diameter=0.014, asymmetric=True),
+    CircleGrid(
+        columns=5, rows=10, spacing=0.04, diameter=0.014, asymmetric=True, origin_diameter=0.02
+    ),
+]
+
+
+@pytest.mark.parametrize("roll", [0, 70, 200])
+@pytest.mark.parametrize("target", TARGETS, ids=repr)
+def test_find_target_of_tilted_sheet_has_each_point_where_it_is(target: Target, roll: int) -> None:
+    picture = drawn(target, tilt=35, roll=roll)
+    view = find_target(picture.image, target, name="one")
+    assert view.ids.tolist() == list(range(len(target.points)))
+    assert picture.off(view).max() < 0.02
+    assert (view.name, view.size, view.target) == ("one", (640, 480), target)
+
+
+@pytest.mark.parametrize("target", [PLAIN, CHARUCO, DOTS], ids=repr)
+def test_find_target_covariance_is_that_of_its_errors(target: Target) -> None:
+    picture = drawn(target, camera=STRAIGHT, tilt=25, roll=10, noise=4)
+    view = find_target(picture.image, target)
+    off = view.points - picture.pixels
+    squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(view.covariance), off)
+    assert 0.5 < squares.mean() / 2 < 1.5
+    assert 0.005 < view.sigmas.mean() < 0.025
+
+
+@pytest.mark.parametrize("tilt", [0, 40])
+def test_find_target_in_colour_and_in_16_bits_is_the_same(tilt: int) -> None:
+    picture = drawn(PLAIN, tilt=tilt)
+    grey = find_target(picture.image, PLAIN).points
+    colour = cv2.cvtColor(picture.image, cv2.COLOR_GRAY2BGR)
+    deep = picture.image.astype(np.uint16) * 16
+    np.testing.assert_allclose(find_target(colour, PLAIN).points, grey, atol=1e-9)
+    np.testing.assert_allclose(find_target(deep, PLAIN).points, grey, atol=5e-3)
+
+
+@pytest.mark.parametrize("roll", [0, 45, 130])
+@pytest.mark.parametrize("target", [PLAIN, DARK, DOTS, TARGETS[8]], ids=repr)
+def test_find_target_of_steep_far_and_noisy_sheet_has_its_points(target: Target, roll: int) -> None:
+    picture = drawn(target, tilt=60, roll=roll, away=0.7, blur=1.2, noise=4)
+    off = picture.off(find_target(picture.image, target))
+    assert off.max() < 0.3
+    assert np.sqrt((off**2).mean()) < 0.08
+
+
+def test_find_target_with_a_covered_corner_says_how_little_is_known_of_it() -> None:
+    picture = drawn(PLAIN, tilt=20)
+    u, v = np.rint(picture.pixels[31]).astype(int)
+    cv2.circle(picture.image, (int(u) + 3, int(v) - 2), 7, 120, -1)
+    view = find_target(picture.image, PLAIN)
+    off = picture.off(view)
+    assert np.delete(off, 31).max() < 0.02
+    assert off[31] < 3 * view.sigmas[31]
+    assert off[31] < 5
+
+
+def test_find_charuco_with_small_markers_is_found() -> None:
+    target = Charuco(columns=8, rows=6, square=0.03, marker=0.02, dictionary="DICT_4X4_50")
+    picture = drawn(target, tilt=10, away=0.9)
+    view = find_target(picture.image, target)
+    assert len(view.ids) > 20
+    assert picture.off(view).max() < 0.1
+
+
+def test_find_target_in_large_image_is_as_exact() -> None:
+    small = drawn(PLAIN, tilt=30)
+    large = cv2.resize(small.image, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    view = find_target(large, PLAIN)
+    off = (view.points + 0.5) / 4 - 0.5 - small.pixels
+    assert view.size == (2560, 1920)
+    assert np.abs(off).max() < 0.03
+
+
+def test_find_target_without_marks_has_its_origin_at_a_black_square() -> None:
+    picture = drawn(PLAIN, roll=180)
+    view = find_target(picture.image, PLAIN)
+    assert picture.off(view).max() < 0.01
+    assert view.points[0, 0] > view.points[8, 0]
+    assert view.margin is None
+
+
+@pytest.mark.parametrize("roll", [0, 180])
+def test_find_target_that_looks_alike_when_turned_has_x_to_the_right(roll: int) -> None:
+    target = Checkerboard(columns=8, rows=6, square=0.025)
+    view = find_target(drawn(target, roll=roll).image, target)
+    assert view.points[7, 0] > view.points[0, 0]
+    assert view.points[8, 1] < view.points[0, 1]
+
+
+def test_find_target_with_white_square_at_the_origin_is_found_all_the_same() -> None:
+    target = Checkerboard(columns=9, rows=7, square=0.025)
+    picture = drawn(target)
+    view = find_target(255 - picture.image, target)
+    assert picture.off(view).max() < 0.01
+
+
+@pytest.mark.parametrize("target", [DARK, DOTS], ids=repr)
+def test_find_target_margin_is_the_marks_contrast(target: Target) -> None:
+    view = find_target(drawn(target, tilt=20).image, target)
+    assert view.margin is not None
+    assert 140 < view.margin < 181
+
+
+@pytest.mark.parametrize("target", [DARK, DOTS], ids=repr)
+def test_find_target_in_mirror_image_is_refused(target: Target) -> None:
+    image = np.ascontiguousarray(drawn(target, tilt=20).image[:, ::-1])
+    with refused(Code.MIRRORED, "expected an image of the sheet as one reads it", "mirrored"):
+        find_target(image, target)
+
+
+def test_find_charuco_in_mirror_image_is_not_found() -> None:
+    image = np.ascontiguousarray(drawn(CHARUCO).image[:, ::-1])
+    with refused(Code.TARGET_NOT_FOUND, "8 x 6 squares, found 0 beside 0 of its markers"):
+        find_target(image, CHARUCO)
+
+
+def test_find_target_whose_dark_area_is_not_there_is_ambiguous() -> None:
+    plain = Checkerboard(columns=9, rows=7, square=0.025)
+    text = "expected the origin to be darker than the other corners by 30 grey levels of 255, got"
+    with refused(Code.AMBIGUOUS_ORIGIN, text):
+        find_target(drawn(plain).image, DARK)
+
+
+def test_find_target_whose_larger_dot_is_not_there_is_ambiguous() -> None:
+    plain = CircleGrid(columns=10, rows=8, spacing=0.02, diameter=0.01)
+    with refused(Code.AMBIGUOUS_ORIGIN, "10 x 8 dots, of which the larger one is the origin"):
+        find_target(drawn(plain).image, DOTS)
+
+
+def test_find_target_of_other_board_says_what_is_seen_instead() -> None:
+    wanted = Checkerboard(columns=10, rows=7, square=0.025)
+    text = "expected a board of 10 x 7 inner corners that is seen as a whole, found one of about"
+    with pytest.raises(CalibrationError, match=text) as caught:
+        find_target(drawn(PLAIN).image, wanted)
+    assert caught.value.code == Code.TARGET_NOT_FOUND
+    assert caught.value.got in ((9, 6), (6, 9))
+
+
+def test_find_target_of_nothing_says_that_none_is_found() -> None:
+    empty = np.full((480, 640), 128, dtype=np.uint8)
+    with refused(Code.TARGET_NOT_FOUND, "9 x 6 inner corners", "found none"):
+        find_target(empty, PLAIN)
+    with refused(Code.TARGET_NOT_FOUND, "8 x 6 squares, found 0"):
+        find_target(empty, CHARUCO)
+    with refused(Code.TARGET_NOT_FOUND, "expected 10 x 8 dots, saw 0 dark spots and no such grid"):
+        find_target(empty, DOTS)
+
+
+def test_find_target_of_covered_dots_says_how_many_are_seen() -> None:
+    picture = drawn(DOTS)
+    u, v = np.rint(picture.pixels[35]).astype(int)
+    cv2.circle(picture.image, (int(u), int(v)), 11, 210, -1)
+    with refused(Code.TARGET_NOT_FOUND, "expected 10 x 8 dots, saw 79 dark spots"):
+        find_target(picture.image, DOTS)
+
+
+def test_find_charuco_of_covered_board_has_the_corners_that_are_seen() -> None:
+    picture = drawn(CHARUCO, tilt=20)
+    covered = picture.pixels[10]
+    u, v = np.rint(covered).astype(int)
+    cv2.circle(picture.image, (int(u), int(v)), 15, 90, -1)
+    view = find_target(picture.image, CHARUCO)
+    assert 10 not in view.ids
+    assert len(view.ids) >= 30
+    assert picture.off(view).max() < 0.05
+
+
+def test_find_charuco_with_other_pattern_asks_for_the_legacy_one() -> None:
+    legacy = Charuco(columns=8, rows=6, square=0.03, marker=0.02, legacy_pattern=True)
+    with refused(Code.TARGET_NOT_FOUND, "is its legacy_pattern right?"):
+        find_target(drawn(legacy).image, CHARUCO)
+
+
+def test_find_charuco_of_unknown_dictionary_is_refused() -> None:
+    target = Charuco(columns=8, rows=6, square=0.03, marker=0.02, dictionary="DICT_9X9")
+    with refused(Code.SHAPE, "dictionaries such as DICT_5X5_250, got 'DICT_9X9'"):
+        find_target(np.zeros((480, 640), np.uint8), target)
+
+
+def test_find_charuco_of_too_small_dictionary_is_refused() -> None:
+    target = Charuco(columns=12, rows=12, square=0.03, marker=0.02, dictionary="DICT_4X4_50")
+    with refused(Code.SHAPE, "expected at least 72 markers in DICT_4X4_50, got 50"):
+        find_target(np.zeros((480, 640), np.uint8), target)
+
+
+@pytest.mark.parametrize(
+    ("image", "got"),
+    [
+        (np.zeros((480, 640)), "float64 of shape (480, 640)"),
+        (np.zeros((480, 640, 4), np.uint8), "uint8 of shape (480, 640, 4)"),
+        (np.zeros(640, np.uint8), "uint8 of shape (640,)"),
+        (np.zeros((8, 640), np.uint8), "uint8 of shape (8, 640)"),
+        (None, "NoneType"),
+        ("left01.jpg", "str"),
+    ],
+)
+def test_find_target_in_no_image_is_refused(image: object, got: str) -> None:
+    with refused(Code.SHAPE, "image: expected an array of uint8 or uint16", got):
+        find_target(image, PLAIN)
+
+
+def test_find_target_of_no_target_is_refused() -> None:
+    with refused(Code.SHAPE, "expected a Checkerboard, Charuco or CircleGrid, got str"):
+        find_target(np.zeros((480, 640), np.uint8), "board")  # type: ignore[arg-type]

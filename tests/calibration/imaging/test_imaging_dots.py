@@ -1,0 +1,102 @@
+"""Dots, refined, and what perspective makes of their middles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drawnkit import BENT, STRAIGHT, drawn, facing
+from imaging_scenes import refused
+
+from smartcam.calibration.codes import Code
+from smartcam.calibration.imaging.cameras import CameraModel
+from smartcam.calibration.imaging.detection import find_target
+from smartcam.calibration.imaging.dots import UNREFINED, GridMap, refine_dots
+from smartcam.calibration.imaging.grey import grey_image
+from smartcam.calibration.imaging.homography import apply_homography, fit_homography
+from smartcam.calibration.imaging.targets import CircleGrid
+
+GRID = CircleGrid(columns=8, rows=6, spacing=0.03, diameter=0.02)
+FLAT = GRID.points[:, :2]
+
+
+def ellipse_shift(matrix: np.ndarray, x: float, y: float, radius: float) -> np.ndarray:
+    """Return how far a circle's image has its middle from its centre's, by its dual conic."""
+    centre = np.array([x, y, 1.0])
+    dual = radius**2 * np.diag([1.0, 1.0, 0.0]) - np.outer(centre, centre)
+    seen = matrix @ dual @ matrix.T
+    middle = matrix @ centre
+    return np.asarray(seen[:2, 2] / seen[2, 2] - middle[:2] / middle[2])
+
+
+def test_grid_map_shift_without_distortion_is_that_of_the_conic() -> None:
+    picture = drawn(GRID, camera=STRAIGHT, tilt=40)
+    matrix = fit_homography(FLAT, picture.pixels)
+    assert matrix is not None
+    shifts = GridMap(FLAT, picture.pixels).shifts(FLAT, np.full(48, 0.02))
+    exact = [ellipse_shift(matrix, x, y, 0.01) for x, y in FLAT]
+    np.testing.assert_allclose(shifts, exact, atol=1e-4)
+    assert np.linalg.norm(shifts, axis=1).max() > 0.2
+
+
+def test_grid_map_follows_the_bend_of_a_lens() -> None:
+    picture = drawn(GRID, camera=BENT, tilt=20)
+    matrix = fit_homography(FLAT, picture.pixels)
+    assert matrix is not None
+    straight = np.abs(apply_homography(matrix, FLAT) - picture.pixels).max()
+    bent = np.abs(GridMap(FLAT, picture.pixels)(FLAT) - picture.pixels).max()
+    assert straight > 0.5
+    assert bent < 0.1
+
+
+def test_grid_map_of_few_points_is_a_homography() -> None:
+    flat = FLAT[[0, 3, 7, 16, 24, 40, 44, 47]]
+    seen = GridMap(flat, 1000 * flat + 100)
+    np.testing.assert_allclose(seen(FLAT), 1000 * FLAT + 100, atol=1e-6)
+
+
+def test_refine_dots_has_middles_areas_and_covariance() -> None:
+    picture = drawn(GRID, camera=STRAIGHT, noise=3)
+    ways = 600 / 0.45 * np.tile(np.array([[1.0, 0.0], [0.0, -1.0]]), (48, 1, 1))
+    dots = refine_dots(
+        grey_image(picture.image), np.rint(picture.pixels), 0.008 * ways, 0.0125 * ways
+    )
+    assert dots.fitted.all()
+    off = dots.points - picture.pixels
+    assert np.abs(off).max() < 0.05
+    squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(dots.covariance), off)
+    assert 0.5 < squares.mean() / 2 < 1.5
+    np.testing.assert_allclose(dots.areas, np.pi * (0.01 / 0.45) ** 2 * 600 * 602, rtol=0.01)
+
+
+def test_refine_dots_where_none_is_keeps_its_start() -> None:
+    empty = grey_image(np.full((480, 640), 200, dtype=np.uint8))
+    ways = np.tile(10 * np.eye(2), (2, 1, 1))
+    start = np.array([[100.25, 90.0], [300.0, 200.5]])
+    dots = refine_dots(empty, start, ways, 1.5 * ways)
+    assert not dots.fitted.any()
+    np.testing.assert_array_equal(dots.points, start)
+    np.testing.assert_array_equal(dots.covariance[1], UNREFINED**2 * np.eye(2))
+    np.testing.assert_allclose(dots.areas, np.pi * 100)
+
+
+@pytest.mark.parametrize("tilt", [0, 30, 50])
+def test_ellipse_shift_grows_with_the_tilt(tilt: int) -> None:
+    pose = facing(GRID, tilt)
+    points = GRID.points @ pose.rotation.T + pose.translation
+    shifts = GridMap(FLAT, STRAIGHT.project(points)).shifts(FLAT, np.full(48, 0.02))
+    low, high = {0: (0.0, 0.01), 30: (0.1, 0.5), 50: (0.2, 2.0)}[tilt]
+    assert low <= np.linalg.norm(shifts, axis=1).max() < high
+
+
+def test_refine_dots_of_large_dots_is_as_exact() -> None:
+    large = CameraModel(size=(1920, 1440), matrix=np.diag([3, 3, 1]) @ STRAIGHT.matrix)
+    picture = drawn(GRID, camera=large, tilt=20, noise=3, blur=1.5)
+    view = find_target(picture.image, GRID)
+    assert picture.off(view).max() < 0.1
+    assert 0.001 < np.median(view.sigmas) < 0.02
+
+
+def test_circle_grid_with_dots_that_touch_is_refused() -> None:
+    with refused(Code.SHAPE, "dots that do not touch each other at a distance of 0.02 m", "0.0205"):
+        CircleGrid(columns=5, rows=4, spacing=0.02, diameter=0.015, origin_diameter=0.026)
+    CircleGrid(columns=5, rows=4, spacing=0.02, diameter=0.01, origin_diameter=0.02)

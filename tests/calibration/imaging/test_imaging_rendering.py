@@ -1,0 +1,127 @@
+"""Images of targets against what follows from their geometry alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drawnkit import BENT, FACING, STRAIGHT, facing
+from imaging_scenes import refused
+
+from smartcam.calibration.codes import Code
+from smartcam.calibration.frames import Transform
+from smartcam.calibration.imaging.cameras import CameraModel
+from smartcam.calibration.imaging.charucos import charuco_board
+from smartcam.calibration.imaging.rendering import render
+from smartcam.calibration.imaging.targets import Charuco, Checkerboard, CircleGrid
+
+UNIT = CameraModel(size=(60, 50), matrix=np.array([[1000, 0, 0], [0, 1000, 0], [0, 0, 1.0]]))
+"""A pixel is a millimetre at a metre."""
+
+
+def upright(left: float, down: float) -> Transform:
+    """Return a sheet a metre away; where its origin is, pixels of ``UNIT``."""
+    return Transform("camera", "target", FACING, np.array([left, down, 1e3]) / 1e3)
+
+
+def test_render_edge_covers_its_share_of_a_pixel() -> None:
+    board = Checkerboard(columns=3, rows=3, square=0.01)
+    image = render(board, UNIT, upright(20.25, 30.0), blur=0, black=0, white=200)
+    # pixel 20 reaches from 19.5 to 20.5: three quarters of it lie left of the edge
+    assert image[26, 17:24].tolist() == [200, 200, 200, 150, 0, 0, 0]
+    assert image[34, 17:24].tolist() == [0, 0, 0, 50, 200, 200, 200]
+
+
+def test_render_outline_and_paper_lie_where_they_should() -> None:
+    board = Checkerboard(columns=3, rows=3, square=0.01)
+    image = render(board, UNIT, upright(20.5, 29.5), blur=0, black=0, white=200, background=90)
+    # the outermost square is black, then comes paper as wide as a square
+    assert image[34, 0] == 90 or image[34, 0] == 200
+    assert image[34, 8:12].tolist() == [200, 200, 200, 0]
+    assert image[35, 18:23].tolist() == [0, 0, 0, 200, 200]
+    assert image[39, 15] == 0
+    assert image[40, 15] == 200
+
+
+def test_render_origin_mark_is_a_dot_outside_of_the_origin() -> None:
+    board = Checkerboard(columns=3, rows=3, square=0.01, origin_mark=True)
+    image = render(board, UNIT, upright(20, 30), blur=0, black=0, white=200)
+    u, v = 20 - 13, 30 + 13
+    assert image[v, u] == 0
+    near = image[v - 2 : v + 3, u - 2 : u + 3]
+    assert (1 - near / 200).sum() == pytest.approx(np.pi * 1.5**2, rel=0.03)
+
+
+@pytest.mark.parametrize("asymmetric", [False, True])
+def test_render_dots_have_their_areas_and_centroids(*, asymmetric: bool) -> None:
+    grid = CircleGrid(
+        columns=3, rows=4, spacing=0.01, diameter=0.004, asymmetric=asymmetric,
+        origin_diameter=0.006,
+    )  # fmt: skip
+    image = render(grid, UNIT, upright(15.3, 38.6), blur=0.5, black=0, white=200)
+    ink = 1 - image.astype(float) / 200
+    for point, diameter in zip(grid.points, [6] + [4] * 11, strict=True):
+        u, v = 15.3 + 1e3 * point[0], 38.6 - 1e3 * point[1]
+        y, x = np.mgrid[:50, :60]
+        near = ink * (np.hypot(x - u, y - v) < 3.6 + (diameter - 4) / 2)
+        if not asymmetric or diameter == 4:
+            assert near.sum() == pytest.approx(np.pi * diameter**2 / 4, rel=0.05)
+            assert (near * x).sum() / near.sum() == pytest.approx(u, abs=0.05)
+            assert (near * y).sum() / near.sum() == pytest.approx(v, abs=0.05)
+
+
+@pytest.mark.parametrize("rows", [5, 6])
+@pytest.mark.parametrize("legacy", [False, True])
+def test_render_charuco_is_the_board_that_opencv_draws(rows: int, *, legacy: bool) -> None:
+    target = Charuco(columns=4, rows=rows, square=0.012, marker=0.006, legacy_pattern=legacy)
+    camera = CameraModel(
+        size=(4 * 84, rows * 84), matrix=np.array([[7000, 0, 0], [0, 7000, 0], [0, 0, 1.0]])
+    )
+    # 84 pixels a square, of which the first begins at -0.5
+    away = Transform("camera", "target", FACING, np.array([83.5, rows * 84 - 84.5, 7000]) / 7000)
+    image = render(target, camera, away, blur=0, black=0, white=255)
+    expected = charuco_board(target).generateImage(camera.size, marginSize=0)
+    assert np.abs(image.astype(int) - expected).mean() < 0.5
+
+
+@pytest.mark.parametrize("camera", [STRAIGHT, BENT])
+def test_render_edges_are_where_the_camera_projects_them(camera: CameraModel) -> None:
+    board = Checkerboard(columns=9, rows=6, square=0.025)
+    pose = facing(board, tilt=30, roll=5)
+    image = render(board, camera, pose, blur=0.5, black=0, white=200).astype(float)
+    # along an edge that runs upwards, the mean over a row of pixels is at the row's middle
+    ends = board.points[13] + np.array([[0, 0.008, 0], [0, 0.017, 0]])
+    (u0, v0), (u1, v1) = camera.project(ends @ pose.rotation.T + pose.translation)
+    for row in range(int(v1) + 1, int(v0)):
+        expected = u0 + (row - v0) / (v1 - v0) * (u1 - u0)
+        left = int(expected) - 6
+        part = image[row, left : left + 13]
+        share = (part - part[-1]).sum() / (part[0] - part[-1])
+        assert left - 0.5 + share == pytest.approx(expected, abs=0.01)
+
+
+def test_render_noise_is_as_large_as_asked_and_the_same_each_time() -> None:
+    board = Checkerboard(columns=3, rows=3, square=0.001)
+    first = render(board, UNIT, upright(20, 30), noise=5)
+    assert first[:20].std() == pytest.approx(5, rel=0.1)
+    np.testing.assert_array_equal(first, render(board, UNIT, upright(20, 30), noise=5))
+    other = render(board, UNIT, upright(20, 30), noise=5, random=np.random.default_rng(1))
+    assert (first != other).any()
+
+
+def test_render_of_sheet_outside_of_the_image_is_background() -> None:
+    board = Checkerboard(columns=3, rows=3, square=0.001)
+    assert (render(board, UNIT, upright(500, 30), background=77) == 77).all()
+
+
+def test_render_from_behind_is_refused() -> None:
+    board = Checkerboard(columns=3, rows=3, square=0.01)
+    behind = Transform("camera", "target", np.eye(3), np.array([0, 0, 1.0]))
+    with refused(Code.MIRRORED, "T_camera_target: expected the sheet's front"):
+        render(board, UNIT, behind)
+
+
+def test_render_of_sheet_behind_the_camera_is_refused() -> None:
+    board = Checkerboard(columns=3, rows=3, square=0.01)
+    grazing = facing(board, tilt=85, away=0.01)
+    with refused(Code.OUT_OF_FIELD, "expected the sheet before the camera, got a corner at z = -"):
+        render(board, STRAIGHT, grazing)
