@@ -21,6 +21,9 @@ BENCHMARKS = {
     "emulator": "triggers that emulated cameras answer, one and 1,000 of them",
     "startup": "import smartcam, and the first connect",
     "calibration": "error and predicted error of a plane over the bound, points and poses a second",
+    "corners": "error of corners and dots in images over the bound, and time for an image",
+    "stereo": "squares of OpenCV's pairs that were left out; boards against dots",
+    "hand_eye": "error of a camera on a robot over the bound, and of recorded poses left out",
     "scaling": "cost of a message over 10^3 to 10^6 of them",
 }
 """Modules of this package with a ``run(plan)``, and what they measure."""

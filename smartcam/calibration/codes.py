@@ -90,6 +90,12 @@ class Code(enum.StrEnum):
     """The points of a printed target are not where they were meant to be."""
     PAGE_TOO_SMALL = "PAGE_TOO_SMALL"
     """A sheet's target does not fit on its page."""
+    LENS_UNKNOWN = "LENS_UNKNOWN"
+    """No lens was given: its distortion is not corrected."""
+    NO_PICTURE = "NO_PICTURE"
+    """No picture came in time, or nowhere it could come from."""
+    BAD_PICTURE = "BAD_PICTURE"
+    """A picture that cannot be read: damaged, too large, of no known format."""
 
     # steps, files and services
     WRONG_ANSWERS = "WRONG_ANSWERS"

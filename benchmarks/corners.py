@@ -141,7 +141,7 @@ def _corners(plan: Plan, noise: float, blur: float) -> Iterator[Comparison]:
             found[name].append(math.sqrt(float((off**2).mean())))
     for name, errors in found.items():
         yield Comparison(
-            "calibration_corners",
+            "corners",
             f"noise {noise:g}, blur {blur:g} px: rms error of {name} over the bound",
             Series(name, "px", errors),
             Series("Cramer-Rao bound", "px", bounds),
@@ -178,7 +178,7 @@ def _dots(plan: Plan) -> Iterator[Comparison]:
         nearest = np.linalg.norm(found[None] - truth[:, None], axis=2).argmin(axis=1)
         theirs.append(_rms(found[nearest] - truth))
     yield Comparison(
-        "calibration_corners",
+        "corners",
         "dots tilted by 40 degrees, noise 2: rms error",
         Series("find_target", "px", ours),
         Series("OpenCV findCirclesGrid", "px", theirs),
@@ -220,7 +220,7 @@ def _times(plan: Plan) -> Iterator[Comparison]:
             times.append(1e3 * (time.process_time() - begin))
         goal = Goal("at most", 20, "ms") if name.startswith("refinement") else None
         yield Comparison(
-            "calibration_corners",
+            "corners",
             f"{name}, 640 x 480 pixels",
             Series("smartcam", "ms", times),
             None,

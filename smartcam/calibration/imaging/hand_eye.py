@@ -1,0 +1,499 @@
+"""A camera on a robot's hand, or beside the robot and looking at it: where it is.
+
+::
+
+    calibration = calibrate_hand_eye(robot_poses, views, setup="eye-in-hand", camera=camera)
+    calibration.held_out_error                 # metres, of poses that were left out
+    table = calibration.target_pose            # the sheet's plane, in the robot's frame
+    calibration.to_plane([[640, 480]], plane=table, robot_pose=now)
+
+The robot takes the camera to ten poses or more, turned about different axes, from which it sees the
+sheet; beside the robot the camera stays, and the robot shows it the sheet.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from smartcam.calibration.codes import Code, Remark
+from smartcam.calibration.frames import Transform
+from smartcam.calibration.imaging.hand_eye_choice import (
+    METHODS,
+    Problem,
+    Solution,
+    candidates,
+    choose,
+    steps_between,
+)
+from smartcam.calibration.imaging.hand_eye_fit import (
+    PixelObservations,
+    PoseObservations,
+    Rigid,
+    Robot,
+    RobotSigmas,
+)
+from smartcam.calibration.imaging.hand_eye_linear import (
+    check_motion,
+    second_turn,
+    solve_linear,
+)
+from smartcam.calibration.imaging.hand_eye_result import HandEyeCalibration, as_transform
+from smartcam.calibration.imaging.intrinsics import calibrate_intrinsics
+from smartcam.calibration.imaging.poses import CAMERA, TARGET, locate
+from smartcam.calibration.imaging.projection import excess, whitening
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.imaging.hand_eye_choice import Candidate
+    from smartcam.calibration.imaging.hand_eye_fit import Setup
+    from smartcam.calibration.imaging.poses import TargetPose
+    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.models import Pose
+
+__all__ = [
+    "MOST_POSES",
+    "HandEyeCalibration",
+    "calibrate_hand_eye",
+    "calibrate_hand_eye_from_poses",
+]
+
+MOST_POSES = 200
+"""Of one calibration, which takes half a minute then."""
+
+ADVISED_POSES = 8
+"""Below as many, what is left over tells little of the error."""
+
+ADVISED_TURN = math.radians(8.0)
+"""Rms turn of the poses about the second of their axes that is worth its name."""
+
+SCALE_OFF = 0.005
+"""Difference between the target's size and the nominal one that is worth a remark."""
+
+WORST = 4.0
+"""A pose whose held-out error is as many times the others' median is named."""
+
+OTHER_WAY = 5.0
+"""Poses that fit as many times better the other way round are taken for given the wrong way."""
+
+POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
+"""Of poses of the target that come without a covariance: their ratio counts."""
+
+
+def calibrate_hand_eye(
+    robot_poses: Sequence[Transform | Pose],
+    views: Sequence[TargetView],
+    *,
+    setup: Setup,
+    camera: CameraModel | None = None,
+    method: str = "auto",
+    beside: Literal["auto", "", "scale", "camera", "scale and camera"] = "auto",
+    robot_sigmas: RobotSigmas | None = None,
+) -> HandEyeCalibration:
+    """Return where a camera is on a robot, or beside it.
+
+    Args:
+        robot_poses: ``T_base_flange`` at each view: the flange's pose in the robot's base.
+        views: of one target, as many.
+        setup: whether the camera is on the hand (``eye-in-hand``, the target stays), or stands
+            beside the robot (``eye-to-hand``, the target is on the hand).
+        camera: its lens; None: calibrated from the same views, which should then tilt the target.
+        method: ``auto``: the candidate that predicts left-out poses best; or the name of one, see
+            :data:`~smartcam.calibration.imaging.hand_eye_choice.METHODS`.
+        beside: what may be adjusted besides: the target's ``scale`` (printers change it), the
+            ``camera``; ``auto``: what the held-out error asks for, ``""``: nothing.
+        robot_sigmas: of each axis of the robot's poses; None: estimated.
+
+    The order of the poses does not matter.
+
+    Raises:
+        CalibrationError: ``TOO_FEW``, ``POSES_TOO_SIMILAR``, ``INSUFFICIENT_ROTATION``; ``SHAPE``:
+            not as many views as poses, or of another image size; ``WRONG_FRAME``: poses of several
+            frames, or that fit only the other way round; ``DIFFERENT_TARGETS``; ``POOR_FIT``:
+            nothing fits; and what
+            :func:`~smartcam.calibration.imaging.intrinsics.calibrate_intrinsics` says.
+        MissingExtraError: SciPy or OpenCV is not installed, or OpenCV is 5.0.0.
+    """
+    transforms = _checked(robot_poses, len(views), "views", setup)
+    order = _order(transforms)
+    robot = Robot(_rigid([transforms[i] for i in order]), setup == "eye-in-hand")
+    check_motion(robot)
+    if any(one.target != views[0].target for one in views):
+        raise CalibrationError(
+            "hand-eye: expected views of one target, got views of several",
+            code=Code.DIFFERENT_TARGETS,
+            expected=views[0].target,
+        )
+    ordered = [views[i] for i in order]
+    lens = camera if camera is not None else calibrate_intrinsics(ordered, sheet="exact").camera
+    located = [locate(one, lens) for one in ordered]
+    poses = _rigid([one.transform for one in located])
+    problem = Problem(
+        robot=robot,
+        seen=_observations(ordered, located, lens),
+        poses=poses,
+        given=_given(ordered),
+        sigmas=_positive(robot_sigmas),
+    )
+    named = [one.name or f"pose {i}" for i, one in zip(order, ordered, strict=True)]
+    kept = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
+    free = {"": (), "scale": (0,), "camera": (1, 2, 3, 4, *kept)}
+    free["scale and camera"] = (0, *free["camera"])
+    result = _solved(problem, _allowed(free, beside), method, named, transforms[0])
+    back = np.argsort(order)
+    remarks = [] if camera is None else _lens_remarks(camera, result.camera)
+    return dataclasses.replace(
+        _reordered(result, back),
+        warnings=(*result.warnings, *remarks),
+        robot_poses=tuple(transforms),
+        views=tuple(views),
+        target_poses=tuple(located[i].transform for i in back),
+    )
+
+
+def calibrate_hand_eye_from_poses(
+    robot_poses: Sequence[Transform | Pose],
+    target_poses: Sequence[Transform],
+    *,
+    setup: Setup,
+    method: str = "auto",
+    beside: Literal["auto", "", "scale"] = "auto",
+    robot_sigmas: RobotSigmas | None = None,
+) -> HandEyeCalibration:
+    """Return where a camera is on a robot, or beside it, from poses of the target.
+
+    For cameras that say where a target is instead of where its points are in the image. Errors are
+    those of the target's origin.
+
+    Args:
+        robot_poses: ``T_base_flange``.
+        target_poses: ``T_camera_target``, as many.
+        setup: as for :func:`calibrate_hand_eye`.
+        method: as for :func:`calibrate_hand_eye`; ``reprojection`` weighs a milliradian as a
+            millimetre.
+        beside: as for :func:`calibrate_hand_eye`.
+        robot_sigmas: as for :func:`calibrate_hand_eye`.
+
+    Raises:
+        CalibrationError: as :func:`calibrate_hand_eye`.
+    """
+    transforms = _checked(robot_poses, len(target_poses), "poses of the target", setup)
+    order = _order(transforms)
+    robot = Robot(_rigid([transforms[i] for i in order]), setup == "eye-in-hand")
+    check_motion(robot)
+    poses = _rigid([target_poses[i] for i in order])
+    scale = np.repeat(1.0 / np.array(POSE_SIGMAS), 3)
+    white = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
+    problem = Problem(
+        robot=robot,
+        seen=PoseObservations(poses, white),
+        poses=poses,
+        sigmas=_positive(robot_sigmas),
+    )
+    named = [f"pose {i}" for i in order]
+    allowed = _allowed({"": (), "scale": (0,)}, beside)
+    result = _solved(problem, allowed, method, named, transforms[0])
+    return dataclasses.replace(
+        _reordered(result, np.argsort(order)),
+        robot_poses=tuple(transforms),
+        target_poses=tuple(
+            Transform(CAMERA, TARGET, one.rotation, one.translation) for one in target_poses
+        ),
+    )
+
+
+def _checked(
+    robot_poses: Sequence[Transform | Pose], count: int, what: str, setup: str
+) -> list[Transform]:
+    """Return the robot's poses as transforms.
+
+    Raises:
+        CalibrationError: SHAPE or WRONG_FRAME.
+    """
+    if setup not in ("eye-in-hand", "eye-to-hand"):
+        raise CalibrationError(
+            f"hand-eye: expected setup eye-in-hand or eye-to-hand, got {setup!r}",
+            code=Code.SHAPE,
+            expected=["eye-in-hand", "eye-to-hand"],
+            got=setup,
+        )
+    if len(robot_poses) != count or count > MOST_POSES:
+        raise CalibrationError(
+            f"hand-eye: expected as many {what} as poses of the robot, {MOST_POSES} at most, got "
+            f"{count} and {len(robot_poses)}",
+            code=Code.SHAPE,
+            expected=len(robot_poses),
+            got=count,
+        )
+    transforms = [as_transform(pose, "flange").undated() for pose in robot_poses]
+    for one in transforms:
+        if one.label != transforms[0].label:
+            raise CalibrationError(
+                f"hand-eye: expected all poses of the robot to be {transforms[0].label}, got "
+                f"{one.label}",
+                code=Code.WRONG_FRAME,
+                expected=transforms[0].label,
+                got=one.label,
+            )
+    return transforms
+
+
+def _positive(sigmas: RobotSigmas | None) -> RobotSigmas | None:
+    if sigmas is not None and not all(math.isfinite(one) and one > 0 for one in sigmas):
+        raise CalibrationError(
+            f"robot_sigmas: expected two positive numbers, radians and metres, got {tuple(sigmas)}",
+            code=Code.NOT_FINITE,
+            expected="two positive numbers",
+            got=tuple(sigmas),
+        )
+    return None if sigmas is None else RobotSigmas(*sigmas)
+
+
+def _order(transforms: Sequence[Transform]) -> list[int]:
+    """Return an order of poses that does not depend on how they come."""
+    if not transforms:
+        return []
+    rows = np.array([[*one.translation, *one.rotation.ravel()] for one in transforms])
+    return [int(index) for index in np.lexsort(rows.T[::-1])]
+
+
+def _rigid(transforms: Sequence[Transform]) -> Rigid:
+    rotations = np.array([one.rotation for one in transforms]).reshape(-1, 3, 3)
+    return Rigid(rotations, np.array([one.translation for one in transforms]).reshape(-1, 3))
+
+
+def _given(views: Sequence[TargetView]) -> Any:
+    counts = np.array([len(one.ids) for one in views])
+    return np.arange(counts.max())[None] < counts[:, None]
+
+
+def _observations(
+    views: Sequence[TargetView], located: Sequence[TargetPose], camera: CameraModel
+) -> PixelObservations:
+    """Return the views' points with their noise, as large as the views themselves show it."""
+    off = np.concatenate([one.residuals for one in located])
+    noise = np.concatenate([one.covariance for one in views])
+    more = excess(off, noise, off.size - 6 * len(views))
+    given = _given(views)
+    points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
+    white = np.zeros((*given.shape, 2, 2))
+    for index, one in enumerate(views):
+        points[index], pixels[index] = one.object_points[0], one.points[0]
+        mask = given[index]
+        points[index, mask], pixels[index, mask] = one.object_points, one.points
+        white[index, mask] = whitening(one.covariance, more)
+    return PixelObservations(camera, points, pixels, white)
+
+
+def _allowed(free: Mapping[str, tuple[int, ...]], beside: str) -> dict[str, tuple[int, ...]]:
+    if beside == "auto":
+        return dict(free)
+    if beside not in free:
+        raise CalibrationError(
+            f"beside: expected auto or one of {list(free)}, got {beside!r}",
+            code=Code.SHAPE,
+            expected=list(free),
+            got=beside,
+        )
+    return {beside: free[beside]}
+
+
+def _solved(
+    problem: Problem,
+    free: Mapping[str, tuple[int, ...]],
+    method: str,
+    named: Sequence[str],
+    pose: Transform,
+) -> HandEyeCalibration:
+    if method != "auto" and method not in METHODS:
+        raise CalibrationError(
+            f"method: expected auto or one of {list(METHODS)}, got {method!r}",
+            code=Code.SHAPE,
+            expected=list(METHODS),
+            got=method,
+        )
+    _check_direction(problem)
+    found = candidates(problem, free, method)
+    chosen = choose(found, method=method, beside=next(iter(free)) if len(free) == 1 else None)
+    if chosen is None or chosen.solution is None:
+        raise _poor(f"none at all {problem.count} poses", math.inf)
+    result = _result(problem, chosen, chosen.solution, found, pose)
+    off, size = float(np.median(result.errors)), _size(problem)
+    if off > size:
+        raise _poor(f"it {off:.3g} m off, where {size:.3g} m would be nowhere", off)
+    return dataclasses.replace(result, warnings=tuple(_remarks(problem, result, named)))
+
+
+def _poor(what: str, off: float) -> CalibrationError:
+    return CalibrationError(
+        f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "
+        "those of the views, in metres, and is the setup right?",
+        code=Code.POOR_FIT,
+        got=off,
+    )
+
+
+def _size(problem: Problem) -> float:
+    """Return the error at which a calibration says nothing, metres.
+
+    That is the target's extent, or without views half of its distance.
+    """
+    if isinstance(problem.seen, PixelObservations):
+        return float(np.ptp(problem.seen.points.reshape(-1, 3), axis=0).max())
+    return 0.5 * float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
+
+
+def _result(
+    problem: Problem,
+    chosen: Candidate,
+    solution: Solution,
+    found: Sequence[Candidate],
+    pose: Transform,
+) -> HandEyeCalibration:
+    in_hand = problem.robot.in_hand
+    hand, base = pose.source, pose.target
+    seen = chosen.problem.seen
+    errors = chosen.problem.errors(solution)
+    held_out = np.where(np.isfinite(chosen.errors), chosen.errors, np.nan)
+    camera = seen.camera(solution.change) if isinstance(seen, PixelObservations) else None
+    return HandEyeCalibration(
+        setup="eye-in-hand" if in_hand else "eye-to-hand",
+        camera_pose=Transform(hand if in_hand else base, CAMERA, *solution.camera),
+        target_pose=Transform(base if in_hand else hand, TARGET, *solution.target),
+        camera=camera,
+        target_scale=seen.scale(solution.change),
+        method=chosen.name,
+        candidates={
+            one.name: one.held_out if math.isfinite(one.held_out) else None for one in found
+        },
+        errors=np.array([math.sqrt(float((one**2).mean())) for one in errors]),
+        mean_error=float(np.concatenate(errors).mean()),
+        leave_one_out=held_out,
+        held_out_error=chosen.held_out if math.isfinite(chosen.held_out) else None,
+        covariance=_covariance(problem, chosen, solution),
+        robot_sigmas=None if solution.noise is None else solution.noise.robot,
+        robot_poses=(),
+    )
+
+
+def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Array:
+    """Return that of the steps of camera and target (12, 12).
+
+    Where the noise of the robot was part of the solution, it says; otherwise what the solutions
+    without some of the poses say, by the jackknife.
+    """
+    if solution.adjusted is not None and solution.noise is not None:
+        whole = solution.adjusted.information
+        size = np.sqrt(np.maximum(np.diag(whole), np.finfo(np.float64).tiny))
+        inverse = np.linalg.pinv(whole / np.outer(size, size), rcond=1e-14, hermitian=True)
+        joint: Array = (inverse / np.outer(size, size))[:12, :12]
+        return joint
+    steps = np.array([steps_between(solution, other) for _, other in chosen.folds])
+    if len(steps) < 2:
+        return np.full((12, 12), np.nan)
+    off = steps - steps.mean(axis=0)
+    folds: Array = (len(off) - 1) / len(off) * off.T @ off
+    return folds
+
+
+def _check_direction(problem: Problem) -> None:
+    """Raise where the poses fit far better as the other setup's, or inverted.
+
+    Raises:
+        CalibrationError: ``WRONG_FRAME``.
+    """
+    robot = problem.robot
+    other = dataclasses.replace(
+        problem, robot=Robot(robot.poses, not robot.in_hand), seen=problem.seen
+    )
+    off = []
+    for one in (problem, other):
+        tried = (solve_linear(name, one.robot, one.poses) for name in ("park", "shah"))
+        medians = [_median(one, found) for found in tried if found is not None]
+        off.append(min(medians, default=math.inf))
+    if off[1] < _size(problem) and off[0] > OTHER_WAY * off[1]:
+        raise CalibrationError(
+            "hand-eye: expected poses of the flange in the base, and the setup as it is, got poses "
+            f"that are {1e3 * off[0]:.3g} mm off so, and {1e3 * off[1]:.3g} mm the other way "
+            "round: they are inverted, or the camera is on the other side",
+            code=Code.WRONG_FRAME,
+            expected="T_base_flange",
+            got=off[1],
+        )
+
+
+def _median(problem: Problem, found: tuple[Rigid, Rigid]) -> float:
+    errors = problem.errors(Solution(*found, np.zeros(problem.seen.extra)))
+    return float(np.median(np.concatenate(errors)))
+
+
+def _remarks(problem: Problem, result: HandEyeCalibration, named: Sequence[str]) -> list[Remark]:
+    remarks = []
+    if abs(result.target_scale - 1.0) > SCALE_OFF:
+        remarks.append(
+            Remark(
+                Code.SCALE_MISMATCH,
+                f"expected the target as large as it was said, got {result.target_scale:.4f} "
+                "times that by the robot's motions: measure the print",
+            )
+        )
+    if problem.count < ADVISED_POSES:
+        remarks.append(
+            Remark(
+                Code.TOO_FEW,
+                f"expected {ADVISED_POSES} poses or more for an error that can be relied on, got "
+                f"{problem.count}",
+            )
+        )
+    turn = second_turn(problem.robot)
+    if turn < ADVISED_TURN:
+        remarks.append(
+            Remark(
+                Code.INSUFFICIENT_ROTATION,
+                f"expected the robot to turn by {math.degrees(ADVISED_TURN):g} deg rms about a "
+                f"second axis, got {math.degrees(turn):.1f} deg: tilt it more to both sides",
+            )
+        )
+    if result.held_out_error is None:
+        remarks.append(
+            Remark(Code.NOT_HELD_OUT, "too few poses to leave one out: no held-out error")
+        )
+    else:
+        worst = result.worst
+        others = float(np.median(np.delete(result.leave_one_out, worst)))
+        if result.leave_one_out[worst] > WORST * others:
+            remarks.append(
+                Remark(
+                    Code.OUTLIER,
+                    f"{named[worst]} is {1e3 * result.leave_one_out[worst]:.3g} mm off what the "
+                    f"others say of it, they are {1e3 * others:.3g} mm: take it again or leave it "
+                    "out",
+                )
+            )
+    return remarks
+
+
+def _lens_remarks(given: CameraModel, adjusted: CameraModel | None) -> list[Remark]:
+    if adjusted is None or np.array_equal(given.matrix, adjusted.matrix):
+        return []
+    before, after = given.matrix[0, 0], adjusted.matrix[0, 0]
+    return [
+        Remark(
+            Code.POOR_FIT,
+            f"expected the lens as it was given, got one that fits far better: fx {after:.1f} px "
+            f"instead of {before:.1f} px; the calibration's camera is that one",
+        )
+    ]
+
+
+def _reordered(result: HandEyeCalibration, back: Any) -> HandEyeCalibration:
+    return dataclasses.replace(
+        result, errors=result.errors[back], leave_one_out=result.leave_one_out[back]
+    )

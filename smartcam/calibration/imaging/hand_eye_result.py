@@ -1,0 +1,259 @@
+"""What a hand-eye calibration found, and what it is for: from pixels to the robot's base."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.calibration.codes import Code, Remark
+from smartcam.calibration.frames import Transform
+from smartcam.calibration.geometry import as_points
+from smartcam.calibration.imaging.hand_eye_choice import on_plane
+from smartcam.calibration.imaging.hand_eye_fit import Rigid
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.imaging.hand_eye_fit import RobotSigmas, Setup
+    from smartcam.calibration.imaging.views import TargetView
+
+__all__ = ["KIND", "HandEyeCalibration", "as_transform"]
+
+KIND = "hand-eye"
+"""What the files are called in the store."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandEyeCalibration:
+    """What :func:`~smartcam.calibration.imaging.hand_eye.calibrate_hand_eye` finds; immutable.
+
+    Attributes:
+        setup: ``eye-in-hand`` or ``eye-to-hand``.
+        camera_pose: ``T_flange_camera``; ``T_base_camera`` for a camera beside the robot.
+        target_pose: ``T_base_target``; ``T_flange_target`` there.
+        camera: the camera; None where poses of the target were given instead of views.
+        target_scale: size of the target over the nominal one.
+        method: what the candidate is called that was taken.
+        candidates: rms held-out error of each candidate on the target, metres; None where a
+            candidate has none.
+        errors: (V,), rms error of each pose on the target, metres, with all poses taken in.
+        mean_error: mean over all points, metres: what others publish as their 3D error.
+        leave_one_out: (V,), the same of a calibration from the others, with the robot's pose as it
+            was given, metres; NaN where there is none.
+        held_out_error: rms of these over all points, metres; None where there is none. It is what
+            picking has to expect.
+        covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
+            along those of its target, m) and of ``target_pose``.
+        robot_sigmas: of each axis of the robot's poses, as given or estimated; None where they were
+            taken for exact.
+        robot_poses: ``T_base_flange``, as given.
+        views: as given; empty where poses were.
+        target_poses: ``T_camera_target`` of each pose, from its own view or as given.
+        warnings: what one should know before using it.
+    """
+
+    setup: Setup
+    camera_pose: Transform
+    target_pose: Transform
+    camera: CameraModel | None
+    target_scale: float
+    method: str
+    candidates: dict[str, float | None]
+    errors: Array
+    mean_error: float
+    leave_one_out: Array
+    held_out_error: float | None
+    covariance: Array
+    robot_sigmas: RobotSigmas | None
+    robot_poses: tuple[Transform, ...]
+    views: tuple[TargetView, ...] = ()
+    target_poses: tuple[Transform, ...] = ()
+    warnings: tuple[Remark, ...] = ()
+
+    def __post_init__(self) -> None:
+        for array in (self.errors, self.leave_one_out, self.covariance):
+            array.flags.writeable = False
+
+    @property
+    def rotation_error(self) -> float:
+        """Expected rms error of the camera's orientation, all axes together, radians."""
+        return math.sqrt(float(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def translation_error(self) -> float:
+        """Expected rms error of the camera's position, all axes together, metres."""
+        return math.sqrt(float(np.trace(self.covariance[3:6, 3:6])))
+
+    @property
+    def worst(self) -> int:
+        """Index of the pose with the largest held-out error, or error where there is none."""
+        errors = self.errors if np.isnan(self.leave_one_out).any() else self.leave_one_out
+        return int(np.argmax(errors))
+
+    def camera_at(self, robot_pose: Transform | Pose | None = None) -> Transform:
+        """Return ``T_base_camera``.
+
+        Args:
+            robot_pose: ``T_base_flange``; a camera beside the robot has no need of it.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: no pose, or one of other frames.
+        """
+        if self.setup == "eye-to-hand":
+            return self.camera_pose
+        if robot_pose is None:
+            raise CalibrationError(
+                "eye-in-hand: expected the robot's pose when the image was taken, got none",
+                code=Code.WRONG_FRAME,
+                expected="a pose of the robot",
+            )
+        return as_transform(robot_pose, self.camera_pose.target) @ self.camera_pose
+
+    def to_plane(
+        self,
+        pixels: ArrayLike,
+        *,
+        plane: Transform,
+        robot_pose: Transform | Pose | None = None,
+        height: float = 0.0,
+    ) -> Array:
+        """Return where what a camera sees lies in a plane, wherever the robot is.
+
+        Args:
+            pixels: (N, 2).
+            plane: ``T_base_plane``; the plane is its z = 0. Such is ``target_pose`` of a camera on
+                the hand.
+            robot_pose: ``T_base_flange`` when the image was taken; none for a camera beside the
+                robot.
+            height: of the features over the plane, along its z, metres.
+
+        Returns:
+            (N, 3), in the robot's base, metres.
+
+        Raises:
+            CalibrationError: SHAPE or NOT_FINITE; WRONG_FRAME; OUT_OF_FIELD: a ray that does not
+                meet the plane before the camera; NO_CALIBRATION: without a camera's lens.
+        """
+        lens, seen = self._lens(), as_points(pixels, 2, "pixels")
+        found = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
+        return plane.apply(found)
+
+    def predicted_error(
+        self,
+        pixels: ArrayLike,
+        *,
+        plane: Transform,
+        robot_pose: Transform | Pose | None = None,
+    ) -> Array:
+        """Return the rms error to expect of :meth:`to_plane`, of what the camera's pose adds to it.
+
+        The robot's own error at ``robot_pose`` and that of the pixels come on top.
+
+        Args:
+            pixels: (N, 2).
+            plane: as for :meth:`to_plane`.
+            robot_pose: as for :meth:`to_plane`.
+
+        Returns:
+            (N,), metres.
+
+        Raises:
+            CalibrationError: as :meth:`to_plane`.
+        """
+        lens, seen = self._lens(), as_points(pixels, 2, "pixels")
+        behind = self.camera_at(robot_pose) @ self.camera_pose.inverse()
+        camera = Rigid(self.camera_pose.rotation, self.camera_pose.translation)
+        slopes, small = [], 1e-6
+        for axis in range(6):
+            ends = []
+            for sign in (-small, small):
+                moved = camera.moved(sign * np.eye(6)[axis])
+                at = behind @ Transform(self.camera_pose.target, self.camera_pose.source, *moved)
+                ends.append(_met(lens, seen, at.inverse() @ plane, 0.0))
+            slopes.append((ends[1] - ends[0]) / (2 * small))
+        by_step = np.stack(slopes, axis=-1)
+        joint = by_step @ self.covariance[:6, :6] @ np.swapaxes(by_step, 1, 2)
+        error: Array = np.sqrt(np.trace(joint, axis1=1, axis2=2))
+        return error
+
+    def _lens(self) -> CameraModel:
+        if self.camera is None:
+            raise CalibrationError(
+                "to_plane: expected a calibration with the camera's lens, got one from poses of "
+                "the target",
+                code=Code.NO_CALIBRATION,
+                expected="camera",
+            )
+        return self.camera
+
+    def to_data(self) -> dict[str, Any]:
+        """Return everything as JSON takes it; :meth:`from_data` gives it back bit by bit."""
+        from smartcam.calibration.imaging.hand_eye_stored import to_data
+
+        return to_data(self)
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> HandEyeCalibration:
+        """Return what :meth:`to_data` was made of; nothing is calculated anew.
+
+        Raises:
+            CalibrationError: SHAPE: this is no hand-eye calibration.
+        """
+        from smartcam.calibration.imaging.hand_eye_stored import from_data
+
+        return from_data(data)
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a file, whole or not at all; see :mod:`smartcam.calibration.store`."""
+        from smartcam.calibration import store
+
+        store.write(path, KIND, self.to_data())
+
+    @classmethod
+    def load(cls, path: str | Path) -> HandEyeCalibration:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            CalibrationError: the file is damaged, newer, or holds something else.
+            OSError: it is not there, or cannot be read.
+        """
+        from smartcam.calibration import store
+
+        return cls.from_data(store.read(path, KIND))
+
+
+def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) -> Array:
+    """Return where rays of pixels pass a plane of the camera's frame, in the plane's.
+
+    Raises:
+        CalibrationError: OUT_OF_FIELD.
+    """
+    rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
+    raised = plane.rotation[:, 2] * height + plane.translation
+    found = on_plane(rays, plane.rotation, raised)
+    missed = ~np.isfinite(found).all(axis=1)
+    if missed.any():
+        row = int(np.argmax(missed))
+        raise CalibrationError(
+            "to_plane: expected pixels whose rays meet the plane before the camera, got "
+            f"{pixels[row].tolist()} in row {row}, whose ray does not",
+            code=Code.OUT_OF_FIELD,
+            got=pixels[row].tolist(),
+        )
+    above: Array = found + np.array([0.0, 0.0, height])
+    return above
+
+
+def as_transform(pose: Transform | Pose, flange: str) -> Transform:
+    """Return ``T_base_flange`` of a pose of the robot, whichever way it is given."""
+    return Transform.from_pose(pose, flange) if isinstance(pose, Pose) else pose

@@ -1,0 +1,129 @@
+"""The wizard of a camera on a robot, with a rendered sheet and a robot that knows its poses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from imaging_scenes import CAMERA, SHEET, scene
+
+from smartcam.calibration.imaging.hand_eye import HandEyeCalibration
+from smartcam.calibration.imaging.hand_eye_wizard import SUGGESTIONS, hand_eye_wizard
+from smartcam.calibration.imaging.rendering import render
+from smartcam.calibration.journal import Journal
+from smartcam.calibration.sequence import Session
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from smartcam.calibration.frames import Transform
+
+TRUTH = scene("eye-in-hand", poses=6, seed=7)
+
+
+class Cell:
+    """A robot with a camera; each picture is taken at the next pose."""
+
+    def __init__(self) -> None:
+        self.poses = list(TRUTH.robot_poses)
+        self.hidden = 0
+
+    async def take_picture(self) -> Any:
+        if self.hidden:
+            self.hidden -= 1
+            return np.full(CAMERA.size[::-1], 128, dtype=np.uint8)
+        return render(SHEET, CAMERA, TRUTH.seen(self.poses[0]), blur=0.7)
+
+    async def read_robot(self) -> Transform:
+        return self.poses[0] if self.hidden else self.poses.pop(0)
+
+
+def begin(folder: Path, cell: Cell, journal: Path | None = None) -> Session:
+    wizard = hand_eye_wizard(
+        target=SHEET,
+        take_picture=cell.take_picture,
+        read_robot=cell.read_robot,
+        save_to=lambda name: folder / f"{name}.json",
+        camera=CAMERA,
+    )
+    opened = None if journal is None else Journal(journal)
+    return Session(wizard, opened, parameters={"name": "gripper"})
+
+
+async def say(session: Session, answers: object = None) -> dict[str, Any]:
+    view = await session.submit(session.token, answers)
+    assert view["errors"] == {}, view
+    return view
+
+
+async def test_views_taken_give_a_calibration_in_a_file(tmp_path: Path) -> None:
+    session = begin(tmp_path, Cell())
+    view = await say(session, {"setup": "eye-in-hand"})
+    for number in range(6):
+        assert view["step"] == f"view-{number + 1}"
+        assert SUGGESTIONS[number] in view["description"]
+        view = await say(session)
+    view = await say(session, {"next": "calculate"})
+    assert view["step"] == "calculate"
+    view = await say(session)
+    assert (view["step"], view["defaults"]["next"]) == ("review", "accept")
+    assert any("mm rms on the sheet, at views that were left out" in one for one in view["notes"])
+    view = await say(session)
+    assert view["step"] == "save"
+    view = await say(session)
+    assert view["type"] == "result", view
+    found = HandEyeCalibration.load(tmp_path / "gripper.json")
+    assert TRUTH.errors(found.camera_pose)[1] < 2e-4
+    assert len(found.views) == 6
+
+
+async def test_view_without_a_sheet_is_taken_again(tmp_path: Path) -> None:
+    cell = Cell()
+    session = begin(tmp_path, cell)
+    await say(session)
+    cell.hidden = 1
+    view = await session.submit(session.token, None)
+    assert "base" in view["errors"]
+    assert view["step"] == "view-1"
+    cell.hidden = 0
+    assert (await say(session))["step"] == "view-2"
+
+
+async def test_view_removed_is_calculated_without(tmp_path: Path) -> None:
+    session = begin(tmp_path, Cell())
+    await say(session)
+    for _ in range(5):
+        await say(session)
+    await say(session, {"next": "calculate"})
+    await say(session)
+    view = await say(session, {"next": "remove", "view": 2})
+    assert (view["step"], view["notes"]) == ("calculate", ["4 views"])
+    view = await say(session)
+    assert view["notes"][0].startswith("4 views, ")
+    view = await say(session, {"next": "more"})
+    assert view["step"] == "view-5"
+
+
+async def test_views_that_give_nothing_say_why(tmp_path: Path) -> None:
+    cell = Cell()
+    cell.poses = [cell.poses[0]] * 3
+    session = begin(tmp_path, cell)
+    for _ in range(4):
+        await say(session)
+    await say(session, {"next": "calculate"})
+    view = await say(session)
+    assert view["notes"][0].startswith("POSES_TOO_SIMILAR: hand-eye: expected at least 3")
+    assert view["defaults"]["next"] == "more"
+
+
+async def test_views_are_there_again_after_a_crash(tmp_path: Path) -> None:
+    cell = Cell()
+    session = begin(tmp_path, cell, tmp_path / "journal")
+    for _ in range(4):
+        view = await say(session)
+    left = len(cell.poses)
+    session.close()
+    again = begin(tmp_path, cell, tmp_path / "journal")
+    assert again.current["step"] == view["step"] == "view-4"
+    assert len(cell.poses) == left
+    again.close()
