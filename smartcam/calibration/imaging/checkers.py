@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from numpy.typing import NDArray
 
     from smartcam.calibration.geometry import Array
     from smartcam.calibration.imaging.corners import Corners
@@ -41,6 +43,9 @@ median of that."""
 
 AREA_PART = 0.8
 """Of the area outside of a corner that is looked at: not its rim."""
+
+SQUARES = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5]])
+"""Middles of the four squares next to an outer corner, in sides of one."""
 
 DISC = np.array([(x, y) for x in range(-4, 5) for y in range(-4, 5) if x * x + y * y <= 20]) / 4.5
 """(N, 2), points of the unit disc."""
@@ -155,14 +160,44 @@ def _number(
 ) -> tuple[Arrangement, float | None]:
     what = f"checkerboard of {target.columns} x {target.rows} corners"
     if target.origin_mark:
-        area = target.corner_areas[0] / target.square + AREA_PART * AREA_DIAMETER / 2 * DISC
-        return marked(
-            ways,
-            lambda order: mean_level(image, _near(corners.points[order], area)),
-            f"{what} with a dark area at the origin",
-        )
+        shades = {int(way.order[0, 0]): _shades(image, target, corners, way) for way in ways}
+        dark, light = np.mean([[shade.black, shade.white] for shade in shades.values()], axis=0)
+        outside = sum(shade.area is None for shade in shades.values())
+        note = f" ({outside} of the 4 such areas outside of the image)" if outside else ""
+
+        def level(order: NDArray[np.intp]) -> float:
+            """Return the level of the area as it would be where all light is as in the mean."""
+            black, white, area = shades[int(order[0, 0])]
+            part = 1.0 if area is None else (area - black) / max(white - black, 1.0)
+            return float(dark + (light - dark) * part)
+
+        return marked(ways, level, f"{what} with a dark area at the origin{note}")
     black = [way for way in ways if way.proper and _blackness(target, corners, way) > 0]
     return leftmost(black or ways, what), None
+
+
+class _Shades(NamedTuple):
+    """Grey levels near an outer corner.
+
+    Attributes:
+        black: of the two black squares next to it.
+        white: of the two white ones.
+        area: of the area outside of it; None where that is not in the image.
+    """
+
+    black: float
+    white: float
+    area: float | None
+
+
+def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arrangement) -> _Shades:
+    grid = corners.points[way.order]
+    squares = sorted(mean_level(image, _near(grid, at + PART * DISC)) for at in SQUARES)
+    area = target.corner_areas[0] / target.square + AREA_PART * AREA_DIAMETER / 2 * DISC
+    seen = _near(grid, area)
+    inside = ((seen >= 0) & (seen <= np.array(image.size) - 1)).all()
+    level = mean_level(image, seen) if inside else None
+    return _Shades(sum(squares[:2]) / 2, sum(squares[2:]) / 2, level)
 
 
 def _blackness(target: Checkerboard, corners: Corners, way: Arrangement) -> float:

@@ -24,7 +24,8 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
 
     Corners of squares are found where two fitted edges cross, dots by the fitted ellipse of their
     rim, from whose middle the centre is told by how the whole grid is seen. All points of a
-    checkerboard and of a grid of dots must be seen; of a ChArUco board at least four corners.
+    checkerboard and of a grid of dots must be seen; of a ChArUco board at least four corners. Dots
+    may be dark on light or light on dark; a grid that goes on beside them is refused.
 
     Points are numbered as the target does. Its origin is told by its mark, its larger dot or its
     ids; without these by the outermost square there, which is black, where only one of the corners

@@ -28,7 +28,6 @@ __all__ = [
     "LEAST_MARGIN",
     "Arrangement",
     "arrangements",
-    "lattice",
     "leftmost",
     "marked",
     "rows_of",
@@ -36,12 +35,6 @@ __all__ = [
 
 LEAST_MARGIN = 30.0
 """Grey levels of 255 by which a marked origin is darker than the next corner at least."""
-
-LEAST_SINE = 0.5
-"""Of the angle between the steps to a grid's next column and its next row: 30 degrees."""
-
-NEAR = 0.35
-"""Of a step, from where it leads to the point that is found there at most."""
 
 _TURNS: Final = [
     np.array(entries).reshape(2, 2)
@@ -78,7 +71,9 @@ def arrangements(
         target: what was found.
     """
     wanted = _places(target)
-    ways = []
+    ways: list[Arrangement] = []
+    if len(points) != len(wanted):
+        return ways
     for turn in _TURNS:
         turned = places @ turn
         number = {place: index for index, place in enumerate(_from_zero(turned))}
@@ -106,38 +101,6 @@ def rows_of(columns: int, rows: int) -> NDArray[np.intp]:
     """Return the places (N, 2) of points that come row by row."""
     row, column = np.divmod(np.arange(columns * rows), columns)
     return np.stack([column, row], axis=1)
-
-
-def lattice(points: Array) -> NDArray[np.intp]:
-    """Return the places (N, 2) of the points of a grid in any order.
-
-    From the middle one outwards each is found by the steps that lead to its neighbours. Those that
-    are not found get places that no grid has.
-    """
-    places = np.full((len(points), 2), -len(points), dtype=np.intp)
-    first = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())
-    near = points - points[first]
-    near = near[np.argsort(np.linalg.norm(near, axis=1))[1:]]
-    across = near[0]
-    sines = np.abs(across[0] * near[:, 1] - across[1] * near[:, 0])
-    sines /= np.linalg.norm(across) * np.maximum(np.linalg.norm(near, axis=1), 1e-9)
-    along = near[int(np.argmax(sines > LEAST_SINE))]
-    places[first] = 0
-    steps = {first: np.stack([across, along])}
-    waiting = [first]
-    while waiting:
-        here = waiting.pop(0)
-        for axis, sign in itertools.product((0, 1), (1, -1)):
-            step = sign * steps[here][axis]
-            off = np.linalg.norm(points - points[here] - step, axis=1)
-            there = int(off.argmin())
-            if off[there] < NEAR * np.linalg.norm(step) and there not in steps:
-                places[there] = places[here]
-                places[there, axis] += sign
-                steps[there] = steps[here].copy()
-                steps[there][axis] = sign * (points[there] - points[here])
-                waiting.append(there)
-    return places
 
 
 def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:

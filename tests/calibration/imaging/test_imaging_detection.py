@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -137,10 +139,17 @@ def test_find_target_in_mirror_image_is_refused(target: Target) -> None:
         find_target(image, target)
 
 
-def test_find_charuco_in_mirror_image_is_not_found() -> None:
-    image = np.ascontiguousarray(drawn(CHARUCO).image[:, ::-1])
+@pytest.mark.parametrize("dictionary", ["DICT_5X5_250", "DICT_4X4_50"])
+def test_find_charuco_in_mirror_image_is_refused(dictionary: str) -> None:
+    target = dataclasses.replace(CHARUCO, dictionary=dictionary)
+    image = np.ascontiguousarray(drawn(target).image[:, ::-1])
+    with refused(Code.MIRRORED, "charuco of 8 x 6 squares: expected an image", "mirrored"):
+        find_target(image, target)
+
+
+def test_find_charuco_of_empty_image_is_not_found() -> None:
     with refused(Code.TARGET_NOT_FOUND, "8 x 6 squares, found 0 beside 0 of its markers"):
-        find_target(image, CHARUCO)
+        find_target(np.full((480, 640), 128, dtype=np.uint8), CHARUCO)
 
 
 def test_find_target_whose_dark_area_is_not_there_is_ambiguous() -> None:
@@ -231,3 +240,27 @@ def test_find_target_in_no_image_is_refused(image: object, got: str) -> None:
 def test_find_target_of_no_target_is_refused() -> None:
     with refused(Code.SHAPE, "expected a Checkerboard, Charuco or CircleGrid, got str"):
         find_target(np.zeros((480, 640), np.uint8), "board")  # type: ignore[arg-type]
+
+
+def test_find_target_whose_origin_area_is_not_in_the_image_says_so() -> None:
+    picture = drawn(DARK)
+    left = round(picture.pixels[0, 0] - 1.1 * np.ptp(picture.pixels[:2, 0]))
+    text = "at the origin (2 of the 4 such areas outside of the image): expected the origin"
+    with refused(Code.AMBIGUOUS_ORIGIN, text):
+        find_target(np.ascontiguousarray(picture.image[:, left:]), DARK)
+
+
+def test_find_target_with_other_areas_outside_of_the_image_has_its_origin() -> None:
+    picture = drawn(DARK, roll=180)
+    left = round(picture.pixels[8, 0] - 1.1 * np.ptp(picture.pixels[:2, 0]))
+    picture.image[:, : left + 3] = 0
+    view = find_target(np.ascontiguousarray(picture.image[:, left:]), DARK)
+    assert np.abs(view.points - picture.pixels + np.array([left, 0])).max() < 0.02
+
+
+@pytest.mark.parametrize("roll", [0, 180])
+def test_find_target_in_uneven_light_has_its_origin(roll: int) -> None:
+    picture = drawn(DARK, roll=roll)
+    light = np.linspace(1.0, 0.2, 640)
+    view = find_target((picture.image * light).astype(np.uint8), DARK)
+    assert picture.off(view).max() < 0.1

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from drawnkit import drawn
 from imaging_scenes import refused
 
 from smartcam.calibration.codes import Code
+from smartcam.calibration.imaging.lattices import lattices
 from smartcam.calibration.imaging.ordering import (
     Arrangement,
     arrangements,
-    lattice,
     leftmost,
     marked,
     rows_of,
 )
 from smartcam.calibration.imaging.targets import Checkerboard, CircleGrid
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.calibration.geometry import Array
 
 GRIDS = [
     (CircleGrid(columns=6, rows=4, spacing=0.02, diameter=0.01), 4, 2),
@@ -27,6 +34,14 @@ GRIDS = [
 ]
 
 
+def laid_out(points: Array) -> NDArray[np.intp]:
+    """Return the places (N, 2) of points that are a grid."""
+    (grid,) = lattices(points, np.ones(len(points)), least=len(points), most=len(points))
+    places = np.zeros((len(points), 2), dtype=np.intp)
+    places[list(grid.values())] = list(grid)
+    return places
+
+
 @pytest.mark.parametrize(("grid", "count", "proper"), GRIDS, ids=repr)
 def test_arrangements_of_shuffled_points_are_those_that_look_alike(
     grid: CircleGrid, count: int, proper: int
@@ -34,7 +49,7 @@ def test_arrangements_of_shuffled_points_are_those_that_look_alike(
     pixels = drawn(grid, tilt=40, roll=25).pixels
     shuffled = np.random.default_rng(1).permutation(len(pixels))
     found = pixels[shuffled]
-    ways = arrangements(found, lattice(found), grid)
+    ways = arrangements(found, laid_out(found), grid)
     assert (len(ways), sum(way.proper for way in ways)) == (count, proper)
     numbered = [way.order.ravel().tolist() for way in ways if way.proper]
     assert np.argsort(shuffled).tolist() in numbered
@@ -43,14 +58,15 @@ def test_arrangements_of_shuffled_points_are_those_that_look_alike(
 def test_arrangements_of_other_counts_are_none() -> None:
     grid, other = GRIDS[0][0], CircleGrid(columns=8, rows=3, spacing=0.02, diameter=0.01)
     pixels = drawn(grid).pixels
-    assert arrangements(pixels, lattice(pixels), other) == []
+    assert arrangements(pixels, laid_out(pixels), other) == []
 
 
-def test_lattice_with_a_point_astray_has_no_arrangement() -> None:
-    grid = GRIDS[0][0]
-    pixels = drawn(grid).pixels
-    pixels[0] -= 13.0
-    assert arrangements(pixels, lattice(pixels), grid) == []
+def test_arrangements_of_a_grid_with_a_point_too_many_are_none() -> None:
+    board = Checkerboard(columns=5, rows=4, square=0.02)
+    pixels, places = drawn(board).pixels, rows_of(5, 4)
+    more = np.vstack([pixels, pixels[:1] - 30]), np.vstack([places, [[-1, 0]]])
+    assert arrangements(pixels, places, board) != []
+    assert arrangements(*more, board) == []
 
 
 def test_rows_of_counts_columns_first() -> None:
