@@ -114,8 +114,9 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     off = measured / nominal - 1.0
     if abs(off) <= max(SCALE_TOLERANCE, 3.0 * uncertainty):
         return None
+    percent = f"{100 * off:+.2g}" if abs(off) < 0.1 else f"{100 * off:+.0f}"
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
-    text += f" ({100 * off:+.2g} %): the print, the units or the height are other than thought"
+    text += f" ({percent} %): the print, the units or the height are other than thought"
     if exact or abs(off) > SCALE_LIMIT:
         raise CalibrationError(text, code=Code.SCALE_MISMATCH, expected=nominal, got=measured)
     return text

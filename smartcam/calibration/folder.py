@@ -51,8 +51,8 @@ class Folder:
 
     def names(self) -> list[str]:
         """Return the names of the calibrations there, sorted."""
-        found = (one.stem for one in self.path.glob("*.json") if not one.is_symlink())
-        return sorted(name for name in found if _is_name(name))
+        files = (one for one in self.path.glob("*.json") if one.is_file() and not one.is_symlink())
+        return sorted(one.stem for one in files if _is_name(one.stem))
 
     def calibration(self, name: str) -> Path:
         """Return the file of a calibration.

@@ -40,6 +40,9 @@ LEAST_SINE = 0.17
 At 5 degrees, 0.5 mm of height tilt the normal by 2.2 degrees, at 1 degree by 10.8 (derived).
 """
 
+LARGEST = 1e100
+"""Of a coordinate: products of a few of them are numbers, too."""
+
 
 def as_points(values: ArrayLike, columns: int, what: str) -> Array:
     """Return ``values`` as float64 of shape (N, ``columns``).
@@ -69,6 +72,13 @@ def as_points(values: ArrayLike, columns: int, what: str) -> Array:
             code=Code.NOT_FINITE,
             expected="finite numbers",
             got=points[row].tolist(),
+        )
+    if points.size and not np.abs(points).max() <= LARGEST:
+        raise CalibrationError(
+            f"{what}: expected numbers up to {LARGEST:g}, got {np.abs(points).max():g}",
+            code=Code.NOT_FINITE,
+            expected=LARGEST,
+            got=float(np.abs(points).max()),
         )
     return points
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.sequence import ask
@@ -16,6 +16,7 @@ from smartcam.models import Localization, Pose, Quaternion
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from smartcam.calibration.sequence import Answer
     from smartcam.calibration.steps import Answers, Input
 
 __all__ = [
@@ -28,7 +29,9 @@ __all__ = [
     "ReadRobot",
     "Station",
     "Touch",
+    "Touched",
     "choose",
+    "touch",
     "with_default",
 ]
 
@@ -202,24 +205,52 @@ class Station:
             tool_z: where the tool points when its position is typed.
             preview: of the step.
         """
-        where = f"Move the tip of the tool onto {what}, with the tool held as at every touch."
-        if self.read_robot is not None:
-            step = Step(
-                id=step_id, title=title, description=where, button="It is there", preview=preview
-            )
-            outcome = (await ask(step, partial(_read, self.read_robot))).outcome
-            x, y, z = outcome["position"]
-            return Touch(mark, (x, y, z), _axis_z(Quaternion(*outcome["orientation"])))
         step = Step(
             id=step_id,
             title=title,
-            description=f"{where} Then take its position from the robot, in its base.",
-            inputs=tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz"),
+            description=f"Move the tip of the tool onto {what}, with the tool held as at every "
+            "touch.",
             preview=preview,
         )
-        answer = await ask(step)
-        x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
-        return Touch(mark, (x, y, z), tool_z)
+        touched = await touch(step, self.read_robot, unit=unit, tool_z=tool_z)
+        return Touch(mark, touched.robot, touched.tool_z)
+
+
+class Touched(NamedTuple):
+    """What :func:`touch` gives.
+
+    Attributes:
+        answer: of the step.
+        robot: where the tip was, in the robot's base, metres.
+        tool_z: where the tool pointed; None if that is not known.
+    """
+
+    answer: Answer
+    robot: Vector
+    tool_z: Vector | None
+
+
+async def touch(
+    step: Step, read_robot: ReadRobot | None, *, unit: str, tool_z: Vector | None = None
+) -> Touched:
+    """Ask for a touch.
+
+    Args:
+        step: says what is to be touched; where the robot is not read, ``x, y, z`` are asked for
+            behind its inputs.
+        read_robot: reads the robot's pose; None: it is typed.
+        unit: of what is typed, one of :data:`UNITS`.
+        tool_z: where the tool points when its position is typed.
+    """
+    if read_robot is not None:
+        answer = await ask(replace(step, button="It is there"), partial(_read, read_robot))
+        x, y, z = answer.outcome["position"]
+        return Touched(answer, (x, y, z), _axis_z(Quaternion(*answer.outcome["orientation"])))
+    place = tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz")
+    about = f"{step.description} Then take its position from the robot, in its base."
+    answer = await ask(replace(step, description=about, inputs=(*step.inputs, *place)))
+    x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
+    return Touched(answer, (x, y, z), tool_z)
 
 
 async def _read(read_robot: ReadRobot, _answers: Answers) -> dict[str, Any]:

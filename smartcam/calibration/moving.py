@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smartcam.calibration.codes import Code
+from smartcam.calibration.geometry import as_points
 from smartcam.calibration.solvers import Chain, Poses, Solver
 from smartcam.exceptions import CalibrationError
 
@@ -64,7 +65,8 @@ class MovingCamera:
             does 5 mm in 20 ms, a quarter of a millimetre in one.
 
     Raises:
-        CalibrationError: ``TOO_FEW`` or ``COLLINEAR`` points of the field.
+        CalibrationError: ``SHAPE``, ``NOT_FINITE``, ``TOO_FEW`` or ``COLLINEAR`` points of the
+            field.
     """
 
     def __init__(
@@ -76,7 +78,7 @@ class MovingCamera:
         tolerance: float = 2e-4,
         max_lag: float = 1e-3,
     ) -> None:
-        points = np.array(field, dtype=np.float64).reshape(-1, 3)
+        points = as_points(field, 3, "moving camera: points of the field")
         if len(points) < 3:
             raise CalibrationError(
                 f"moving camera: expected 3 points of the field or more, got {len(points)}",
@@ -114,7 +116,8 @@ class MovingCamera:
 
         Raises:
             CalibrationError: ``WRONG_FRAME``: a pose of other frames; ``NOT_SIMULTANEOUS``: pose
-                and image are more than ``max_lag`` apart, or the pose has no time;
+                and image are more than ``max_lag`` apart, or the pose has no time; ``BAD_TIME``:
+                the image's has no time zone;
                 ``PLANE_MOVED``: the plane of the parts would not be where the camera saw it.
         """
         self._check_frames(pose)
@@ -147,6 +150,13 @@ class MovingCamera:
                 "image's, got none",
                 code=Code.NOT_SIMULTANEOUS,
                 expected=image_at,
+            )
+        if image_at.tzinfo is None:
+            raise CalibrationError(
+                f"moving camera: expected an image's time with its time zone, got {image_at}",
+                code=Code.BAD_TIME,
+                expected="a time with its time zone",
+                got=image_at,
             )
         lag = abs(pose.at - image_at)
         if lag > self._max_lag:

@@ -86,7 +86,7 @@ class Drift(NamedTuple):
 class PlaneCalibration:
     """What :func:`fit_plane` finds; immutable.
 
-    Two calibrations are the same where their :meth:`to_data` is.
+    ``==`` asks for one and the same object; compare :meth:`to_data` for the same contents.
 
     Attributes:
         model: ``rigid``, ``similarity``, ``affine``, ``homography``, or ``touches`` for
@@ -330,11 +330,18 @@ class PlaneCalibration:
         Args:
             camera_points: (K, 2), or one point (2,).
             robot_points: (K, 3) or (3,), where the robot touches them, metres.
-            level: how seldom a calibration that still holds may be called stale.
+            level: how seldom a calibration that still holds may be called stale, between 0 and 1.
 
         Raises:
-            CalibrationError: as :meth:`covariance_at`.
+            CalibrationError: as :meth:`covariance_at`; NOT_FINITE: no such level.
         """
+        if not 0.0 < level < 1.0:
+            raise CalibrationError(
+                f"level: expected a number between 0 and 1, got {level}",
+                code=Code.NOT_FINITE,
+                expected="a number between 0 and 1",
+                got=level,
+            )
         seen = as_points(np.atleast_2d(camera_points), 2, "camera points")
         touched = as_points(np.atleast_2d(robot_points), 3, "robot points")
         if len(seen) != len(touched) or not len(seen):

@@ -42,6 +42,9 @@ MOST_THICKNESS = 0.2
 SAME = 1e-9
 """Of the points' extent: what is closer together counts as the same."""
 
+SMALLEST = 1e-100
+"""Difference of two coordinates below which they are the same: the square of it is a number."""
+
 
 def read_pairs(
     camera_points: ArrayLike, robot_points: ArrayLike, weights: ArrayLike | None
@@ -142,7 +145,7 @@ def check_lever(found: float, touch_sigma: float) -> None:
         raise CalibrationError(
             f"robot points: expected at least {LEAST_LEVER:g} sigmas of a touch "
             f"({1e3 * LEAST_LEVER * touch_sigma:.3g} mm) in each direction, "
-            f"got {1e3 * found:.3g} mm",
+            f"got {1e3 * found:.3g} mm: they lie too close together, or are in another unit",
             code=Code.SHORT_LEVER,
             expected=LEAST_LEVER * touch_sigma,
             got=found,
@@ -176,7 +179,7 @@ def _extents(points: Array) -> Array:
 def _check_distinct(points: Array, what: str, least: int) -> None:
     extent = float(np.ptp(points, axis=0).max())
     rounding = np.finfo(np.float64).eps * float(np.abs(points).max())
-    grain = max(SAME * extent, 4.0 * rounding, np.finfo(np.float64).tiny)
+    grain = max(SAME * extent, 4.0 * rounding, SMALLEST)
     distinct = len(np.unique(np.round((points - points[0]) / grain), axis=0))
     if distinct < least:
         raise CalibrationError(

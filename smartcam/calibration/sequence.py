@@ -226,12 +226,24 @@ class Session:
                 f"the journal is incomplete: {exc!r}; expected one as a sequence writes it",
                 code=Code.BROKEN_FILE,
             ) from exc
-        self._run = _Run(wizard, self.parameters, self._log.entries)
+        self._run = self._resumed()
         if journal is not None and journal.header is None:
             journal.start(header)
         self._errors: dict[str, str] = {}
         self._lock = asyncio.Lock()
         self._scope: asyncio.Timeout | None = None
+
+    def _resumed(self) -> _Run:
+        try:
+            return _Run(self.wizard, self.parameters, self._log.entries)
+        except (AttributeError, LookupError, TypeError, ValueError) as exc:
+            if isinstance(exc, SmartCamError) or not self._log.entries:
+                raise
+            raise CalibrationError(
+                f"the journal's answers do not lead through {self.wizard.name!r}: {exc!r}; "
+                "expected those that its steps took",
+                code=Code.BROKEN_FILE,
+            ) from exc
 
     def _header(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         wizard, journal = self.wizard, self._journal

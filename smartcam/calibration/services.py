@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam.calibration.codes import Code
 from smartcam.calibration.folder import EXPORTS, Folder
 from smartcam.calibration.journal import Journal
+from smartcam.calibration.kinds import of_document
 from smartcam.calibration.sequence import Session
 from smartcam.calibration.store import keep_backup, read_document, replace_file
 from smartcam.calibration.wizard import KIND
@@ -26,8 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from smartcam.calibration.plane import PlaneCalibration
+    from smartcam.calibration.kinds import AnyCalibration
     from smartcam.calibration.sequence import Wizard
+    from smartcam.calibration.store import Document
 
 __all__ = ["JOURNALS", "CalibrationService"]
 
@@ -61,7 +63,7 @@ class CalibrationService:
         self._wizards = {wizard.name: wizard for wizard in wizards}
         self._session: Session | None = None
         self._name: str | None = None
-        self._calibration: PlaneCalibration | None = None
+        self._calibration: AnyCalibration | None = None
         self._numbers = itertools.count(1)
 
     @property
@@ -164,21 +166,20 @@ class CalibrationService:
 
         Raises:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read. ``UNKNOWN_FORMAT``;
-                ``NOT_SIMILAR``: it has no frame; see
-                :func:`~smartcam.calibration.formats.plane_frame`.
+                ``WRONG_KIND``: a matrix is wanted of what is no plane's; ``NOT_SIMILAR``: it has no
+                frame; see :func:`~smartcam.calibration.formats.plane_frame`.
             OSError: it cannot be written.
         """
         from smartcam.calibration.formats import PlaneMatrix, compose
         from smartcam.calibration.formats.opencv import compose_matrix
+        from smartcam.calibration.plane import PlaneCalibration
 
         source = self.folder.find(name)
         path = self.folder.export(target)
-        calibration, context = _loaded(source)
-        if form is not None:
-            body = compose(form, calibration, suffix=path.suffix).encode()
-        elif path.suffix == ".json":
+        document = read_document(source)
+        if form is None and path.suffix == ".json":
             body = source.read_bytes()
-        elif path.suffix != MATRIX:
+        elif form is None and path.suffix != MATRIX:
             raise CalibrationError(
                 f"{path.name}: expected the format to be named, or a file that ends in .json or "
                 f"{MATRIX}",
@@ -187,13 +188,17 @@ class CalibrationService:
                 got=path.suffix,
             )
         else:
-            unit = str(context.get("camera_unit", "unit"))
-            body = compose_matrix(PlaneMatrix.of(calibration), unit).encode()
+            calibration = PlaneCalibration.from_data(_of_kind(document, KIND, source.name))
+            if form is not None:
+                body = compose(form, calibration, suffix=path.suffix).encode()
+            else:
+                unit = str(document.context.get("camera_unit", "unit"))
+                body = compose_matrix(PlaneMatrix.of(calibration), unit).encode()
         replace_file(path, body)
         return f"{EXPORTS}/{path.name}"
 
-    def load(self, name_or_path: str) -> PlaneCalibration:
-        """Load a calibration, which :meth:`transform` then uses.
+    def load(self, name_or_path: str) -> AnyCalibration:
+        """Load a calibration, of a plane or by a sheet, which :meth:`transform` then uses.
 
         Args:
             name_or_path: its name; or with a ``/`` the path of an exported one, in the folder.
@@ -202,7 +207,8 @@ class CalibrationService:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read.
             OSError: it cannot be read.
         """
-        self._calibration = _loaded(self.folder.find(name_or_path))[0]
+        path = self.folder.find(name_or_path)
+        self._calibration = of_document(read_document(path), path.name)
         return self._calibration
 
     def transform(self, x: float, y: float, theta: float = 0.0, frame: str | None = None) -> Pose:
@@ -210,7 +216,7 @@ class CalibrationService:
 
         Args:
             x: to the right, in the unit of the calibration.
-            y: upwards.
+            y: upwards: of a sheet's calibration, whose pixels count down, -v.
             theta: counter-clockwise, radians.
             frame: frame that the pose must come out in; None for the calibration's.
 
@@ -253,15 +259,12 @@ def _put_aside(path: Path) -> None:
     path.unlink()
 
 
-def _loaded(path: Path) -> tuple[PlaneCalibration, dict[str, Any]]:
-    from smartcam.calibration.plane import PlaneCalibration
-
-    document = read_document(path)
-    if document.kind != KIND:
+def _of_kind(document: Document, kind: str, name: str) -> dict[str, Any]:
+    if document.kind != kind:
         raise CalibrationError(
-            f"{path.name}: holds {document.kind!r}, expected {KIND!r}",
+            f"{name}: holds {document.kind!r}, expected {kind!r}",
             code=Code.WRONG_KIND,
             got=document.kind,
-            expected=KIND,
+            expected=kind,
         )
-    return PlaneCalibration.from_data(document.data), document.context
+    return document.data

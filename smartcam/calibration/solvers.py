@@ -19,6 +19,8 @@ import numpy as np
 from smartcam.calibration.codes import Code
 from smartcam.calibration.frames import Transform
 from smartcam.calibration.geometry import (
+    as_points,
+    as_vector,
     frame_from_axes,
     matrix_from_quaternion,
     quaternion_about_z,
@@ -26,6 +28,7 @@ from smartcam.calibration.geometry import (
     quaternion_multiply,
     rotate,
 )
+from smartcam.calibration.samples import check_positive
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Localization, Pose, Position, Quaternion
 
@@ -68,9 +71,19 @@ class Poses(NamedTuple):
         Args:
             points: (N, 2), in any unit.
             thetas: (N,), radians, counter-clockwise; None is 0 for each.
+
+        Raises:
+            CalibrationError: ``SHAPE``.
         """
-        flat = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        flat = np.atleast_2d(np.asarray(points, dtype=np.float64))
         angles = np.zeros(len(flat)) if thetas is None else np.asarray(thetas, dtype=np.float64)
+        if flat.shape != (len(angles), 2):
+            raise CalibrationError(
+                f"poses on a plane: expected points of shape ({len(angles)}, 2), got {flat.shape}",
+                code=Code.SHAPE,
+                expected=(len(angles), 2),
+                got=flat.shape,
+            )
         return cls(np.column_stack([flat, np.zeros(len(flat))]), quaternion_about_z(angles))
 
     @classmethod
@@ -112,13 +125,17 @@ class CameraPosition2D:
         theta: its angle there, radians, counter-clockwise with y up.
         scale: metres in one of the camera's units; 1 where the camera gives metres.
 
+    Raises:
+        CalibrationError: ``SHAPE``, or ``NOT_FINITE``: a scale that is not positive, too.
+
     Source: the thesis' ``solver_camera_2D_position``, 3.2.5.1; that the origin is subtracted, and
     first, is derived: the origin itself must come to zero.
     """
 
     def __init__(self, origin: ArrayLike, theta: float = 0.0, scale: float = 1.0) -> None:
-        self.origin: Array = np.array(origin, dtype=np.float64).reshape(2)
-        self.theta: float = float(theta)
+        check_positive(scale, "scale", "metres in one of the camera's units")
+        self.origin: Array = as_vector(origin, 2, "origin mark").copy()
+        self.theta: float = float(as_vector([theta], 1, "theta of the origin mark")[0])
         self.scale: float = float(scale)
         cos, sin = np.cos(self.theta), np.sin(self.theta)
         self._back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -184,12 +201,20 @@ class PlaneProjection:
         matrix: (4, 3), metres; ``w`` is positive in the camera's field.
 
     Raises:
-        CalibrationError: in :meth:`solve`: ``OUT_OF_FIELD``: a point behind the plane's horizon;
-            ``OUT_OF_PLANE``: a pose that is not in the camera's plane.
+        CalibrationError: ``SHAPE`` or ``NOT_FINITE``; in :meth:`solve`: ``OUT_OF_FIELD``: a point
+            behind the plane's horizon; ``OUT_OF_PLANE``: a pose that is not in the camera's plane.
     """
 
     def __init__(self, matrix: ArrayLike) -> None:
-        self.matrix: Array = np.array(matrix, dtype=np.float64).reshape(4, 3)
+        rows = as_points(matrix, 3, "projection")
+        if len(rows) != 4:
+            raise CalibrationError(
+                f"projection: expected shape (4, 3), got {rows.shape}",
+                code=Code.SHAPE,
+                expected=(4, 3),
+                got=rows.shape,
+            )
+        self.matrix: Array = rows.copy()
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses in the robot's frame."""
@@ -234,8 +259,8 @@ class Height:
             frame as the poses that come, as ``normal`` is.
 
     Raises:
-        CalibrationError: ``SHORT_LEVER``: a normal without a length; in :meth:`solve`, a viewpoint
-            that is not above the points by more than the height.
+        CalibrationError: ``SHAPE`` or ``NOT_FINITE``; ``SHORT_LEVER``: a normal without a length;
+            in :meth:`solve`, a viewpoint that is not above the points by more than the height.
     """
 
     def __init__(
@@ -244,7 +269,7 @@ class Height:
         normal: ArrayLike = (0.0, 0.0, 1.0),
         viewpoint: ArrayLike | None = None,
     ) -> None:
-        direction = np.array(normal, dtype=np.float64).reshape(3)
+        direction = as_vector(normal, 3, "normal")
         length = float(np.linalg.norm(direction))
         if not length > 0:
             raise CalibrationError(
@@ -253,10 +278,10 @@ class Height:
                 expected="a length above 0",
                 got=length,
             )
-        self.height: float = float(height)
+        self.height: float = float(as_vector([height], 1, "height")[0])
         self.normal: Array = direction / length
         self.viewpoint: Array | None = (
-            None if viewpoint is None else np.array(viewpoint, dtype=np.float64).reshape(3)
+            None if viewpoint is None else as_vector(viewpoint, 3, "viewpoint").copy()
         )
 
     def solve(self, poses: Poses) -> Poses:
@@ -425,13 +450,16 @@ def chain_of(
         The thesis' two solvers for ``rigid``, ``similarity`` and ``touches``; one
         :class:`PlaneProjection` for ``affine`` and ``homography``, where ``origin`` and ``theta``
         are ignored.
+
+    Raises:
+        CalibrationError: ``SHAPE`` or ``NOT_FINITE``: no such origin.
     """
     frame, camera_frame = calibration.robot_frame, calibration.camera_frame
     y_down = calibration.y_down
     if calibration.model in {"affine", "homography"}:
         projection = PlaneProjection(calibration.matrix)
         return Chain([projection], frame=frame, camera_frame=camera_frame, y_down=y_down)
-    sheet = np.array(origin, dtype=np.float64).reshape(2)
+    sheet = as_vector(origin, 2, "origin")
     turned = matrix_from_quaternion(quaternion_about_z(theta))
     return Chain(
         [

@@ -58,8 +58,8 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
         flanges: ``T_base_flange`` of each touch.
 
     Raises:
-        CalibrationError: ``TOO_FEW``: fewer than two; ``INSUFFICIENT_ROTATION``: the flange was
-            turned by less than 20 degrees.
+        CalibrationError: ``TOO_FEW``: fewer than two; ``WRONG_FRAME``: between different frames;
+            ``INSUFFICIENT_ROTATION``: the flange was turned by less than 20 degrees.
     """
     if len(flanges) < 2:
         raise CalibrationError(
@@ -68,6 +68,7 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
             expected=2,
             got=len(flanges),
         )
+    _check_same([flange.label for flange in flanges], "tool tip: expected poses")
     turns = np.array([flange.rotation for flange in flanges])
     places = np.array([flange.translation for flange in flanges])
     mean_turn, mean_place = turns.mean(axis=0), places.mean(axis=0)
@@ -115,8 +116,8 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
         parts: the same part at each turn, in the camera's frame.
 
     Raises:
-        CalibrationError: ``TOO_FEW``: fewer than two; ``INSUFFICIENT_ROTATION``: turned by less
-            than 20 degrees.
+        CalibrationError: ``TOO_FEW``: fewer than two; ``WRONG_FRAME``: in different frames;
+            ``INSUFFICIENT_ROTATION``: turned by less than 20 degrees.
     """
     poses = [part.pose for part in parts]
     if len(poses) < 2:
@@ -126,6 +127,7 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
             expected=2,
             got=len(poses),
         )
+    _check_same([pose.header.frame_id for pose in poses], "rotation centre: expected sights")
     # as complex numbers, where a turn is a product
     places = np.array([complex(pose.position.x, pose.position.y) for pose in poses])
     turns = np.exp(1j * np.array([pose.orientation.theta for pose in poses]))
@@ -142,6 +144,17 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     arm = np.vdot(near, places) / np.vdot(near, near)
     centre = places.mean() - arm * turns.mean()
     return RotationCentre(_plane(centre), _plane(arm), _plane(places - centre - arm * turns))
+
+
+def _check_same(frames: Sequence[str], what: str) -> None:
+    others = [frame for frame in frames if frame != frames[0]]
+    if others:
+        raise CalibrationError(
+            f"{what} of one and the same frame, got {frames[0]} and {others[0]}",
+            code=Code.WRONG_FRAME,
+            expected=frames[0],
+            got=others[0],
+        )
 
 
 def _plane(numbers: NDArray[np.complex128] | np.complex128) -> Array:

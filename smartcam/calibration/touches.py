@@ -22,6 +22,7 @@ from smartcam.calibration.fitting import Frame, rigid_tangent
 from smartcam.calibration.geometry import as_points, frame_from_axes, rotate_ccw
 from smartcam.calibration.plane import PlaneCalibration, mean_axis
 from smartcam.calibration.samples import check_lever, check_positive
+from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -94,16 +95,22 @@ def fit_touches(
         their rays; none can be held out.
 
     Raises:
-        CalibrationError: SHAPE, NOT_FINITE, COINCIDENT: A or B lies on the origin; COLLINEAR: the
-            rays are less than 10 degrees apart; SHORT_LEVER; MIRRORED.
+        CalibrationError: SHAPE, NOT_FINITE, TOO_FEW, COINCIDENT: A or B lies on the origin;
+            COLLINEAR: the rays are less than 10 degrees apart; SHORT_LEVER; MIRRORED.
 
     Source: the thesis' procedure, sections 3.2.3 and 3.2.4; its mathematics is put right.
     """
     check_positive(touch_sigma, "touch_sigma", "metres")
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
+    if not (math.isfinite(theta_sigma) and theta_sigma >= 0.0):
+        raise CalibrationError(
+            f"theta_sigma: expected a number of radians that is not negative, got {theta_sigma}",
+            code=Code.NOT_FINITE,
+            expected="a number that is not negative",
+            got=theta_sigma,
+        )
     groups = [
-        as_points(np.atleast_2d(np.asarray(touches, dtype=np.float64)), 3, f"touches of {name}")
-        for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
+        _touches(touches, name) for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
     ]
     touched = np.concatenate(groups)
     ray = np.repeat([0, 1, 2], [len(group) for group in groups])
@@ -151,6 +158,18 @@ def fit_touches(
         y_down=y_down,
         warnings=_remarks(sheet, freedom, touch_sigma, nominal_scale, side),
     )
+
+
+def _touches(values: ArrayLike, name: str) -> Array:
+    touches = as_points(np.atleast_2d(np.asarray(values)), 3, f"touches of {name}")
+    if not len(touches):
+        raise CalibrationError(
+            f"touches of {name}: expected one or more, got none",
+            code=Code.TOO_FEW,
+            expected=1,
+            got=0,
+        )
+    return touches
 
 
 def _fit(touched: Array, ray: NDArray[np.intp]) -> _Sheet:

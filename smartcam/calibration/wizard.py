@@ -35,7 +35,17 @@ if TYPE_CHECKING:
     from smartcam.calibration.sequence import Answer
     from smartcam.calibration.steps import Answers
 
-__all__ = ["KIND", "MAX_POINTS", "RULER", "plane_wizard"]
+__all__ = [
+    "KIND",
+    "MAX_POINTS",
+    "RULER",
+    "SIDES",
+    "figures",
+    "plane_wizard",
+    "review",
+    "side",
+    "summary",
+]
 
 KIND = "plane"
 """What the store calls a calibration of a plane."""
@@ -46,7 +56,7 @@ MAX_POINTS = 200
 RULER = 100.0
 """Length of the ruler on the sheet, mm."""
 
-_SIDES: Mapping[str, tuple[float, float, float] | None] = {
+SIDES: Mapping[str, tuple[float, float, float] | None] = {
     "-z": (0.0, 0.0, -1.0),
     "+z": (0.0, 0.0, 1.0),
     "-x": (-1.0, 0.0, 0.0),
@@ -55,7 +65,7 @@ _SIDES: Mapping[str, tuple[float, float, float] | None] = {
     "+y": (0.0, 1.0, 0.0),
     "unknown": None,
 }
-
+"""Directions of a tool's axis in the robot's base, by what people choose."""
 
 _SIGNS_OF_OUTLIERS = frozenset({Code.OUTLIER, Code.POOR_FIT, Code.NOT_PLANAR})
 """Warnings after which points may be left out; two that are wrong can hide each other."""
@@ -106,22 +116,17 @@ def plane_wizard(
                 title=f"Save {work.name}",
                 description="A calibration of that name is kept beside it as a backup.",
                 button="Save",
-                notes=tuple(_summary(calibration)),
+                notes=tuple(summary(calibration)),
                 preview=work.preview(calibration),
             ),
             partial(work.save, file, calibration),
         )
-        return {"name": work.name, "file": file.name, **_figures(calibration)}
+        return {"name": work.name, "file": file.name, **figures(calibration)}
 
     return Wizard(name="plane", version=1, script=script)
 
 
 def _about(parameters: Mapping[str, Any], *, typed: bool) -> Step:
-    side = Option(
-        name="side",
-        label="Where the tool points when it touches",
-        options={name: _side_text(name) for name in _SIDES},
-    )
     inputs = (
         Option(
             name="method",
@@ -144,7 +149,7 @@ def _about(parameters: Mapping[str, Any], *, typed: bool) -> Step:
         Text(name="robot_frame", label="Name of the robot's frame", default="robot"),
         Text(name="tool", label="Which tool touches", default=""),
         UNIT,
-        *((side,) if typed else ()),
+        *((side(),) if typed else ()),
         SIGMA,
     )
     return Step(
@@ -164,6 +169,15 @@ async def _choose_origin(marks: list[Mark]) -> Mark:
     inputs = (Option(name="mark", label="The origin mark", options=options),)
     step = Step(id="which", title="Which one is the origin?", inputs=inputs)
     return marks[int((await ask(step))["mark"]) - 1]
+
+
+def side() -> Option:
+    """Return what asks for one of :data:`SIDES`."""
+    return Option(
+        name="side",
+        label="Where the tool points when it touches",
+        options={name: _side_text(name) for name in SIDES},
+    )
 
 
 def _side_text(name: str) -> str:
@@ -233,7 +247,7 @@ class _Work:
             what,
             mark,
             unit=about["unit"],
-            tool_z=_SIDES[about["side"]] if "side" in about else None,
+            tool_z=SIDES[about["side"]] if "side" in about else None,
             preview=before(self._points, self._marks, mark),
         )
 
@@ -288,7 +302,7 @@ class _Work:
                 description="Three touches fit any plane: nothing tells how good they were. To "
                 "know, touch marks instead.",
                 button="Accept",
-                notes=tuple(_summary(calibration)),
+                notes=tuple(summary(calibration)),
                 preview=self.preview(calibration),
             )
         )
@@ -302,7 +316,15 @@ class _Work:
             if len(self._points) < 3:
                 continue
             calibration, notes = self._try_fit()
-            choice = await ask(self._review(calibration, notes))
+            step = review(
+                calibration,
+                notes,
+                count=len(self._points),
+                more="take another picture, for more points",
+                robust=self._robust,
+                preview=self.preview(calibration),
+            )
+            choice = await ask(step)
             index = choice["point"] - 1
             picture = choice["next"] == "more"
             match choice["next"]:
@@ -345,41 +367,6 @@ class _Work:
         for number, mark in enumerate(marks, 1):
             title = f"Touch mark {number} of {len(marks)}"
             self._points.append(await self._touch(f"touch-{number}", title, str(mark), mark))
-
-    def _review(self, calibration: PlaneCalibration | None, notes: Sequence[str]) -> Step:
-        count = len(self._points)
-        options = {
-            "accept": "accept it",
-            "more": "take another picture, for more points",
-            "redo": "touch a point again",
-            "remove": "remove a point",
-        }
-        point = 1
-        if calibration is None:
-            del options["accept"]
-        else:
-            point = 1 + min(calibration.outliers, default=calibration.worst)
-        if self._robust:
-            options["all"] = "count all points, also those that do not agree with the others"
-        elif count >= LEAST_POINTS and _doubtful(calibration):
-            options["robust"] = "leave out the points that do not agree with the others"
-        return Step(
-            id="review",
-            title="What came out",
-            notes=tuple(notes),
-            inputs=(
-                Option(name="next", label="What next", options=options),
-                Number(
-                    name="point",
-                    label="Point, to touch again or to remove; the worst one stands there",
-                    integer=True,
-                    minimum=1,
-                    maximum=count,
-                    default=point,
-                ),
-            ),
-            preview=self.preview(calibration),
-        )
 
     # ------------------------------------------------------------------ numbers
 
@@ -429,7 +416,7 @@ class _Work:
             )
         except CalibrationError as exc:
             return None, [f"{exc.code}: {exc}"]
-        return calibration, _summary(calibration)
+        return calibration, summary(calibration)
 
     def preview(self, calibration: PlaneCalibration | None) -> dict[str, Any]:
         """Return what a picture is drawn from."""
@@ -446,6 +433,62 @@ class _Work:
         )
 
 
+def review(
+    calibration: PlaneCalibration | None,
+    notes: Sequence[str],
+    *,
+    count: int,
+    more: str,
+    robust: bool,
+    preview: Mapping[str, Any] | None = None,
+) -> Step:
+    """Return the step that shows what came out of touches, and asks what next.
+
+    Its answers: ``next`` (``accept``, ``more``, ``redo``, ``remove``, ``robust``, ``all``) and
+    ``point``, from 1.
+
+    Args:
+        calibration: what came out; None: nothing did, and it cannot be accepted.
+        notes: of the step.
+        count: of touches.
+        more: what the option ``more`` says.
+        robust: whether points that do not agree are left out.
+        preview: of the step.
+    """
+    options = {
+        "accept": "accept it",
+        "more": more,
+        "redo": "touch a point again",
+        "remove": "remove a point",
+    }
+    point = 1
+    if calibration is None:
+        del options["accept"]
+    else:
+        point = 1 + min(calibration.outliers, default=calibration.worst)
+    if robust:
+        options["all"] = "count all points, also those that do not agree with the others"
+    elif count >= LEAST_POINTS and _doubtful(calibration):
+        options["robust"] = "leave out the points that do not agree with the others"
+    return Step(
+        id="review",
+        title="What came out",
+        notes=tuple(notes),
+        inputs=(
+            Option(name="next", label="What next", options=options),
+            Number(
+                name="point",
+                label="Point, to touch again or to remove; the worst one stands there",
+                integer=True,
+                minimum=1,
+                maximum=count,
+                default=point,
+            ),
+        ),
+        preview=preview,
+    )
+
+
 def _doubtful(calibration: PlaneCalibration | None) -> bool:
     """Return whether a point or more may be wrong."""
     if calibration is None:
@@ -453,7 +496,8 @@ def _doubtful(calibration: PlaneCalibration | None) -> bool:
     return any(remark.code in _SIGNS_OF_OUTLIERS for remark in calibration.warnings)
 
 
-def _figures(calibration: PlaneCalibration) -> dict[str, Any]:
+def figures(calibration: PlaneCalibration) -> dict[str, Any]:
+    """Return what a wizard's result says of a calibration, JSON-able; lengths in mm."""
     counted = calibration.weights > 0.0
     residual = math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
     held_out = calibration.held_out_error
@@ -472,19 +516,19 @@ def _figures(calibration: PlaneCalibration) -> dict[str, Any]:
     }
 
 
-def _summary(calibration: PlaneCalibration) -> list[str]:
+def summary(calibration: PlaneCalibration) -> list[str]:
     """Return what people should know of a calibration, a line each."""
-    figures = _figures(calibration)
-    left_out = len(figures["left_out"])
-    of = f" of {figures['points'] + left_out}" if left_out else ""
-    lines = [f"model {figures['model']} from {figures['points']}{of} points"]
-    lines.append(f"residual {figures['residual_mm']:.3f} mm rms: how well the points fit")
-    if figures["held_out_mm"] is not None:
+    found = figures(calibration)
+    left_out = len(found["left_out"])
+    of = f" of {found['points'] + left_out}" if left_out else ""
+    lines = [f"model {found['model']} from {found['points']}{of} points"]
+    lines.append(f"residual {found['residual_mm']:.3f} mm rms: how well the points fit")
+    if found["held_out_mm"] is not None:
         lines.append(
-            f"held-out error {figures['held_out_mm']:.3f} mm rms: each point against a "
+            f"held-out error {found['held_out_mm']:.3f} mm rms: each point against a "
             f"calibration from the others; the worst is point {calibration.worst + 1}"
         )
-    if figures["predicted_mm"] is not None:
-        lines.append(f"predicted error {figures['predicted_mm']:.3f} mm rms at the points")
-    lines += [f"{code}: {text}" for code, text in figures["remarks"]]
+    if found["predicted_mm"] is not None:
+        lines.append(f"predicted error {found['predicted_mm']:.3f} mm rms at the points")
+    lines += [f"{code}: {text}" for code, text in found["remarks"]]
     return lines

@@ -10,6 +10,8 @@ import os
 import sys
 import textwrap
 import threading
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,13 +19,16 @@ import click
 from smartcam.cli.options import CONNECTS, SECONDS, Options, output_options
 from smartcam.cli.running import run
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
-from smartcam.exceptions import CalibrationError, ConfigurationError
+from smartcam.exceptions import CalibrationError, ConfigurationError, UnsupportedError
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Coroutine, Mapping
 
-    from smartcam.calibration.sequence import Session
+    from smartcam.calibration.folder import Folder
+    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.imaging.targets import Target
+    from smartcam.calibration.sequence import Session, Wizard
     from smartcam.calibration.services import CalibrationService
 
 __all__ = ["calibrate"]
@@ -33,6 +38,9 @@ ABORTED = 130
 
 STALE = 7
 """Exit code after a check that found the calibration stale."""
+
+MAX_DESCRIPTION = 65_536
+"""Bytes of a target's description."""
 
 WIDTH = 88
 """Columns of a text."""
@@ -47,10 +55,36 @@ WIDTH = 88
     "is meant, or without for the current one. "
     "With --check it asks for some touches only, and tells whether a calibration is still true: "
     f"exit code {STALE} if it is stale. "
+    "With --wizard sheet or hand-eye the camera's own pictures are looked at: those of a camera "
+    "that sends them, or those that come into the folder of --pictures; then no URL is needed. "
     f"The camera is connected for each picture only. {CONNECTS}"
 )
-@click.argument("url")
-@click.option("--name", metavar="NAME", help="Its name.  [default: plane]")
+@click.argument("url", required=False)
+@click.option("--name", metavar="NAME", help="Its name.  [default: that of the wizard]")
+@click.option(
+    "--wizard",
+    type=click.Choice(["plane", "sheet", "hand-eye"]),
+    help="What to calibrate: a plane from what the camera localizes, a plane from a picture of a "
+    "printed sheet, or a camera on a robot or beside it.  [default: plane]",
+)
+@click.option(
+    "--pictures",
+    metavar="FOLDER",
+    type=click.Path(file_okay=False),
+    help="Take the next picture that comes into this folder, as by FTP.",
+)
+@click.option(
+    "--target",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    help="What is on the sheet, as smartcam sheet --describe writes it.",
+)
+@click.option(
+    "--lens",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    help="The camera's lens: a camera_info of ROS, YAML.",
+)
 @click.option("--check", metavar="NAME", help="Check the calibration of that name.")
 @click.option(
     "--folder",
@@ -99,7 +133,12 @@ WIDTH = 88
 )
 @output_options
 def calibrate(
+    url: str | None,
     name: str | None,
+    wizard: str | None,
+    pictures: str | None,
+    target: str | None,
+    lens: str | None,
     check: str | None,
     folder: str,
     fresh: bool,
@@ -117,26 +156,28 @@ def calibrate(
         )
     if name is not None and check is not None:
         raise click.UsageError("--check names the calibration: no --name beside it")
-    url: str = shared.pop("url")
+    if wizard is not None and check is not None:
+        raise click.UsageError("--check asks for touches of marks: no --wizard beside it")
+    if url is None and (pictures is None or wizard in {None, "plane"}):
+        raise click.UsageError(
+            "a URL is missing: only --wizard sheet and --wizard hand-eye do without one, with "
+            "--pictures FOLDER"
+        )
     options = Options(**shared)
+    station = _Station(options, url, pictures, target, lens)
     parameters = {} if feature is None else {"feature": feature}
     place = {"host": web_host or "127.0.0.1", "port": web_port or 0, "token": web_token}
 
     async def main() -> None:
         from smartcam.calibration.drift import WIZARD
-        from smartcam.calibration.wizard import KIND
 
+        started = WIZARD if check is not None else wizard or "plane"
         try:
-            service = _service(url, folder, options)
+            service = _service(folder, station)
             try:
                 if check is not None:
                     options.check_y_down(service.load(check), f"--check {check}")
-                service.start(
-                    check or name or KIND,
-                    KIND if check is None else WIZARD,
-                    parameters,
-                    fresh=fresh,
-                )
+                service.start(check or name or started, started, parameters, fresh=fresh)
                 await (_serve(service, options, place) if web else _drive(service.session, options))
             finally:
                 service.close()
@@ -154,17 +195,76 @@ async def _serve(service: CalibrationService, options: Options, place: Mapping[s
         await asyncio.Event().wait()
 
 
-def _service(url: str, folder: str, options: Options) -> CalibrationService:
-    from smartcam.calibration.drift import drift_wizard
+def _service(folder: str, station: _Station) -> CalibrationService:
     from smartcam.calibration.extra import load
     from smartcam.calibration.folder import Folder
     from smartcam.calibration.services import CalibrationService
-    from smartcam.calibration.wizard import plane_wizard
 
     load("scipy")  # before anything is measured
+    try:
+        inside = Folder(folder)
+    except OSError as exc:
+        raise ConfigurationError(f"--folder {folder}: {exc.strerror}") from exc
+    return CalibrationService(inside, station.wizards(inside))
 
-    async def localize() -> list[Localization]:
-        with options.camera(url) as unopened:
+
+class _Station:
+    """Where localizations and pictures come from, and what is known of target and lens."""
+
+    def __init__(
+        self,
+        options: Options,
+        url: str | None,
+        pictures: str | None,
+        target: str | None,
+        lens: str | None,
+    ) -> None:
+        self._options = options
+        self._url = url
+        self._pictures = pictures
+        self._target = target
+        self._lens = lens
+
+    def wizards(self, folder: Folder) -> list[Wizard]:
+        """Return the wizards that can work with what there is; the first is the page's default.
+
+        Raises:
+            ConfigurationError: a file of the options cannot be used.
+        """
+        from smartcam.calibration.drift import drift_wizard
+        from smartcam.calibration.imaging.hand_eye_wizard import hand_eye_wizard
+        from smartcam.calibration.imaging.sheet_wizard import sheet_wizard
+        from smartcam.calibration.wizard import plane_wizard
+
+        found: list[Wizard] = []
+        if self._url is not None:
+            y_down = self._options.y_down
+            found = [
+                plane_wizard(localize=self.localize, save_to=folder.calibration, y_down=y_down),
+                drift_wizard(
+                    localize=self.localize,
+                    find=folder.find,
+                    record_to=folder.checks,
+                    y_down=y_down,
+                ),
+            ]
+        target = None if self._target is None else _read_target(self._target)
+        lens = None if self._lens is None else _read_lens(self._lens)
+        take_picture = self._taking()
+        for make in (sheet_wizard, hand_eye_wizard):
+            found.append(
+                make(
+                    take_picture=take_picture,
+                    save_to=folder.calibration,
+                    suggested=target,
+                    camera=lens,
+                )
+            )
+        return found
+
+    async def localize(self) -> list[Localization]:
+        options = self._options
+        with options.camera(str(self._url)) as unopened:
             async with unopened as camera:
                 result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
         found = result.value
@@ -175,20 +275,60 @@ def _service(url: str, folder: str, options: Options) -> CalibrationService:
             )
         return found
 
+    def _taking(self) -> Callable[[], Coroutine[Any, Any, Any]]:
+        from smartcam.calibration.imaging.pictures import PictureFolder
+
+        if self._pictures is None:
+            return self.take_picture
+        return PictureFolder(self._pictures).take
+
+    async def take_picture(self) -> Any:
+        from smartcam.calibration.imaging.pictures import decode_picture
+
+        # the picture counts, not what the application says of it
+        options = replace(self._options, interpret_as=None)
+        wait = options.step(DEFAULT_TRIGGER_TIMEOUT)
+        with options.camera(str(self._url)) as unopened:
+            async with unopened as camera:
+                if not camera.capabilities.read_image:
+                    raise UnsupportedError(
+                        f"{camera.name}: its protocol sends no pictures; expected one that does, "
+                        "or --pictures FOLDER, where the camera writes them by FTP"
+                    )
+                await camera.trigger(timeout=wait)
+                data = await camera.read_image(timeout=wait)
+                name = camera.name
+        return await asyncio.to_thread(decode_picture, data, name)
+
+
+def _read_target(path: str) -> Target:
+    from smartcam.calibration.imaging.targets import target_from_data
+
     try:
-        inside = Folder(folder)
+        with Path(path).open("rb") as stream:
+            data: object = json.loads(stream.read(MAX_DESCRIPTION))
     except OSError as exc:
-        raise ConfigurationError(f"--folder {folder}: {exc.strerror}") from exc
-    wizards = (
-        plane_wizard(localize=localize, save_to=inside.calibration, y_down=options.y_down),
-        drift_wizard(
-            localize=localize,
-            find=inside.find,
-            record_to=inside.checks,
-            y_down=options.y_down,
-        ),
-    )
-    return CalibrationService(inside, wizards)
+        raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
+    except (ValueError, RecursionError) as exc:
+        raise ConfigurationError(f"--target {path}: no JSON: {exc}") from exc
+    if not isinstance(data, dict):
+        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
+    described: dict[str, Any] = data
+    try:
+        return target_from_data(described)
+    except CalibrationError as exc:
+        raise ConfigurationError(f"--target {path}: {exc}") from exc
+
+
+def _read_lens(path: str) -> CameraModel:
+    from smartcam.calibration.imaging.camera_files import read_cameras
+
+    try:
+        return read_cameras(path, "camera_info").cameras[0]
+    except OSError as exc:
+        raise ConfigurationError(f"--lens {path}: {exc.strerror}") from exc
+    except CalibrationError as exc:
+        raise ConfigurationError(f"--lens: {exc}") from exc
 
 
 async def _drive(session: Session, options: Options) -> None:

@@ -19,7 +19,7 @@ from smartcam.observers import Observer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from smartcam.calibration.plane import PlaneCalibration
+    from smartcam.calibration.kinds import AnyCalibration
     from smartcam.connection import TraceEntry
 
 __all__ = [
@@ -147,12 +147,12 @@ class _Frames(Observer):
         self._write(entry)
 
 
-def _calibration(path: str) -> PlaneCalibration:
+def _calibration(path: str) -> AnyCalibration:
     """Return what a calibration's file holds."""
-    from smartcam.calibration.plane import PlaneCalibration
+    from smartcam.calibration.kinds import load_calibration
 
     try:
-        return PlaneCalibration.load(path)
+        return load_calibration(path)
     except OSError as exc:
         raise ConfigurationError(f"--calibration {path}: {exc.strerror}") from exc
 
@@ -177,7 +177,7 @@ class Options:
         """Return the bound of a step, seconds."""
         return default if self.timeout is None else self.timeout
 
-    def check_y_down(self, calibration: PlaneCalibration, what: str) -> None:
+    def check_y_down(self, calibration: AnyCalibration, what: str) -> None:
         """Raise where ``--y-down`` is not as it was when a calibration was made.
 
         Args:

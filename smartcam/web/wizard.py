@@ -227,8 +227,8 @@ CALLS: tuple[_Row, ...] = (
         method="POST",
         path=f"{API}/start",
         about="Start a wizard under a name, or go on with the one that was broken off; answers its "
-        "step. `wizard` is `plane`, or `drift` to check a calibration. With `fresh` begin anew in "
-        "any case.",
+        "step. `wizard` is `plane`, `drift` to check a calibration, `sheet` or `hand-eye`, which "
+        "look at pictures. With `fresh` begin anew in any case.",
         handler=_guarded(_start),
         body=_Start,
         sample='{"name": "table"}',

@@ -248,3 +248,19 @@ def test_moving_pinhole_that_is_raised_would_be_wrong_by_as_much() -> None:
     found = one.now(flange).transform(pixels(flange @ HAND_EYE, parts))
     errors = 1e3 * np.linalg.norm(found - parts, axis=1)
     assert 10 < np.sqrt(np.mean(errors**2)) < 10.6
+
+
+def test_image_time_without_a_time_zone_is_refused() -> None:
+    table = Transform("base", "table", np.eye(3), np.zeros(3))
+    flange = Transform("base", "flange", np.eye(3), np.zeros(3), NOON)
+    with refused("BAD_TIME", "expected an image's time with its time zone"):
+        camera(table, flange).now(flange, NOON.replace(tzinfo=None))
+
+
+@pytest.mark.parametrize(
+    ("field", "code"), [(SEEN, "SHAPE"), (np.full((4, 3), np.nan), "NOT_FINITE")]
+)
+def test_field_that_is_no_field_is_refused(field: NDArray[np.float64], code: str) -> None:
+    flange = Transform("robot", "flange", np.eye(3), np.zeros(3))
+    with refused(code, "moving camera: points of the field"):
+        MovingCamera(chain_of(fit_plane(SEEN, TABLE)), flange, field=field)

@@ -116,7 +116,7 @@ REFUSED: list[tuple[Any, Any, dict[str, Any], str, str]] = [
     (GRID, GRID, {"tool_z": SCENE.turn[:, 2]}, "MIRRORED", "y axis points the wrong way"),
     (GRID, GRID, {"tool_z": [0, 0, 0]}, "COINCIDENT", "tool axis: expected a direction"),
     (GRID, 0.9 * GRID, {"model": "rigid"}, "SCALE_MISMATCH", r"got 0.9 \(-10 %\)"),
-    (1e3 * GRID, GRID, {"nominal_scale": 1.0}, "SCALE_MISMATCH", r"got 0.001 \(-1e\+02 %\)"),
+    (1e3 * GRID, GRID, {"nominal_scale": 1.0}, "SCALE_MISMATCH", r"got 0.001 \(-100 %\)"),
     (GRID * math.nan, GRID, {}, "NOT_FINITE", "camera points: expected finite numbers"),
 ]
 
@@ -443,3 +443,22 @@ def test_from_data_of_something_else_raises(change: dict[str, Any], text: str) -
     with pytest.raises(CalibrationError, match=f"stored plane calibration: .*{text}") as caught:
         PlaneCalibration.from_data(data | change)
     assert caught.value.code == "SHAPE"
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, 2.0, math.nan])
+def test_check_with_a_level_that_is_none_raises(level: float) -> None:
+    found = fit_plane(GRID, np.column_stack([GRID, np.zeros(len(GRID))]), touch_sigma=SIGMA)
+    with pytest.raises(
+        CalibrationError, match="level: expected a number between 0 and 1"
+    ) as caught:
+        found.check(GRID[0], (*GRID[0], 0.0), level=level)
+    assert caught.value.code == "NOT_FINITE"
+
+
+@pytest.mark.parametrize(
+    ("scale", "code"), [(1e300, "NOT_FINITE"), (1e-120, "COINCIDENT"), (1e-300, "COINCIDENT")]
+)
+def test_fit_plane_of_points_whose_squares_are_no_numbers_raises(scale: float, code: str) -> None:
+    with pytest.raises(CalibrationError, match="camera points: expected") as caught:
+        fit_plane(scale * GRID, np.column_stack([GRID, np.zeros(len(GRID))]))
+    assert caught.value.code == code

@@ -147,3 +147,17 @@ def test_fit_touches_with_a_scale_maps_pixels() -> None:
     field = np.array([[0.0, 0.0], [0.3, -0.2]])
     assert spread(found.transform(1000 * field), SCENE.robot(field)) < 1e-12
     assert found.scale == pytest.approx(0.001)
+
+
+@pytest.mark.parametrize("sigma", [-0.001, math.nan, math.inf])
+def test_fit_touches_with_an_impossible_theta_sigma_raises(sigma: float) -> None:
+    with pytest.raises(CalibrationError, match="theta_sigma: expected a number") as caught:
+        fitted(1, theta_sigma=sigma)
+    assert caught.value.code == "NOT_FINITE"
+
+
+def test_fit_touches_without_a_touch_of_a_ray_says_which() -> None:
+    o, _, b = touched(1)
+    with pytest.raises(CalibrationError, match="touches of ray A: expected one or more") as caught:
+        fit_touches(ORIGIN, o, np.empty((0, 3)), b)
+    assert caught.value.code == "TOO_FEW"

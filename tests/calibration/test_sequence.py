@@ -472,3 +472,17 @@ async def test_journal_cut_at_every_byte_loses_the_last_line_only(tmp_path: Path
             assert again.current["number"] == body[:size].count(b"\n")
             assert cut.read_bytes() == body[: body.rfind(b"\n", 0, size) + 1]
             again.close()
+
+
+def test_journal_whose_answers_lead_nowhere_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    Session(survey(Trigger()), Journal(path)).close()
+    names = {"event": "answer", "token": "", "outcome": None, "acted": False, "at": ""}
+    with Journal(path) as journal:
+        for step in ("name", "picture", "more"):
+            journal.append({**names, "step": step, "answers": {"cOunt": 1}})
+        with pytest.raises(
+            CalibrationError, match=r"not lead through 'survey': KeyError"
+        ) as caught:
+            Session(survey(Trigger()), journal)
+    assert caught.value.code == "BROKEN_FILE"

@@ -309,3 +309,31 @@ def test_projection_outside_its_field_and_plane_is_refused() -> None:
         projection.solve(Poses.planar([(0, 0), (0.6, 0.1)]))
     with refused("OUT_OF_PLANE", "with a height or a tilt"):
         projection.solve(Poses(np.array([[0, 0, 0.1]]), np.array([[0, 0, 0, 1.0]])))
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan])
+def test_camera_position_with_an_impossible_scale_is_refused(scale: float) -> None:
+    with refused("NOT_FINITE", "scale: expected a positive number of metres"):
+        CameraPosition2D((0.0, 0.0), scale=scale)
+
+
+def test_height_that_is_no_number_is_refused() -> None:
+    with refused("NOT_FINITE", "height: expected finite numbers"):
+        Height(np.nan)
+
+
+def test_projection_of_another_shape_is_refused() -> None:
+    with refused("SHAPE", r"projection: expected shape (N, 3), got (4, 4)"):
+        PlaneProjection(np.eye(4))
+    with refused("SHAPE", r"projection: expected shape (4, 3), got (3, 3)"):
+        PlaneProjection(np.eye(3))
+
+
+def test_transform_of_points_in_space_is_refused_and_not_read_as_others() -> None:
+    with refused("SHAPE", r"expected points of shape (2, 2), got (2, 3)"):
+        Chain([]).transform([(0.1, 0.2, 0.0), (0.3, 0.4, 0.0)])
+
+
+def test_planar_poses_without_an_angle_for_each_are_refused() -> None:
+    with refused("SHAPE", r"expected points of shape (2, 2), got (1, 2)"):
+        Poses.planar([(0.1, 0.2)], [0.0, 1.0])

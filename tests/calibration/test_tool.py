@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from planekit import part
 from rigid import angles, localization, refused, rotation_about, transforms, yaw
 
 from smartcam.calibration.frames import Transform
@@ -120,3 +121,16 @@ def test_rotation_centre_of_a_part_that_hardly_turned_is_refused() -> None:
         fit_rotation_centre(turned([0.3]))
     with refused("INSUFFICIENT_ROTATION", "a spread of 0.0998"):
         fit_rotation_centre(turned([0.3, 0.5]))
+
+
+def test_tool_tip_of_poses_in_different_frames_is_refused() -> None:
+    first, second = touching(DOWN), touching(np.eye(3))
+    other = Transform("cell", "flange", second.rotation, second.translation)
+    with refused("WRONG_FRAME", "got T_base_flange and T_cell_flange"):
+        fit_tool_tip([first, other])
+
+
+def test_rotation_centre_of_sights_in_different_frames_is_refused() -> None:
+    sights = [part(0.1, 0.0), part(0.0, 0.1, 1.5, frame="other")]
+    with refused("WRONG_FRAME", "rotation centre: expected sights of one and the same frame"):
+        fit_rotation_centre(sights)

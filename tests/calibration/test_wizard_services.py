@@ -12,7 +12,7 @@ import yaml
 from bench import GRID, Bench, say, where
 
 from smartcam.calibration.folder import Folder
-from smartcam.calibration.plane import fit_plane
+from smartcam.calibration.plane import PlaneCalibration, fit_plane
 from smartcam.calibration.services import CalibrationService
 from smartcam.calibration.store import write
 from smartcam.calibration.wizard import plane_wizard
@@ -250,7 +250,9 @@ def test_export_as_yaml_is_read_by_pyyaml_and_by_opencv(tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2", reason="needs the extra calibration")
     service = served(tmp_path)
     saved(service, "table")
-    matrix = service.load("table").matrix
+    calibration = service.load("table")
+    assert isinstance(calibration, PlaneCalibration)
+    matrix = calibration.matrix
     path = service.folder.path / service.export("table", "matrix.yaml")
     read = yaml.safe_load(path.read_text())
     assert read["data"] == matrix.ravel().tolist()
@@ -300,3 +302,11 @@ def test_export_of_a_text_without_a_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"table\.txt: expected the format to be named"):
         service.export("table", "table.txt")
     assert service.export("table", "table.txt", "tf2") == "exports/table.txt"
+
+
+def test_folder_with_a_directory_called_as_a_calibration_does_not_list_it(tmp_path: Path) -> None:
+    service = served(tmp_path)
+    (service.folder.path / "table.json").mkdir()
+    assert service.folder.names() == []
+    with pytest.raises(CalibrationError, match="no calibration 'table'; there are none"):
+        service.load("table")

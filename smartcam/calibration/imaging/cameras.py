@@ -41,7 +41,8 @@ class CameraModel:
 
     Attributes:
         size: width and height of its images, pixels.
-        matrix: (3, 3), focal lengths and principal point, pixels.
+        matrix: (3, 3), focal lengths and principal point, pixels; rows and columns of pixels are at
+            right angles.
         distortion: (K,), as many as its model has.
         distortion_model: which.
     """
@@ -70,13 +71,13 @@ class CameraModel:
                 expected=count,
                 got=len(distortion),
             )
-        upper = matrix.shape == (3, 3) and not (matrix[1, 0] or matrix[2, :2].any())
-        if not (upper and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[2, 2] == 1):
+        plain = matrix.shape == (3, 3) and not (matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).any()
+        if not (plain and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[2, 2] == 1):
             raise CalibrationError(
-                "camera matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive focal "
-                f"lengths, got {matrix.tolist()}",
+                "camera matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal "
+                f"lengths and no skew, got {matrix.tolist()}",
                 code=Code.SHAPE,
-                expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",
+                expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
                 got=matrix.tolist(),
             )
         for name, value in (("matrix", matrix), ("distortion", distortion)):

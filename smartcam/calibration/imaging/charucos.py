@@ -9,7 +9,7 @@ import numpy as np
 from smartcam.calibration.codes import Code
 from smartcam.calibration.extra import load
 from smartcam.calibration.imaging.corners import refine_corners
-from smartcam.calibration.imaging.grey import scaled
+from smartcam.calibration.imaging.grey import GreyImage, scaled
 from smartcam.calibration.imaging.homography import fit_homography, local_steps
 from smartcam.calibration.imaging.views import TargetView
 from smartcam.exceptions import CalibrationError
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.grey import GreyImage
     from smartcam.calibration.imaging.targets import Charuco
 
 __all__ = ["charuco_board", "find_charuco"]
@@ -70,9 +69,9 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     """Return where those corners of a ChArUco board are that are seen.
 
     Raises:
-        CalibrationError: TARGET_NOT_FOUND; SHAPE: no such dictionary.
+        CalibrationError: TARGET_NOT_FOUND; MIRRORED; SHAPE: no such dictionary.
     """
-    ids, found = _detect(image, target)
+    ids, found = _numbered(image, target)
     flat = target.points[ids, :2]
     matrix = fit_homography(flat, found)
     if matrix is None:
@@ -95,8 +94,35 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     )
 
 
-def _detect(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Array]:
-    """Return numbers (N,), ascending, and corners (N, 2)."""
+def _numbered(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Array]:
+    """Return numbers (N,), ascending, and corners (N, 2).
+
+    Where few are found, the mirror image is looked at as well: a marker's mirror image can be
+    another one of its dictionary, and such neighbours give corners with wrong numbers.
+    """
+    ids, found, markers = _detect(image, target)
+    if 2 * len(ids) > max(len(target.points), 4 * FEWEST):
+        return ids, found
+    flipped = GreyImage(
+        np.ascontiguousarray(image.levels[:, ::-1]), np.ascontiguousarray(image.bytes[:, ::-1])
+    )
+    if len(_detect(flipped, target)[0]) >= max(FEWEST, 2 * len(ids)):
+        raise CalibrationError(
+            f"charuco of {target.columns} x {target.rows} squares: expected an image of the sheet "
+            "as one reads it, got one that is mirrored",
+            code=Code.MIRRORED,
+            expected="the sheet as one reads it",
+            got="its mirror image",
+        )
+    if len(ids) < FEWEST:
+        doubt = markers and not len(ids) and target.rows % 2 == 0
+        legacy = ": is its legacy_pattern right?" if doubt else ""
+        raise _not_found(target, f"beside {markers} of its markers{legacy}", len(ids))
+    return ids, found
+
+
+def _detect(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Array, int]:
+    """Return numbers (N,), ascending, corners (N, 2), and how many markers were seen."""
     cv2 = load("cv2")
     given = cv2.aruco.CharucoParameters()
     given.minMarkers, given.tryRefineMarkers = 1, True
@@ -110,15 +136,11 @@ def _detect(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Array]
             found = (np.array(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
         if 2 * len(numbers) > len(target.points) or max(image.size) > LARGEST_DOUBLED:
             break
-    if len(numbers) < FEWEST:
-        doubt = markers and not len(numbers) and target.rows % 2 == 0
-        legacy = ": is its legacy_pattern right?" if doubt else ""
-        raise _not_found(target, f"beside {markers} of its markers{legacy}", len(numbers))
     # OpenCV counts rows from the top
     row, column = np.divmod(numbers, target.columns - 1)
     ids = (target.rows - 2 - row) * (target.columns - 1) + column
     order = np.argsort(ids)
-    return ids[order], found[order]
+    return ids[order], found[order], markers
 
 
 def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.frames import Transform
 from smartcam.calibration.imaging.hand_eye_choice import (
     METHODS,
+    NOTHING,
     Problem,
     Solution,
     candidates,
@@ -77,8 +78,15 @@ ADVISED_TURN = math.radians(8.0)
 SCALE_OFF = 0.005
 """Difference between the target's size and the nominal one that is worth a remark."""
 
-WORST = 4.0
-"""A pose whose held-out error is as many times the others' median is named."""
+BAD = 4.0
+"""A pose whose held-out error is more times the median is bad: of normal errors along two axes one
+in 60000 is."""
+
+EXACT = 1e-7
+"""Metres: what is less off, rounding alone may explain."""
+
+MOST_BAD = 1 / 3
+"""Of the poses that may be left out."""
 
 OTHER_WAY = 5.0
 """Poses that fit as many times better the other way round are taken for given the wrong way."""
@@ -94,8 +102,9 @@ def calibrate_hand_eye(
     setup: Setup,
     camera: CameraModel | None = None,
     method: str = "auto",
-    beside: Literal["auto", "", "scale", "camera", "scale and camera"] = "auto",
+    adjust: Literal["auto", "nothing", "scale", "camera", "scale and camera"] = "auto",
     robot_sigmas: RobotSigmas | None = None,
+    drop_bad: bool = True,
 ) -> HandEyeCalibration:
     """Return where a camera is on a robot, or beside it.
 
@@ -107,9 +116,11 @@ def calibrate_hand_eye(
         camera: its lens; None: calibrated from the same views, which should then tilt the target.
         method: ``auto``: the candidate that predicts left-out poses best; or the name of one, see
             :data:`~smartcam.calibration.imaging.hand_eye_choice.METHODS`.
-        beside: what may be adjusted besides: the target's ``scale`` (printers change it), the
-            ``camera``; ``auto``: what the held-out error asks for, ``""``: nothing.
+        adjust: what is adjusted besides the poses: the target's ``scale`` (printers change it),
+            the ``camera``, ``nothing``; ``auto``: what the held-out error asks for.
         robot_sigmas: of each axis of the robot's poses; None: estimated.
+        drop_bad: whether poses that are far off what the others say of them are left out (and
+            named), at most a third of them, and while 8 are left; else they are only named.
 
     The order of the poses does not matter.
 
@@ -144,9 +155,10 @@ def calibrate_hand_eye(
     )
     named = [one.name or f"pose {i}" for i, one in zip(order, ordered, strict=True)]
     kept = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
-    free = {"": (), "scale": (0,), "camera": (1, 2, 3, 4, *kept)}
+    free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *kept)}
     free["scale and camera"] = (0, *free["camera"])
-    result = _solved(problem, _allowed(free, beside), method, named, transforms[0])
+    asked = _Asked(_allowed(free, adjust), method, drop_bad)
+    result = _without_bad(problem, asked, named, [transforms[i] for i in order], ordered)
     back = np.argsort(order)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     return dataclasses.replace(
@@ -164,8 +176,9 @@ def calibrate_hand_eye_from_poses(
     *,
     setup: Setup,
     method: str = "auto",
-    beside: Literal["auto", "", "scale"] = "auto",
+    adjust: Literal["auto", "nothing", "scale"] = "auto",
     robot_sigmas: RobotSigmas | None = None,
+    drop_bad: bool = True,
 ) -> HandEyeCalibration:
     """Return where a camera is on a robot, or beside it, from poses of the target.
 
@@ -178,8 +191,9 @@ def calibrate_hand_eye_from_poses(
         setup: as for :func:`calibrate_hand_eye`.
         method: as for :func:`calibrate_hand_eye`; ``reprojection`` weighs a milliradian as a
             millimetre.
-        beside: as for :func:`calibrate_hand_eye`.
+        adjust: as for :func:`calibrate_hand_eye`.
         robot_sigmas: as for :func:`calibrate_hand_eye`.
+        drop_bad: as for :func:`calibrate_hand_eye`.
 
     Raises:
         CalibrationError: as :func:`calibrate_hand_eye`.
@@ -198,8 +212,9 @@ def calibrate_hand_eye_from_poses(
         sigmas=_positive(robot_sigmas),
     )
     named = [f"pose {i}" for i in order]
-    allowed = _allowed({"": (), "scale": (0,)}, beside)
-    result = _solved(problem, allowed, method, named, transforms[0])
+    asked = _Asked(_allowed({NOTHING: (), "scale": (0,)}, adjust), method, drop_bad)
+    seen = [target_poses[i] for i in order]
+    result = _without_bad(problem, asked, named, [transforms[i] for i in order], seen)
     return dataclasses.replace(
         _reordered(result, np.argsort(order)),
         robot_poses=tuple(transforms),
@@ -292,26 +307,93 @@ def _observations(
     return PixelObservations(camera, points, pixels, white)
 
 
-def _allowed(free: Mapping[str, tuple[int, ...]], beside: str) -> dict[str, tuple[int, ...]]:
-    if beside == "auto":
+def _allowed(free: Mapping[str, tuple[int, ...]], adjust: str) -> dict[str, tuple[int, ...]]:
+    if adjust == "auto":
         return dict(free)
-    if beside not in free:
+    if adjust not in free:
         raise CalibrationError(
-            f"beside: expected auto or one of {list(free)}, got {beside!r}",
+            f"adjust: expected auto or one of {list(free)}, got {adjust!r}",
             code=Code.SHAPE,
             expected=list(free),
-            got=beside,
+            got=adjust,
         )
-    return {beside: free[beside]}
+    return {adjust: free[adjust]}
 
 
-def _solved(
+class _Asked(NamedTuple):
+    """What the user asked for.
+
+    Attributes:
+        free: what may be adjusted, and the numbers of its parameters.
+        method: which, or ``auto``.
+        drop_bad: whether bad poses are left out.
+    """
+
+    free: Mapping[str, tuple[int, ...]]
+    method: str
+    drop_bad: bool
+
+
+def _without_bad(
     problem: Problem,
-    free: Mapping[str, tuple[int, ...]],
-    method: str,
+    asked: _Asked,
     named: Sequence[str],
-    pose: Transform,
+    robot_poses: Sequence[Transform],
+    seen: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
+    """Return what the poses give that are not bad, with the errors of all of them."""
+    used, remarks = np.arange(problem.count), list[Remark]()
+    result = _solved(problem, asked, robot_poses[0])
+    while len(bad := _bad(result)) and asked.drop_bad:
+        worst = int(used[result.worst])
+        fewer = used[used != worst]
+        most = MOST_BAD * problem.count
+        if len(fewer) < ADVISED_POSES or problem.count - len(fewer) > most:
+            break
+        try:
+            check_motion(problem.robot.taken(fewer))
+        except CalibrationError:  # nothing is left without it
+            break
+        remarks.append(_bad_view(result, result.worst, named[worst], "was not used"))
+        used, result = fewer, _solved(problem.taken(fewer), asked, robot_poses[0])
+    remarks += [_bad_view(result, i, named[int(used[i])], "is used all the same") for i in bad]
+    errors, left_out = np.full((2, problem.count), np.nan)
+    for number in np.setdiff1d(np.arange(problem.count), used).tolist():
+        (off,) = result.point_errors([robot_poses[number]], [seen[number]])
+        if np.isfinite(off).all():
+            errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
+    errors[used], left_out[used] = result.errors, result.leave_one_out
+    some = problem.taken(used)
+    return dataclasses.replace(
+        result,
+        errors=errors,
+        leave_one_out=left_out,
+        used=tuple(np.isin(np.arange(problem.count), used).tolist()),
+        warnings=(*_remarks(some, result), *remarks),
+    )
+
+
+def _bad(result: HandEyeCalibration) -> list[int]:
+    """Return the poses that the others do not predict."""
+    if result.held_out_error is None:
+        return []
+    errors = result.leave_one_out
+    bad: list[int] = np.flatnonzero(errors > BAD * max(float(np.median(errors)), EXACT)).tolist()
+    return bad
+
+
+def _bad_view(result: HandEyeCalibration, index: int, name: str, done: str) -> Remark:
+    errors = 1e3 * result.leave_one_out
+    return Remark(
+        Code.BAD_VIEW,
+        f"{name} is {errors[index]:.3g} mm off what the others say of it, half of them are "
+        f"{np.median(errors):.3g} mm or less: its pose of the robot or its image is wrong; it "
+        f"{done}",
+    )
+
+
+def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibration:
+    free, method = asked.free, asked.method
     if method != "auto" and method not in METHODS:
         raise CalibrationError(
             f"method: expected auto or one of {list(METHODS)}, got {method!r}",
@@ -321,14 +403,14 @@ def _solved(
         )
     _check_direction(problem)
     found = candidates(problem, free, method)
-    chosen = choose(found, method=method, beside=next(iter(free)) if len(free) == 1 else None)
+    chosen = choose(found, method=method, besides=next(iter(free)) if len(free) == 1 else None)
     if chosen is None or chosen.solution is None:
         raise _poor(f"none at all {problem.count} poses", math.inf)
     result = _result(problem, chosen, chosen.solution, found, pose)
     off, size = float(np.median(result.errors)), _size(problem)
     if off > size:
         raise _poor(f"it {off:.3g} m off, where {size:.3g} m would be nowhere", off)
-    return dataclasses.replace(result, warnings=tuple(_remarks(problem, result, named)))
+    return result
 
 
 def _poor(what: str, off: float) -> CalibrationError:
@@ -380,6 +462,7 @@ def _result(
         covariance=_covariance(problem, chosen, solution),
         robot_sigmas=None if solution.noise is None else solution.noise.robot,
         robot_poses=(),
+        used=(True,) * problem.count,
     )
 
 
@@ -434,14 +517,15 @@ def _median(problem: Problem, found: tuple[Rigid, Rigid]) -> float:
     return float(np.median(np.concatenate(errors)))
 
 
-def _remarks(problem: Problem, result: HandEyeCalibration, named: Sequence[str]) -> list[Remark]:
+def _remarks(problem: Problem, result: HandEyeCalibration) -> list[Remark]:
     remarks = []
     if abs(result.target_scale - 1.0) > SCALE_OFF:
         remarks.append(
             Remark(
                 Code.SCALE_MISMATCH,
                 f"expected the target as large as it was said, got {result.target_scale:.4f} "
-                "times that by the robot's motions: measure the print",
+                "times that by the robot's motions: measure the print; poses and errors are those "
+                "of a target of that size",
             )
         )
     if problem.count < ADVISED_POSES:
@@ -465,18 +549,6 @@ def _remarks(problem: Problem, result: HandEyeCalibration, named: Sequence[str])
         remarks.append(
             Remark(Code.NOT_HELD_OUT, "too few poses to leave one out: no held-out error")
         )
-    else:
-        worst = result.worst
-        others = float(np.median(np.delete(result.leave_one_out, worst)))
-        if result.leave_one_out[worst] > WORST * others:
-            remarks.append(
-                Remark(
-                    Code.OUTLIER,
-                    f"{named[worst]} is {1e3 * result.leave_one_out[worst]:.3g} mm off what the "
-                    f"others say of it, they are {1e3 * others:.3g} mm: take it again or leave it "
-                    "out",
-                )
-            )
     return remarks
 
 
@@ -495,5 +567,8 @@ def _lens_remarks(given: CameraModel, adjusted: CameraModel | None) -> list[Rema
 
 def _reordered(result: HandEyeCalibration, back: Any) -> HandEyeCalibration:
     return dataclasses.replace(
-        result, errors=result.errors[back], leave_one_out=result.leave_one_out[back]
+        result,
+        errors=result.errors[back],
+        leave_one_out=result.leave_one_out[back],
+        used=tuple(result.used[i] for i in back),
     )

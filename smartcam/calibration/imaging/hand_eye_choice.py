@@ -38,34 +38,38 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration.geometry import Array
+    from smartcam.calibration.imaging.cameras import CameraModel
     from smartcam.calibration.imaging.hand_eye_fit import Robot, RobotSigmas
 
     Seen = PixelObservations | PoseObservations
 
 __all__ = [
-    "BESIDE",
+    "ADJUSTABLE",
     "JUDGE",
     "METHODS",
+    "NOTHING",
     "Candidate",
     "Problem",
     "Solution",
     "candidates",
     "choose",
     "on_plane",
+    "point_errors",
     "steps_between",
 ]
 
 MOST_FOLDS = 40
 """Parts that poses are left out in: up to as many, each pose alone."""
 
-LEVEL = 1e-3
-"""How seldom noise alone may make more parameters differ from what was given."""
+LEVEL = 1e-4
+"""How seldom noise alone may make more parameters differ from what was given: a scale that is not
+needed puts the camera up to eight times as far off."""
 
 MOST_SCALE = 0.2
 """Part of its size that a target may be off; what is more is a mistake of units."""
 
 JUDGE = "robot and lens"
-"""The method that tells what is to be adjusted beside the poses: it can explain most."""
+"""The method that tells what is to be adjusted besides: it can explain most."""
 
 METHODS: Mapping[str, float] = {
     "robot": 1.0,
@@ -87,8 +91,11 @@ MANY = 12
 """Poses more than have to be, from which on the parts above hold; fewer have to show more: 1.2 of
 five poses is 3."""
 
-BESIDE = ("", "scale", "camera", "scale and camera")
-"""What may be adjusted beside the poses: the target's scale, the camera's parameters."""
+NOTHING = "nothing"
+"""Is adjusted besides the poses."""
+
+ADJUSTABLE = (NOTHING, "scale", "camera", "scale and camera")
+"""What may be adjusted besides the poses: the target's scale, the camera's parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +146,27 @@ class Problem:
         camera = self.seen.camera(solution.change)
         result = []
         for index, mask in enumerate(self.given):
-            rays = camera.directions(self.seen.pixels[index][mask])
-            turn, shift = expected.rotation[index], expected.translation[index]
-            found = on_plane(np.column_stack([rays, np.ones(len(rays))]), turn, shift)
-            result.append(np.linalg.norm(found - scale * self.seen.points[index][mask], axis=1))
+            pixels, points = self.seen.pixels[index][mask], self.seen.points[index][mask]
+            seen = Rigid(expected.rotation[index], expected.translation[index])
+            result.append(point_errors(camera, seen, pixels, scale * points))
         return result
+
+
+def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array) -> Array:
+    """Return where rays pass a target's plane, from where its points are (N,), metres.
+
+    Args:
+        camera: the lens.
+        seen: ``T_camera_target``.
+        pixels: (N, 2), of the rays.
+        points: (N, 3), on the target, metres.
+
+    Returns:
+        Infinite for a ray that does not meet the plane before the camera.
+    """
+    rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
+    off: Array = np.linalg.norm(on_plane(rays, *seen) - points, axis=1)
+    return off
 
 
 def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
@@ -190,7 +213,7 @@ class Candidate:
 
     Attributes:
         method: one of :data:`METHODS`.
-        beside: one of :data:`BESIDE`.
+        besides: one of :data:`ADJUSTABLE`.
         problem: with what is adjusted besides set free.
         solution: from all poses; None where it fails.
         folds: solutions from the other poses, by the poses left out.
@@ -199,7 +222,7 @@ class Candidate:
     """
 
     method: str
-    beside: str
+    besides: str
     problem: Problem
     solution: Solution | None
     folds: list[tuple[NDArray[np.intp], Solution]] = field(default_factory=list)
@@ -209,7 +232,7 @@ class Candidate:
     @property
     def name(self) -> str:
         """Method, and what is adjusted besides."""
-        return f"{self.method}, {self.beside}" if self.beside else self.method
+        return self.method if self.besides == NOTHING else f"{self.method}, {self.besides}"
 
     @property
     def held_out(self) -> float:
@@ -221,7 +244,7 @@ class Candidate:
     @property
     def chance(self) -> float:
         """How likely noise alone makes what is adjusted besides differ as much, 0 to 1."""
-        if self.solution is None or self.solution.adjusted is None or not self.beside:
+        if self.solution is None or self.solution.adjusted is None or not len(self.solution.change):
             return 1.0
         change, whole = self.solution.change, self.solution.adjusted.information
         outer, mixed = whole[:12, :12], whole[:12, 12:]
@@ -231,7 +254,9 @@ class Candidate:
         squares = float(change @ own @ change)
         if not math.isfinite(squares):
             return 1.0
-        return Chance(1.0).chance(max(squares, 0.0), len(change))
+        # half of the equations each tell one of the robot's two sigmas
+        freedom = None if self.problem.sigmas else max(1, 3 * self.problem.count - 6)
+        return Chance(1.0, freedom).chance(max(squares, 0.0), len(change))
 
 
 def candidates(
@@ -243,37 +268,37 @@ def candidates(
 
     Args:
         problem: poses and views.
-        free: numbers of the parameters of each of :data:`BESIDE` that may be adjusted.
+        free: numbers of the parameters of each of :data:`ADJUSTABLE` that may be adjusted.
         method: ``auto``, or the only one that is wanted beside the closed forms.
     """
-    found = [Candidate(name, "", problem, _closed(problem, name)) for name in LINEAR]
+    found = [Candidate(name, NOTHING, problem, _closed(problem, name)) for name in LINEAR]
     begin = _begin(problem, found)
     for one in found:
         _leave_out(one)
     if begin is None or method in LINEAR:
         return found
 
-    def tried(name: str, beside: str) -> Candidate:
-        freed = _freed(problem, free[beside])
-        one = Candidate(name, beside, freed, _refined(freed, name, begin))
+    def tried(name: str, besides: str) -> Candidate:
+        freed = _freed(problem, free[besides])
+        one = Candidate(name, besides, freed, _refined(freed, name, begin))
         _leave_out(one)
         return one
 
     judges = []
     asked = next(iter(free))
     if len(free) > 1 or method in ("auto", JUDGE):
-        judges = [tried(JUDGE, beside) for beside in free]
+        judges = [tried(JUDGE, besides) for besides in free]
     if len(free) > 1:
         asked = _asked([one for one in judges if one.solution is not None])
     others = [name for name in METHODS if name not in (*LINEAR, JUDGE) and method in ("auto", name)]
-    for beside in dict.fromkeys(("", asked)):
-        if beside in free:
-            found += [tried(name, beside) for name in others]
+    for besides in dict.fromkeys((NOTHING, asked)):
+        if besides in free:
+            found += [tried(name, besides) for name in others]
     return found + judges
 
 
 def choose(
-    found: Sequence[Candidate], *, method: str = "auto", beside: str | None = None
+    found: Sequence[Candidate], *, method: str = "auto", besides: str | None = None
 ) -> Candidate | None:
     """Return the candidate that is to be taken; None where none can be.
 
@@ -282,14 +307,14 @@ def choose(
     Args:
         found: all of them.
         method: ``auto``, or which it must be.
-        beside: what must be adjusted besides; None: what is asked for.
+        besides: what must be adjusted besides; None: what is asked for.
     """
     sound = [one for one in found if one.solution is not None]
-    wanted = _asked(sound) if beside is None else beside
+    wanted = _asked(sound) if besides is None else besides
     kept = [
         one
         for one in sound
-        if method in ("auto", one.method) and (one.method in LINEAR or one.beside == wanted)
+        if method in ("auto", one.method) and (one.method in LINEAR or one.besides == wanted)
     ]
     scored = [one for one in kept if math.isfinite(one.held_out)]
     if scored:
@@ -300,11 +325,11 @@ def choose(
 
 
 def _asked(sound: Sequence[Candidate]) -> str:
-    """Return what is to be adjusted beside the poses."""
+    """Return what is to be adjusted besides."""
     judges = [one for one in sound if one.method == JUDGE]
-    plain = next((one.held_out for one in judges if not one.beside), math.inf)
+    plain = next((one.held_out for one in judges if one.besides == NOTHING), math.inf)
     asked = [one for one in judges if one.chance < LEVEL and one.held_out < plain]
-    return min(asked, key=lambda one: one.held_out).beside if asked else ""
+    return min(asked, key=lambda one: one.held_out).besides if asked else NOTHING
 
 
 def _freed(problem: Problem, numbers: tuple[int, ...]) -> Problem:

@@ -11,13 +11,15 @@ import numpy as np
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.frames import Transform
 from smartcam.calibration.geometry import as_points
-from smartcam.calibration.imaging.hand_eye_choice import on_plane
+from smartcam.calibration.imaging.hand_eye_choice import on_plane, point_errors
 from smartcam.calibration.imaging.hand_eye_fit import Rigid
+from smartcam.calibration.imaging.poses import check_view
+from smartcam.calibration.imaging.targets import resized
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import ArrayLike
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.geometry import Array
     from smartcam.calibration.imaging.cameras import CameraModel
     from smartcam.calibration.imaging.hand_eye_fit import RobotSigmas, Setup
+    from smartcam.calibration.imaging.targets import Target
     from smartcam.calibration.imaging.views import TargetView
 
 __all__ = ["KIND", "HandEyeCalibration", "as_transform"]
@@ -40,23 +43,31 @@ class HandEyeCalibration:
     Attributes:
         setup: ``eye-in-hand`` or ``eye-to-hand``.
         camera_pose: ``T_flange_camera``; ``T_base_camera`` for a camera beside the robot.
-        target_pose: ``T_base_target``; ``T_flange_target`` there.
+        target_pose: ``T_base_target``; ``T_flange_target`` there: that of the target as large as
+            ``target_scale`` says, see :attr:`target`.
         camera: the camera; None where poses of the target were given instead of views.
-        target_scale: size of the target over the nominal one.
+        target_scale: size of the target over the nominal one, as the robot's motions tell it; 1
+            where it was not adjusted. ``camera_pose``, ``target_pose`` and all errors are those of
+            the target of this size; a remark ``SCALE_MISMATCH`` says that it is more than half a
+            percent off the nominal one. Where a ruler says that the target has its nominal size, it
+            is the robot's or the lens' lengths that are off by this factor.
         method: what the candidate is called that was taken.
         candidates: rms held-out error of each candidate on the target, metres; None where a
             candidate has none.
-        errors: (V,), rms error of each pose on the target, metres, with all poses taken in.
-        mean_error: mean over all points, metres: what others publish as their 3D error.
+        errors: (V,), rms error of each pose on the target, metres, with all used poses taken in;
+            NaN for a bad pose in which the target would not be before the camera.
+        mean_error: mean over all points of the used poses, metres: what others publish as their 3D
+            error.
         leave_one_out: (V,), the same of a calibration from the others, with the robot's pose as it
             was given, metres; NaN where there is none.
-        held_out_error: rms of these over all points, metres; None where there is none. It is what
-            picking has to expect.
+        held_out_error: rms of these over all points of the used poses, metres; None where there is
+            none. It is what picking has to expect.
         covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
             along those of its target, m) and of ``target_pose``.
         robot_sigmas: of each axis of the robot's poses, as given or estimated; None where they were
             taken for exact.
         robot_poses: ``T_base_flange``, as given.
+        used: whether each pose was used; False for a bad one.
         views: as given; empty where poses were.
         target_poses: ``T_camera_target`` of each pose, from its own view or as given.
         warnings: what one should know before using it.
@@ -76,6 +87,7 @@ class HandEyeCalibration:
     covariance: Array
     robot_sigmas: RobotSigmas | None
     robot_poses: tuple[Transform, ...]
+    used: tuple[bool, ...]
     views: tuple[TargetView, ...] = ()
     target_poses: tuple[Transform, ...] = ()
     warnings: tuple[Remark, ...] = ()
@@ -83,6 +95,11 @@ class HandEyeCalibration:
     def __post_init__(self) -> None:
         for array in (self.errors, self.leave_one_out, self.covariance):
             array.flags.writeable = False
+
+    @property
+    def target(self) -> Target | None:
+        """The target as large as ``target_scale`` says; None where poses of it were given."""
+        return resized(self.views[0].target, self.target_scale) if self.views else None
 
     @property
     def rotation_error(self) -> float:
@@ -144,9 +161,70 @@ class HandEyeCalibration:
             CalibrationError: SHAPE or NOT_FINITE; WRONG_FRAME; OUT_OF_FIELD: a ray that does not
                 meet the plane before the camera; NO_CALIBRATION: without a camera's lens.
         """
-        lens, seen = self._lens(), as_points(pixels, 2, "pixels")
+        lens, seen = self._lens("to_plane"), as_points(pixels, 2, "pixels")
         found = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
         return plane.apply(found)
+
+    def point_errors(
+        self,
+        robot_poses: Sequence[Transform | Pose],
+        views: Sequence[TargetView | Transform],
+    ) -> tuple[Array, ...]:
+        """Return by how much the calibration is off on the target, at any poses of the robot.
+
+        Poses and views that it was not made from tell how good it is. The error of a point is the
+        distance, in the target's plane, from where the target should have it by the robot's pose to
+        where its ray passes.
+
+        Args:
+            robot_poses: ``T_base_flange``.
+            views: of the same target in the same place, as many; or ``T_camera_target``, of which
+                the error is that of the target's origin.
+
+        Returns:
+            Of each view (N,), of each pose of the target (1,), metres; infinite where a ray does
+            not meet the target's plane before the camera.
+
+        Raises:
+            CalibrationError: SHAPE: not as many; ``WRONG_FRAME``: poses of other frames;
+                ``DIFFERENT_TARGETS``; ``NO_CALIBRATION``: views, without a camera's lens; and what
+                :func:`~smartcam.calibration.imaging.poses.check_view` says.
+        """
+        if len(robot_poses) != len(views):
+            raise CalibrationError(
+                f"point_errors: expected as many views as poses of the robot, got {len(views)} and "
+                f"{len(robot_poses)}",
+                code=Code.SHAPE,
+                expected=len(robot_poses),
+                got=len(views),
+            )
+        return tuple(
+            self._errors(as_transform(pose, self._flange).undated(), one)
+            for pose, one in zip(robot_poses, views, strict=True)
+        )
+
+    def _errors(self, robot_pose: Transform, view: TargetView | Transform) -> Array:
+        in_hand = self.setup == "eye-in-hand"
+        between = robot_pose.inverse() if in_hand else robot_pose
+        seen = self.camera_pose.inverse() @ between @ self.target_pose
+        if isinstance(view, Transform):
+            off = seen.translation - self.target_scale * view.translation
+            return np.array([float(np.linalg.norm(off))])
+        lens = self._lens("point_errors")
+        check_view(view, lens.size)
+        if self.views and view.target != self.views[0].target:
+            raise CalibrationError(
+                f"point_errors: expected views of {self.views[0].target}, got one of {view.target}",
+                code=Code.DIFFERENT_TARGETS,
+                expected=self.views[0].target,
+                got=view.target,
+            )
+        points = self.target_scale * view.object_points
+        return point_errors(lens, Rigid(seen.rotation, seen.translation), view.points, points)
+
+    @property
+    def _flange(self) -> str:
+        return (self.camera_pose if self.setup == "eye-in-hand" else self.target_pose).target
 
     def predicted_error(
         self,
@@ -170,7 +248,7 @@ class HandEyeCalibration:
         Raises:
             CalibrationError: as :meth:`to_plane`.
         """
-        lens, seen = self._lens(), as_points(pixels, 2, "pixels")
+        lens, seen = self._lens("predicted_error"), as_points(pixels, 2, "pixels")
         behind = self.camera_at(robot_pose) @ self.camera_pose.inverse()
         camera = Rigid(self.camera_pose.rotation, self.camera_pose.translation)
         slopes, small = [], 1e-6
@@ -186,10 +264,10 @@ class HandEyeCalibration:
         error: Array = np.sqrt(np.trace(joint, axis1=1, axis2=2))
         return error
 
-    def _lens(self) -> CameraModel:
+    def _lens(self, what: str) -> CameraModel:
         if self.camera is None:
             raise CalibrationError(
-                "to_plane: expected a calibration with the camera's lens, got one from poses of "
+                f"{what}: expected a calibration with the camera's lens, got one from poses of "
                 "the target",
                 code=Code.NO_CALIBRATION,
                 expected="camera",

@@ -25,7 +25,7 @@ from smartcam.calibration.imaging.views import TargetView
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from smartcam.calibration.geometry import Array
     from smartcam.calibration.imaging.targets import Target
@@ -55,13 +55,14 @@ class HandEyeData(BaseModel):
     target_scale: FiniteFloat = Field(gt=0)
     method: str
     candidates: dict[str, FiniteFloat | None] = Field(description="rms held-out error, m")
-    errors: list[FiniteFloat] = Field(min_length=3, description="m")
+    errors: list[FiniteFloat | None] = Field(min_length=3, description="m; null: none")
     mean_error: FiniteFloat = Field(ge=0, description="m")
     leave_one_out: list[FiniteFloat | None] = Field(min_length=3, description="m; null: none")
     held_out_error: FiniteFloat | None = Field(description="m")
     covariance: list[list[FiniteFloat]] | None = Field(description="rad and m; null: none")
     robot_sigmas: tuple[FiniteFloat, FiniteFloat] | None = Field(description="rad, m")
     robot_poses: list[MotionData] = Field(min_length=3, description="T_base_flange")
+    used: list[bool] = Field(min_length=3)
     target_poses: list[MotionData] = Field(min_length=3, description="T_camera_target")
     views: list[ViewData]
     warnings: list[RemarkData]
@@ -82,15 +83,14 @@ def to_data(calibration: HandEyeCalibration) -> dict[str, Any]:
         "target_scale": calibration.target_scale,
         "method": calibration.method,
         "candidates": dict(calibration.candidates),
-        "errors": calibration.errors.tolist(),
+        "errors": _nulls(calibration.errors),
         "mean_error": calibration.mean_error,
-        "leave_one_out": [
-            None if math.isnan(value) else value for value in calibration.leave_one_out.tolist()
-        ],
+        "leave_one_out": _nulls(calibration.leave_one_out),
         "held_out_error": calibration.held_out_error,
         "covariance": calibration.covariance.tolist() if known else None,
         "robot_sigmas": None if sigmas is None else list(sigmas),
         "robot_poses": [motion_to_data(one) for one in calibration.robot_poses],
+        "used": list(calibration.used),
         "target_poses": [motion_to_data(one) for one in calibration.target_poses],
         "views": [view_to_data(one) for one in views],
         "warnings": [{"code": one.code.value, "text": one.text} for one in calibration.warnings],
@@ -116,19 +116,26 @@ def from_data(data: Mapping[str, Any]) -> HandEyeCalibration:
         target_scale=stored.target_scale,
         method=stored.method,
         candidates=stored.candidates,
-        errors=np.array(stored.errors),
+        errors=_numbers(stored.errors),
         mean_error=stored.mean_error,
-        leave_one_out=np.array(
-            [math.nan if value is None else value for value in stored.leave_one_out]
-        ),
+        leave_one_out=_numbers(stored.leave_one_out),
         held_out_error=stored.held_out_error,
         covariance=_covariance(stored.covariance),
         robot_sigmas=None if stored.robot_sigmas is None else RobotSigmas(*stored.robot_sigmas),
         robot_poses=tuple(_motion(one, base, flange) for one in stored.robot_poses),
+        used=tuple(stored.used),
         target_poses=tuple(_motion(one, "camera", "target") for one in stored.target_poses),
         views=tuple(_view(one, target) for one in stored.views if target is not None),
         warnings=tuple(Remark(one.code, one.text) for one in stored.warnings),
     )
+
+
+def _nulls(values: Array) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in values.tolist()]
+
+
+def _numbers(values: Sequence[float | None]) -> Array:
+    return np.array([math.nan if value is None else value for value in values])
 
 
 M = TypeVar("M", bound=BaseModel)
@@ -212,7 +219,7 @@ def _covariance(stored: list[list[float]] | None) -> Array:
 
 def _check_counts(stored: HandEyeData) -> None:
     count = len(stored.robot_poses)
-    for name in ("errors", "leave_one_out", "target_poses"):
+    for name in ("errors", "leave_one_out", "used", "target_poses"):
         if len(getattr(stored, name)) != count:
             raise _no_calibration(f"{name}: expected {count}", len(getattr(stored, name)))
     if stored.views and (stored.target is None or len(stored.views) != count):

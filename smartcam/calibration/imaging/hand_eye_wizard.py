@@ -12,7 +12,10 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from smartcam.calibration.codes import Code
+from smartcam.calibration.formats.robots import ROBOTS, pose_from
 from smartcam.calibration.frames import Transform
+from smartcam.calibration.imaging.asked_target import ask_target
 from smartcam.calibration.imaging.detection import find_target
 from smartcam.calibration.imaging.hand_eye import calibrate_hand_eye
 from smartcam.calibration.imaging.hand_eye_linear import LEAST_POSES
@@ -23,6 +26,10 @@ from smartcam.calibration.imaging.hand_eye_stored import (
     view_from_data,
     view_to_data,
 )
+from smartcam.calibration.imaging.pictures import MAX_PREVIEW, PICTURE_TIMEOUT
+from smartcam.calibration.imaging.preview import draw
+from smartcam.calibration.imaging.suggestions import LOOKS, outline
+from smartcam.calibration.marks import with_default
 from smartcam.calibration.sequence import Wizard, ask
 from smartcam.calibration.steps import Number, Option, Step
 from smartcam.calibration.store import write
@@ -35,13 +42,12 @@ if TYPE_CHECKING:
 
     from smartcam.calibration.imaging.cameras import CameraModel
     from smartcam.calibration.imaging.hand_eye_fit import Setup
+    from smartcam.calibration.imaging.pictures import TakePicture
     from smartcam.calibration.imaging.targets import Target
+    from smartcam.calibration.imaging.views import TargetView
     from smartcam.calibration.steps import Answers
 
-__all__ = ["MOST_VIEWS", "SUGGESTIONS", "ReadFlange", "TakePicture", "hand_eye_wizard"]
-
-TakePicture = Callable[[], Awaitable[Any]]
-"""Takes a picture and returns it: uint8, (H, W) or (H, W, 3)."""
+__all__ = ["MOST_VIEWS", "SUGGESTIONS", "ReadFlange", "hand_eye_wizard"]
 
 ReadFlange = Callable[[], Awaitable[Transform | Pose]]
 """Returns ``T_base_flange``, the flange's pose in the robot's base."""
@@ -60,42 +66,34 @@ _MOVES: Mapping[str, str] = {
     "eye-to-hand": "Bring the sheet before the camera, and hold it",
 }
 
-SUGGESTIONS = (
-    "straight from the front, the sheet in the middle of the image",
-    "tilted by 30 degrees about one side of the sheet",
-    "tilted by 30 degrees to the opposite side",
-    "tilted by 30 degrees about the other side of the sheet",
-    "tilted by 30 degrees to the opposite side of that",
-    "turned by 90 degrees about the line of sight",
-    "turned by 90 degrees the other way, and tilted by 20 degrees",
-    "nearer, so that the sheet fills the image, tilted by 20 degrees",
-    "farther away, tilted by 30 degrees towards a corner of the sheet",
-    "with the sheet in a corner of the image, tilted towards another corner",
-)
+SUGGESTIONS = tuple(look.text for look in LOOKS)
 """From where to look, one view after the other; then from the beginning, a bit beside it."""
 
 
 def hand_eye_wizard(
     *,
-    target: Target,
     take_picture: TakePicture,
-    read_robot: ReadFlange,
     save_to: Callable[[str], Path],
+    target: Target | None = None,
+    suggested: Target | None = None,
+    read_robot: ReadFlange | None = None,
     camera: CameraModel | None = None,
 ) -> Wizard:
     """Return the wizard.
 
-    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), ``setup`` (default of the
-    first step).
+    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
+    first step ``setup`` and ``robot`` (in whose convention poses are typed, a key of
+    :data:`~smartcam.calibration.formats.robots.ROBOTS`).
 
     Its result: ``name, file, method, views, held_out_mm, mean_mm, translation_error_mm,
     rotation_error_deg, remarks``.
 
     Args:
-        target: what is on the sheet.
         take_picture: takes a picture; the robot stands still.
-        read_robot: reads the pose of the flange.
         save_to: returns the file for a name.
+        target: what is on the sheet, with the lengths that it has on paper; None: it is asked.
+        suggested: the default of what is asked.
+        read_robot: reads the pose of the flange; None: it is typed.
         camera: its lens; None: calibrated from the same views.
 
     Cancellation: a picture or a pose under way is given up; a calculation ends in its thread, and
@@ -103,8 +101,9 @@ def hand_eye_wizard(
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
-        setup = await _ask_setup(parameters)
-        work = _Work(target, setup, take_picture, read_robot, camera)
+        setup, robot = await _ask_setup(parameters, typed=read_robot is None)
+        there = await ask_target(suggested) if target is None else target
+        work = _Work(there, setup, take_picture, read_robot or robot, camera)
         calibration = await work.views()
         name = str(parameters.get("name", "hand-eye"))
         file = save_to(name)
@@ -121,7 +120,8 @@ def hand_eye_wizard(
     return Wizard(name=KIND, version=1, script=script)
 
 
-async def _ask_setup(parameters: Mapping[str, Any]) -> Setup:
+async def _ask_setup(parameters: Mapping[str, Any], *, typed: bool) -> tuple[Setup, str]:
+    """Return where the camera is, and in which convention the robot's poses are typed."""
     setup = Option(
         name="setup",
         label="Where the camera is",
@@ -129,15 +129,22 @@ async def _ask_setup(parameters: Mapping[str, Any]) -> Setup:
             "eye-in-hand": "on the robot's hand; the sheet lies still",
             "eye-to-hand": "beside the robot; the sheet is on the hand",
         },
-        default="eye-to-hand" if parameters.get("setup") == "eye-to-hand" else "eye-in-hand",
     )
+    robot = Option(
+        name="robot",
+        label="How the robot shows the pose of its flange",
+        options={name: f"{', '.join(one.numbers)}; {one.title}" for name, one in ROBOTS.items()},
+    )
+    inputs = (setup, robot) if typed else (setup,)
     step = Step(
         id="about",
         title="Camera and robot",
         description="The sheet must not slip on what carries it until all pictures are taken.",
-        inputs=(setup,),
+        inputs=tuple(with_default(one, parameters) for one in inputs),
     )
-    return "eye-to-hand" if (await ask(step))["setup"] == "eye-to-hand" else "eye-in-hand"
+    answer = await ask(step)
+    where: Setup = "eye-to-hand" if answer["setup"] == "eye-to-hand" else "eye-in-hand"
+    return where, str(answer.get("robot", ""))
 
 
 async def _save(file: Path, calibration: HandEyeCalibration, _answers: Answers) -> dict[str, Any]:
@@ -153,13 +160,13 @@ class _Work:
         target: Target,
         setup: Setup,
         take_picture: TakePicture,
-        read_robot: ReadFlange,
+        robot: ReadFlange | str,
         camera: CameraModel | None,
     ) -> None:
         self._target = target
         self._setup: Setup = setup
         self._take_picture = take_picture
-        self._read_robot = read_robot
+        self._robot = robot
         self._camera = camera
         self._samples: list[dict[str, Any]] = []
 
@@ -184,7 +191,7 @@ class _Work:
         count = len(self._samples)
         if count >= MOST_VIEWS:
             return False
-        inputs: tuple[Option, ...] = ()
+        inputs: tuple[Option | Number, ...] = ()
         if count >= LEAST_POSES:
             options = {
                 "view": "take this view",
@@ -193,14 +200,20 @@ class _Work:
             default = "view" if count < ADVISED_VIEWS else "calculate"
             inputs = (Option(name="next", label="What next", options=options, default=default),)
         look = SUGGESTIONS[count % len(SUGGESTIONS)]
+        typed = ""
+        if isinstance(self._robot, str):
+            typed = " Then take the pose of the flange from the robot, in its base."
+            inputs = (*inputs, *_pose_inputs(self._robot, optional=count >= LEAST_POSES))
         step = Step(
             id=f"view-{count + 1}",
             title=f"View {count + 1}",
             description=f"{_MOVES[self._setup]}: {look}. The whole sheet must be in the image, and "
-            "the robot must stand still.",
-            button="Take a picture" if not inputs else "Go on",
+            f"the robot must stand still.{typed}",
+            button="Take a picture" if count < LEAST_POSES else "Go on",
             inputs=inputs,
             notes=(f"{count} views so far",) if count else (),
+            preview=self._preview(),
+            timeout=PICTURE_TIMEOUT,
         )
         sample = (await ask(step, self._sample)).outcome
         if sample:
@@ -211,13 +224,44 @@ class _Work:
         """Take a picture and read the robot, if that is wanted."""
         if answers.get("next") == "calculate":
             return {}
+        typed = None
+        if isinstance(self._robot, str):  # a pose that is none shall not cost a picture
+            typed = _typed_pose(self._robot, answers)
         image = await self._take_picture()
-        pose = await self._read_robot()
-        flange = Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
+        flange = typed or await self._flange()
         name = f"view {len(self._samples) + 1}"
-        view = await asyncio.to_thread(find_target, image, self._target, name=name)
+        view, preview = await asyncio.to_thread(self._found, image, name)
         frames = [flange.target, flange.source]
-        return {"frames": frames, "pose": motion_to_data(flange), "view": view_to_data(view)}
+        return {
+            "frames": frames,
+            "pose": motion_to_data(flange),
+            "view": view_to_data(view),
+            "preview": preview,
+        }
+
+    async def _flange(self) -> Transform:
+        if isinstance(self._robot, str):
+            raise TypeError("the robot is not read")
+        pose = await self._robot()
+        return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
+
+    def _found(self, image: Any, name: str) -> tuple[TargetView, str]:
+        """Return what is found in a picture, and the picture to show; a large one is left out."""
+        view = find_target(image, self._target, name=name)
+        earlier = [view_from_data(one["view"], self._target) for one in self._samples]
+        following = LOOKS[(len(earlier) + 1) % len(LOOKS)]
+        svg = draw(
+            image,
+            view=view,
+            earlier=earlier,
+            suggested=outline(following, self._target, view.size),
+            title=f"{name}; orange: the next one, about",
+        )
+        return view, svg if len(svg) <= MAX_PREVIEW else ""
+
+    def _preview(self) -> dict[str, Any] | None:
+        svg = self._samples[-1].get("preview") if self._samples else None
+        return {"svg": svg} if svg else None
 
     async def _calculate(self) -> tuple[HandEyeCalibration | None, list[str]]:
         step = Step(
@@ -273,6 +317,32 @@ class _Work:
                 ),
             ),
         )
+
+
+def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
+    """Return what asks for a pose; where it is ``optional``, none is needed to calculate."""
+    convention = ROBOTS[robot]
+    unit = "mm" if convention.metre > 1 else "m"
+    return tuple(
+        Number(
+            name=name, label=name, unit=unit if name in {"x", "y", "z"} else "", optional=optional
+        )
+        for name in convention.numbers
+    )
+
+
+def _typed_pose(robot: str, answers: Answers) -> Transform:
+    values = [answers[name] for name in ROBOTS[robot].numbers]
+    missing = {
+        name: "no answer"
+        for name, value in zip(ROBOTS[robot].numbers, values, strict=True)
+        if value is None
+    }
+    if missing:
+        raise CalibrationError(
+            f"pose: no answer for {', '.join(missing)}", code=Code.WRONG_ANSWERS, got=missing
+        )
+    return pose_from(robot, values, source="flange")
 
 
 def _figures(calibration: HandEyeCalibration) -> dict[str, Any]:

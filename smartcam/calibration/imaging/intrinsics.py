@@ -12,7 +12,7 @@ import numpy as np
 
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.bundle import Sight
+from smartcam.calibration.imaging.bundle import IDENTITY, Bundle, Motion, Sight
 from smartcam.calibration.imaging.coverage import coverage
 from smartcam.calibration.imaging.lenses import fit_lens, parameter_names
 from smartcam.calibration.imaging.poses import CAMERA, TARGET, check_view, locate
@@ -148,6 +148,45 @@ class IntrinsicCalibration:
         return tuple(
             label(one.view, number) for number, one in enumerate(self.views) if not one.used
         )
+
+    def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
+        """Return by how much the lens is off at any views.
+
+        Views that it was not fitted to tell how good it is. The pose of the target alone is fitted
+        to each, as for :attr:`ViewFit.held_out`.
+
+        Args:
+            views: of any target; of the same one where its points were adjusted (``sheet``).
+
+        Returns:
+            Of each view (N, 2), seen minus projected, pixels: 2 N - 6 of them are free.
+
+        Raises:
+            CalibrationError: ``DIFFERENT_TARGETS``; and what
+                :func:`~smartcam.calibration.imaging.poses.locate` says.
+        """
+        return tuple(self._errors(one) for one in views)
+
+    def _errors(self, view: TargetView) -> Array:
+        meant = self.views[0].view.target
+        if self.sheet is not None and view.target != meant:
+            raise CalibrationError(
+                f"point_errors: expected views of {meant}, whose points were adjusted, got one of "
+                f"{view.target}",
+                code=Code.DIFFERENT_TARGETS,
+                expected=meant,
+                got=view.target,
+            )
+        near = locate(view, self.camera).transform
+        bundle = Bundle(
+            cameras=(self.camera,),
+            rig=(IDENTITY,),
+            poses=(Motion(near.rotation, near.translation),),
+            basis=(np.zeros((4 + len(self.camera.distortion), 0)),),
+            points=None if self.sheet is None else meant.points + self.sheet,
+        )
+        (residuals,) = held_out_residuals(bundle, [Sight(0, 0, view)], 0, self.sigma**2)
+        return residuals
 
     def to_data(self) -> dict[str, Any]:
         """Return it as JSON takes it; :meth:`from_data` gives it back bit by bit."""

@@ -23,6 +23,12 @@ __all__ = ["MAX_PIXELS", "Rectification", "rectify"]
 
 Image: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]"
 
+ACROSS: Final = 0.1
+"""Cosine of the angle by which a camera's viewing direction is turned, at least.
+
+With less, a camera looks along the line to the other one: rows would meet inside of its image.
+"""
+
 MAX_PIXELS: Final = 100_000_000
 """Of a rectified image; its two maps have 8 bytes for each."""
 
@@ -95,7 +101,9 @@ def rectify(
 
     Raises:
         CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is none or too large,
-            lenses of different models; ``WRONG_SIZE``: images of different sizes.
+            lenses of different models; ``WRONG_SIZE``: images of different sizes;
+            ``OUT_OF_FIELD``: the images would have nothing in them, as of cameras behind each
+            other, or of which one stands on its head.
     """
     output = _checked(left, right, alpha, size)
     turns, projections, depth = _parallel(left, right, transform, alpha, output)
@@ -105,6 +113,17 @@ def rectify(
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)
     )
     masks = tuple(_inside(chart, camera.size) for chart, camera in zip(maps, cameras, strict=True))
+    across = min(float(turn[2, 2]) for turn in turns)
+    upright = min(float(projection[0, 0]) for projection in projections) > 0
+    if not (upright and across > ACROSS and all(mask.any() for mask in masks)):
+        raise CalibrationError(
+            f"rectify with alpha {alpha:g}: expected two cameras beside each other that see the "
+            "same place the same way up, got parallel images with nothing in them, or upside down "
+            f"(cosine between old and new viewing direction: {across:.2f})",
+            code=Code.OUT_OF_FIELD,
+            expected=ACROSS,
+            got=across,
+        )
     kept = tuple(
         _kept(camera, turn, projection, output)
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration.codes import Code, Remark
-from smartcam.calibration.extra import load
 from smartcam.calibration.frames import Transform
 from smartcam.calibration.geometry import as_points
 from smartcam.calibration.imaging import triangulation
 from smartcam.calibration.imaging.bundle import (
     Bundle,
-    Indices,
     Sight,
     adjust_weighted,
 )
@@ -30,7 +28,7 @@ from smartcam.calibration.imaging.intrinsics import (
     remark_sheet,
     worst_view,
 )
-from smartcam.calibration.imaging.poses import TARGET
+from smartcam.calibration.imaging.poses import TARGET, check_view
 from smartcam.calibration.imaging.rectification import Rectification, rectify
 from smartcam.calibration.imaging.sheet_shape import (
     GAIN,
@@ -38,6 +36,7 @@ from smartcam.calibration.imaging.sheet_shape import (
     held_out_residuals,
     leave_out,
 )
+from smartcam.calibration.imaging.stereo_errors import PairErrors, pair_errors, spacing_errors
 from smartcam.calibration.imaging.stereo_start import (
     LEFT,
     RIGHT,
@@ -45,6 +44,7 @@ from smartcam.calibration.imaging.stereo_start import (
     Lenses,
     Moment,
     as_moments,
+    half_turned,
     start,
 )
 from smartcam.exceptions import CalibrationError
@@ -58,19 +58,23 @@ if TYPE_CHECKING:
     from smartcam.calibration.geometry import Array
     from smartcam.calibration.imaging.bundle import Adjusted
     from smartcam.calibration.imaging.cameras import CameraModel, DistortionModel
-    from smartcam.calibration.imaging.targets import Target
     from smartcam.calibration.imaging.views import TargetView
 
-__all__ = ["LEFT", "RIGHT", "PairFit", "StereoCalibration", "calibrate_stereo", "spacing_errors"]
+__all__ = [
+    "LEFT",
+    "RIGHT",
+    "PairErrors",
+    "PairFit",
+    "StereoCalibration",
+    "calibrate_stereo",
+    "spacing_errors",
+]
 
 KIND: Final = "stereo"
 """What the store calls it."""
 
 LEAST_PAIRS: Final = 2
 """For lenses that are known; one tells the transform, another that it is right."""
-
-NEAREST: Final = 1.01
-"""Points that are no farther apart than this many times the least distance are neighbours."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -216,6 +220,45 @@ class StereoCalibration:
         """
         pixels = self._pixels(left_pixels, right_pixels)
         return triangulation.epipolar_distances(self.left, self.right, self.transform, pixels)
+
+    def point_errors(
+        self,
+        left_views: Sequence[TargetView | None],
+        right_views: Sequence[TargetView | None],
+    ) -> tuple[PairErrors, ...]:
+        """Return by how much the cameras are off at any pairs of views.
+
+        Pairs that they were not fitted to tell how good they are. The target does not have to be
+        the same.
+
+        Args:
+            left_views: one for each moment; None where the left camera does not see the target.
+            right_views: of the right camera at the same moments. Of a target that looks the same
+                when turned they are numbered as they fit the left ones.
+
+        Returns:
+            One for each moment, without any errors where a view is missing.
+
+        Raises:
+            CalibrationError: ``SHAPE``: lists of different lengths; ``WRONG_SIZE``; ``TOO_FEW``,
+                ``COLLINEAR``, ``NOT_FINITE``: a view that is of no use; ``DIFFERENT_TARGETS``.
+        """
+        moments = as_moments(left_views, right_views)
+        for side, camera in enumerate((self.left, self.right)):
+            for moment in moments:
+                if (view := moment[side]) is not None:
+                    check_view(view, camera.size)
+        return tuple(self._errors(*moment) for moment in moments)
+
+    def _errors(self, left: TargetView | None, right: TargetView | None) -> PairErrors:
+        if left is None or right is None:
+            return PairErrors(np.zeros(0), np.zeros((0, 2)))
+        ways = [right]
+        if right.target.turned_alike:
+            ways.append(half_turned(right))
+        cameras = self.left, self.right, self.transform
+        found = [pair_errors(cameras, left, one) for one in ways]
+        return min(found, key=lambda one: _rms([one.epipolar]))
 
     def rectify(self, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Rectification:
         """Return what makes the rows of both images show the same points.
@@ -375,48 +418,10 @@ class _Found(NamedTuple):
     least: int
 
 
-class _Common(NamedTuple):
-    """Points that both cameras see at one moment."""
-
-    ids: Indices
-    pixels: tuple[Array, Array]
-    covariance: tuple[Array, Array]
-
-    @classmethod
-    def of(cls, left: TargetView, right: TargetView) -> _Common:
-        ids, first, second = np.intersect1d(left.ids, right.ids, return_indices=True)
-        return cls(
-            np.asarray(ids, dtype=np.intp),
-            (left.points[first], right.points[second]),
-            (left.covariance[first], right.covariance[second]),
-        )
-
-
-def spacing_errors(target: Target, ids: Indices, points: Array) -> Array:
-    """Return the distances between neighbours on a target less the true ones (M,), metres.
-
-    Args:
-        target: a sheet.
-        ids: (N,), numbers of points on it.
-        points: (N, 3), where they are in space, metres; those that are NaN have no neighbours.
-    """
-    seen = np.isfinite(points).all(axis=1)
-    flat, points = target.points[ids[seen]], points[seen]
-    if len(flat) < 2:
-        return np.zeros(0)
-    apart = np.linalg.norm(target.points - target.points[0], axis=1)[1:].min()
-    tree = load("scipy.spatial").cKDTree(flat)
-    one, two = tree.query_pairs(NEAREST * apart, output_type="ndarray").T
-    true = np.linalg.norm(flat[one] - flat[two], axis=1)
-    errors: Array = np.linalg.norm(points[one] - points[two], axis=1) - true
-    return errors
-
-
 class _HeldOut(NamedTuple):
     """Errors of one pair under cameras that never saw it."""
 
-    spacing: Array
-    epipolar: Array
+    errors: PairErrors
     residuals: Array
 
 
@@ -430,13 +435,9 @@ def _held_out(found: _Found) -> dict[int, _HeldOut]:
         left, right = found.moments[number]
         if left is None or right is None:
             continue
-        cameras, common = _cameras(bundle), _Common.of(left, right)
-        points = triangulation.triangulate(*cameras, common.pixels, common.covariance).points
         residuals = held_out_residuals(bundle, found.sights, number, found.adjusted.more)
         errors[number] = _HeldOut(
-            spacing_errors(left.target, common.ids, points),
-            triangulation.epipolar_distances(*cameras, common.pixels),
-            np.concatenate(residuals),
+            pair_errors(_cameras(bundle), left, right), np.concatenate(residuals)
         )
     return errors
 
@@ -470,8 +471,7 @@ def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
     for number in _pairs(found.sights):
         one, two = found.moments[number]
         if one is not None and two is not None:
-            pixels = _Common.of(one, two).pixels
-            epipolar.append(triangulation.epipolar_distances(left, right, transform, pixels))
+            epipolar.append(pair_errors((left, right, transform), one, two).epipolar)
     squares = sum(float((one**2).sum()) for one in adjusted.residuals)
     calibration = StereoCalibration(
         left=left,
@@ -482,8 +482,8 @@ def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
         rms=math.sqrt(squares / adjusted.freedom),
         sigma=math.sqrt(adjusted.more),
         epipolar=_rms(epipolar),
-        held_out=_rms([one.spacing for one in held_out.values()]),
-        held_out_epipolar=_rms([one.epipolar for one in held_out.values()]),
+        held_out=_rms([one.errors.spacing for one in held_out.values()]),
+        held_out_epipolar=_rms([one.errors.epipolar for one in held_out.values()]),
         sheet=None if points is None else points - found.sights[0].view.target.points,
         warnings=(),
     )
@@ -503,15 +503,15 @@ def _pair(found: _Found, number: int, held_out: Mapping[int, _HeldOut]) -> PairF
     }
     pose = found.adjusted.bundle.poses[number]
     left, right = found.moments[number]
-    errors = held_out.get(number)
+    held = held_out.get(number)
     return PairFit(
         left=left,
         right=right,
         used=(0 in rms, 1 in rms),
         transform=Transform(LEFT, TARGET, pose.rotation, pose.translation) if rms else None,
         rms=(rms.get(0, math.nan), rms.get(1, math.nan)),
-        held_out=_rms([errors.spacing]) if errors else math.nan,
-        epipolar=_rms([errors.epipolar]) if errors else math.nan,
+        held_out=_rms([held.errors.spacing]) if held else math.nan,
+        epipolar=_rms([held.errors.epipolar]) if held else math.nan,
     )
 
 

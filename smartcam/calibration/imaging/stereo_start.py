@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.imaging.cameras import CameraModel, DistortionModel
     from smartcam.calibration.imaging.views import TargetView
 
-__all__ = ["LEFT", "RIGHT", "SIDES", "Lenses", "Moment", "as_moments", "start"]
+__all__ = ["LEFT", "RIGHT", "SIDES", "Lenses", "Moment", "as_moments", "half_turned", "start"]
 
 LEFT: Final = "left"
 """Name of the left camera's frame."""
@@ -111,7 +111,7 @@ def start(moments: list[Moment], lenses: Lenses) -> tuple[list[Moment], Bundle]:
     if not isinstance(views[0].target, Charuco) and views[0].target.turned_alike:
         for number, ((one, two), (first, second)) in enumerate(zip(poses, moments, strict=True)):
             if one is not None and two is not None and second is not None:
-                other = _half_turned(second)
+                other = half_turned(second)
                 turned = locate(other, cameras[1]).transform
                 if _angle(one, turned) < _angle(one, two):
                     moments[number], poses[number] = (first, other), (one, turned)
@@ -158,8 +158,8 @@ def _angle(one: Transform, two: Transform) -> float:
     return math.acos(min(1.0, max(-1.0, cosine)))
 
 
-def _half_turned(view: TargetView) -> TargetView:
-    """Return a view whose points are numbered from the other end of the target."""
+def half_turned(view: TargetView) -> TargetView:
+    """Return a view whose points are numbered from the target's other end."""
     ids = len(view.target.points) - 1 - view.ids[::-1]
     return dataclasses.replace(
         view, ids=ids, points=view.points[::-1], covariance=view.covariance[::-1]

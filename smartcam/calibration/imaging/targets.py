@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ __all__ = [
     "Checkerboard",
     "CircleGrid",
     "Target",
+    "resized",
     "target_from_data",
     "target_to_data",
 ]
@@ -208,6 +209,8 @@ class CircleGrid:
 Target: TypeAlias = Checkerboard | Charuco | CircleGrid
 """What :func:`~smartcam.calibration.imaging.detection.find_target` looks for."""
 
+T = TypeVar("T", bound=Target)
+
 _KINDS: Mapping[str, type[Target]] = {
     kind.kind: kind for kind in (Checkerboard, Charuco, CircleGrid)
 }
@@ -237,6 +240,21 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
         return kind(**given)
     except TypeError as exc:
         raise CalibrationError(f"target: {exc}", code=Code.SHAPE, got=sorted(given)) from exc
+
+
+def resized(target: T, factor: float) -> T:
+    """Return a target with all of its lengths multiplied by a factor.
+
+    Raises:
+        CalibrationError: SHAPE: a factor that is not positive.
+    """
+    lengths = {
+        one.name: factor * value
+        for one in dataclasses.fields(target)
+        if one.name not in {"columns", "rows"}
+        and not isinstance(value := getattr(target, one.name), bool | str | None)
+    }
+    return dataclasses.replace(target, **lengths)
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:

@@ -3,7 +3,12 @@
 
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
-const WIZARDS = { plane: "calibrate", drift: "check whether it is still true" };
+const WIZARDS = {
+  plane: "calibrate by what the camera localizes",
+  drift: "check whether it is still true",
+  sheet: "calibrate by a picture of a printed sheet",
+  "hand-eye": "find where the camera is on the robot, or beside it",
+};
 let token = null;
 let view = null;
 
@@ -144,7 +149,7 @@ async function current() {
 
 function start(state) {
   view = null;
-  $("step").hidden = $("picture").hidden = true;
+  $("step").hidden = $("picture").hidden = $("camera").hidden = true;
   $("start").hidden = false;
   $("names").replaceChildren(...state.calibrations.map((name) => make("li", {}, name)));
   $("wizards").hidden = state.wizards.length < 2;
@@ -207,7 +212,15 @@ function spread(rows) {
   return [Math.min(...errors), Math.max(...errors)];
 }
 
+// the camera's picture, as an image: whatever stands in it, nothing of it runs here
+function drawPicture(svg) {
+  $("camera").hidden = !svg;
+  if (svg) $("camera-picture").src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(svg)}`;
+  else $("camera-picture").removeAttribute("src");
+}
+
 function draw(preview) {
+  drawPicture(preview?.svg);
   const points = preview?.points ?? [];
   const next = preview?.next;
   const empty = points.length === 0 && !next;
@@ -216,6 +229,7 @@ function draw(preview) {
   const fitted = points.length > 0 && points.every((one) => one.at);
   const places = points.map((one) => (fitted ? one.at : one.camera));
   const origin = preview.camera_origin;
+  const of = preview.of ?? "camera"; // what the points' own frame is: a sheet's, where one was looked at
   const marks = fitted ? [] : preview.marks ?? [];
   const box = fitted ? preview.view : around(next ? [...places, ...marks, next] : places);
   const [[left, bottom], [right, top]] = box;
@@ -245,7 +259,7 @@ function draw(preview) {
     });
     line("axis-camera", origin, [0.5 * margin, 0]);
     line("axis-camera", origin, [0, 0.5 * margin]);
-    label(origin[0] + 0.5 * margin, origin[1] - 5 * dot, "camera x");
+    label(origin[0] + 0.5 * margin, origin[1] - 5 * dot, `${of} x`);
   }
   points.forEach((one, index) => {
     const [x, y] = places[index];
@@ -281,7 +295,7 @@ function draw(preview) {
   }
   plot.replaceChildren(...parts);
   $("legend").textContent = fitted
-    ? `Dots: touched, the worst in red. Rings: where the camera says. Lines: residuals, dashes: predicted error of the mapped point (95 %), both ${factor} times as large.${points.some((one) => one.left_out) ? " Crosses: left out." : ""} The robot's axes stand in the corner, the camera's at its origin.${heat ? ` Colour, the stronger the larger: predicted error, ${spread(heat).map((error) => error.toFixed(3)).join(" to ")} mm rms.` : ""}`
+    ? `Dots: touched, the worst in red. Rings: where the ${of} says. Lines: residuals, dashes: predicted error of the mapped point (95 %), both ${factor} times as large.${points.some((one) => one.left_out) ? " Crosses: left out." : ""} The robot's axes stand in the corner, the ${of}'s at its origin.${heat ? ` Colour, the stronger the larger: predicted error, ${spread(heat).map((error) => error.toFixed(3)).join(" to ")} mm rms.` : ""}`
     : "Marks in the camera's frame: rings are seen, dots are touched, the red ring is next.";
 }
 

@@ -14,12 +14,14 @@ from imaging_scenes import CAMERA, SHEET, refused, scene
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.frames import Transform
+from smartcam.calibration.imaging.cameras import CameraModel
 from smartcam.calibration.imaging.hand_eye import (
     HandEyeCalibration,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
 from smartcam.calibration.imaging.hand_eye_fit import RobotSigmas, Setup, exp_rotation
+from smartcam.calibration.imaging.simulation import hand_eye_scene
 from smartcam.calibration.imaging.targets import Checkerboard
 
 if TYPE_CHECKING:
@@ -135,11 +137,35 @@ def test_hand_eye_finds_the_scale_of_a_print() -> None:
     assert found.target_scale == pytest.approx(0.98, abs=0.002)
     assert [one.code for one in found.warnings] == [Code.SCALE_MISMATCH]
     assert "0.98" in found.warnings[0].text
+    assert "poses and errors are those of a target of that size" in found.warnings[0].text
+    assert found.target == Checkerboard(columns=5, rows=4, square=0.03 / 0.98 * found.target_scale)
     truth = scene("eye-in-hand", poses=12)
     kept = calibrate_hand_eye(
-        poses, thought, setup="eye-in-hand", camera=CAMERA, beside="", method="robot"
+        poses, thought, setup="eye-in-hand", camera=CAMERA, adjust="nothing", method="robot"
     )
     assert truth.errors(found.camera_pose)[1] < truth.errors(kept.camera_pose)[1] / 3
+
+
+def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
+    """Of few poses and much noise: a chi-square test would have the sheet 0.9 % larger."""
+    random = np.random.default_rng([27, 3])
+    camera = CameraModel(
+        size=(1280, 960), matrix=np.array([[1200.0, 0, 640], [0, 1200, 480], [0, 0, 1]])
+    )
+    truth = hand_eye_scene(
+        Checkerboard(columns=9, rows=6, square=0.02),
+        camera,
+        setup="eye-in-hand",
+        poses=10,
+        tilt=math.radians(30.0),
+        distance=0.5,
+        random=random,
+    )
+    sigmas = RobotSigmas(math.radians(0.05), 3e-4)
+    poses, views = truth.measured(pixel_sigma=0.3, robot_sigmas=sigmas, random=random)
+    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=camera)
+    assert found.target_scale == 1.0
+    assert truth.errors(found.camera_pose)[1] < 1e-3
 
 
 def test_hand_eye_without_a_camera_calibrates_it_from_the_views() -> None:
@@ -162,16 +188,70 @@ def test_hand_eye_from_poses_without_noise_is_exact(setup: Setup) -> None:
         found.to_plane([[1, 2]], plane=truth.target_pose, robot_pose=truth.robot_poses[0])
 
 
-def test_hand_eye_names_a_pose_that_belongs_to_another_view() -> None:
-    poses, views = measured("eye-in-hand", 0.1, NOISE, poses=12)
-    off = Transform(
-        "flange", "flange", exp_rotation(np.array([0.02, 0, 0])), np.array([0, 0.01, 0])
-    )
-    poses[4] = poses[4] @ off
-    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, beside="")
+def _with_a_wrong_pose(setup: Setup, poses: int = 12) -> Pairs:
+    """Return poses of which number 4 is 10 mm and 2 degrees off."""
+    said, views = measured(setup, 0.1, NOISE, poses=poses)
+    turn = exp_rotation(np.array([math.radians(2.0), 0, 0]))
+    said[4] = said[4] @ Transform("flange", "flange", turn, np.array([0, 0.01, 0]))
+    return said, views
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_hand_eye_names_a_wrong_pose_and_leaves_it_out(setup: Setup) -> None:
+    poses, views = _with_a_wrong_pose(setup)
+    found = calibrate_hand_eye(poses, views, setup=setup, camera=CAMERA, adjust="nothing")
+    assert [number for number, used in enumerate(found.used) if not used] == [4]
     assert found.worst == 4
-    assert [one.code for one in found.warnings] == [Code.OUTLIER]
+    assert [one.code for one in found.warnings] == [Code.BAD_VIEW]
     assert found.warnings[0].text.startswith("view 4 is ")
+    assert found.warnings[0].text.endswith(
+        "its pose of the robot or its image is wrong; it was not used"
+    )
+    some = [number for number in range(12) if number != 4]
+    rest = calibrate_hand_eye(
+        [poses[i] for i in some],
+        [views[i] for i in some],
+        setup=setup,
+        camera=CAMERA,
+        adjust="nothing",
+    )
+    np.testing.assert_allclose(
+        found.camera_pose.translation, rest.camera_pose.translation, atol=1e-9
+    )
+    assert found.held_out_error == pytest.approx(rest.held_out_error, rel=1e-6)
+    np.testing.assert_allclose(found.leave_one_out[some], rest.leave_one_out, rtol=1e-6)
+    assert found.errors[4] == found.leave_one_out[4] > 5e-3
+    assert HandEyeCalibration.from_data(found.to_data()).used == found.used
+
+
+def test_hand_eye_told_to_keep_a_wrong_pose_names_it_only() -> None:
+    poses, views = _with_a_wrong_pose("eye-in-hand")
+    found = calibrate_hand_eye(
+        poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing", drop_bad=False
+    )
+    assert all(found.used)
+    assert found.worst == 4
+    assert [one.code for one in found.warnings] == [Code.BAD_VIEW]
+    assert found.warnings[0].text.endswith("it is used all the same")
+
+
+def test_hand_eye_of_few_poses_keeps_a_wrong_one() -> None:
+    poses, views = _with_a_wrong_pose("eye-in-hand", poses=8)
+    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
+    assert all(found.used)
+    assert Code.BAD_VIEW in {one.code for one in found.warnings}
+
+
+def test_hand_eye_from_poses_leaves_a_wrong_one_out() -> None:
+    truth = scene("eye-to-hand", poses=12)
+    seen = [truth.seen(pose) for pose in truth.robot_poses]
+    shift = Transform("camera", "camera", np.eye(3), np.array([0.0, 0.01, 0.0]))
+    seen[7] = shift @ seen[7]
+    found = calibrate_hand_eye_from_poses(truth.robot_poses, seen, setup="eye-to-hand")
+    assert found.used.index(False) == 7
+    assert found.errors[7] == pytest.approx(0.01, rel=1e-3)
+    assert found.warnings[0].text.startswith("pose 7 is ")
+    assert truth.errors(found.camera_pose)[1] < 1e-6
 
 
 @pytest.mark.parametrize("setup", SETUPS)
@@ -179,7 +259,7 @@ def test_hand_eye_with_inverted_poses_is_refused(setup: Setup) -> None:
     poses, views = measured(setup, 0.1, NOISE)
     inverted = [Transform("base", "flange", *_parts(pose.inverse())) for pose in poses]
     with refused("WRONG_FRAME", "they are inverted, or the camera is on the other side"):
-        calibrate_hand_eye(inverted, views, setup=setup, camera=CAMERA, beside="")
+        calibrate_hand_eye(inverted, views, setup=setup, camera=CAMERA, adjust="nothing")
 
 
 def _parts(transform: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -190,7 +270,7 @@ def test_hand_eye_of_poses_in_millimetres_is_refused() -> None:
     poses, views = measured("eye-in-hand", 0.1, NOISE)
     wrong = [dataclasses.replace(one, translation=1e3 * one.translation) for one in poses]
     with refused("POOR_FIT", "are the poses those of the views, in metres"):
-        calibrate_hand_eye(wrong, views, setup="eye-in-hand", camera=CAMERA)
+        calibrate_hand_eye(wrong, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
     truth = scene("eye-in-hand")
     seen = [truth.seen(one) for one in truth.robot_poses]
     with refused("POOR_FIT", "in metres, and is the setup right?"):
@@ -263,13 +343,13 @@ def test_hand_eye_of_wrong_inputs_is_refused() -> None:
         calibrate_hand_eye(poses, views, setup="hand", camera=CAMERA)  # type: ignore[arg-type]
     with refused("SHAPE", "method: expected auto or one of", "got 'best'"):
         calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, method="best")
-    with refused("SHAPE", "beside: expected auto or one of", "got 'robot'"):
+    with refused("SHAPE", "adjust: expected auto or one of", "got 'robot'"):
         calibrate_hand_eye(
             poses,
             views,
             setup="eye-in-hand",
             camera=CAMERA,
-            beside="robot",  # type: ignore[arg-type]
+            adjust="robot",  # type: ignore[arg-type]
         )
     with refused("NOT_FINITE", "robot_sigmas: expected two positive numbers"):
         calibrate_hand_eye(
@@ -288,7 +368,7 @@ def test_to_plane_of_a_moving_camera_is_where_the_part_is() -> None:
     truth = scene("eye-in-hand")
     poses, views = measured("eye-in-hand", 0.0, EXACT)
     found = calibrate_hand_eye(
-        poses, views, setup="eye-in-hand", camera=CAMERA, beside="", method="robot"
+        poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing", method="robot"
     )
     random = np.random.default_rng(8)
     parts = truth.target_pose.apply(
@@ -333,12 +413,81 @@ def test_predicted_error_is_that_of_many_calibrations() -> None:
     for _ in range(12):
         poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
         found = calibrate_hand_eye(
-            poses, views, setup="eye-in-hand", camera=CAMERA, beside="", method="robot"
+            poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing", method="robot"
         )
         off.append(found.to_plane(pixels, plane=plane, robot_pose=pose) - centre)
         predicted.append(found.predicted_error(pixels, plane=plane, robot_pose=pose))
     observed = math.sqrt(float((np.array(off) ** 2).sum(axis=2).mean()))
     assert math.sqrt(float((np.array(predicted) ** 2).mean())) == pytest.approx(observed, rel=0.5)
+
+
+def test_point_errors_of_its_own_poses_are_its_errors(noisy: HandEyeCalibration) -> None:
+    found = noisy.point_errors(noisy.robot_poses, noisy.views)
+    assert np.concatenate(found).mean() == pytest.approx(noisy.mean_error, rel=1e-12)
+    rms = [math.sqrt(float((one**2).mean())) for one in found]
+    np.testing.assert_allclose(rms, noisy.errors, rtol=1e-9)
+
+
+def test_point_errors_of_a_target_of_another_size_are_those_of_the_adjusted_one() -> None:
+    poses, views = measured("eye-in-hand", 0.0, EXACT)
+    said = Checkerboard(columns=5, rows=4, square=0.03 / 0.98)
+    thought = [dataclasses.replace(one, target=said) for one in views]
+    found = calibrate_hand_eye(
+        poses, thought, setup="eye-in-hand", camera=CAMERA, adjust="scale", method="robot"
+    )
+    assert np.concatenate(found.point_errors(poses, thought)).max() < 1e-8
+    nominal = dataclasses.replace(found, target_scale=1.0)
+    assert np.concatenate(nominal.point_errors(poses, thought)).mean() > 1e-3
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_point_errors_of_other_poses_are_the_held_out_error(setup: Setup) -> None:
+    poses, views = measured(setup, 0.1, NOISE, poses=30)
+    found = calibrate_hand_eye(
+        poses[::2], views[::2], setup=setup, camera=CAMERA, adjust="nothing", method="robot"
+    )
+    other = np.concatenate(found.point_errors(poses[1::2], views[1::2]))
+    assert found.held_out_error is not None
+    # 14 seeds: 1.03 in all, each off by a fifth
+    assert math.sqrt(float((other**2).mean())) == pytest.approx(found.held_out_error, rel=0.6)
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_point_errors_of_poses_of_the_target_are_its_origins(setup: Setup) -> None:
+    truth = scene(setup)
+    seen = [truth.seen(pose) for pose in truth.robot_poses]
+    found = calibrate_hand_eye_from_poses(truth.robot_poses, seen, setup=setup)
+    up = Transform("camera", "camera", np.eye(3), np.array([0.0, 0.003, 0.004]))
+    errors = found.point_errors(truth.robot_poses, [up @ one for one in seen])
+    np.testing.assert_allclose(np.concatenate(errors), 0.005, rtol=1e-6)
+
+
+def test_point_errors_behind_the_camera_are_infinite() -> None:
+    poses, views = measured("eye-to-hand", 0.0, EXACT)
+    found = calibrate_hand_eye(
+        poses, views, setup="eye-to-hand", camera=CAMERA, adjust="nothing", method="park"
+    )
+    ahead = found.camera_pose.rotation[:, 2]
+    away = dataclasses.replace(poses[0], translation=poses[0].translation - 2.0 * ahead)
+    assert np.isinf(found.point_errors([away], views[:1])[0]).all()
+
+
+def test_point_errors_of_what_does_not_belong_together_is_refused(
+    exact: HandEyeCalibration,
+) -> None:
+    poses, views = list(exact.robot_poses), list(exact.views)
+    with refused("SHAPE", "as many views as poses of the robot, got 9 and 8"):
+        exact.point_errors(poses[:-1], views)
+    other = dataclasses.replace(views[0], target=Checkerboard(columns=5, rows=4, square=0.02))
+    with refused("DIFFERENT_TARGETS", "square=0.03", "square=0.02"):
+        exact.point_errors(poses[:1], [other])
+    with refused("WRONG_SIZE", "an image of 1280 x 960 pixels, got 640 x 480"):
+        exact.point_errors(poses[:1], [dataclasses.replace(views[0], size=(640, 480))])
+    with refused("WRONG_FRAME", "world"):
+        exact.point_errors([Transform("world", "flange", *_parts(poses[0]))], views[:1])
+    blind = dataclasses.replace(exact, camera=None)
+    with refused("NO_CALIBRATION", "point_errors: expected a calibration with the camera's lens"):
+        blind.point_errors(poses[:1], views[:1])
 
 
 def test_hand_eye_is_stored_bit_by_bit(noisy: HandEyeCalibration, tmp_path: Path) -> None:
@@ -347,6 +496,7 @@ def test_hand_eye_is_stored_bit_by_bit(noisy: HandEyeCalibration, tmp_path: Path
     assert again.to_data() == noisy.to_data()
     assert again.camera_pose.label == noisy.camera_pose.label
     assert again.views[3].target == SHEET
+    assert again.target == noisy.target
     np.testing.assert_array_equal(again.covariance, noisy.covariance)
 
 
@@ -364,6 +514,7 @@ def test_hand_eye_from_poses_is_stored_bit_by_bit() -> None:
     [
         ("setup", "beside", "setup: Input should be"),
         ("errors", [0.0, 0.0, 0.0], "errors: expected 9"),
+        ("used", [True, True, True], "used: expected 9"),
         ("covariance", [[0.0]], "covariance: expected 12 rows of 12"),
         ("views", [], ""),
         ("target", None, "views: expected 9, and their target"),

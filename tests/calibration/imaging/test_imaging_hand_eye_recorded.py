@@ -33,12 +33,12 @@ def best_closed_form(found: HandEyeCalibration) -> float:
 def test_mean_error_of_the_published_lens_is_the_published_one() -> None:
     matrix = np.array([[550.0, 0, 320], [0, 550, 240], [0, 0, 1]])
     camera = CameraModel(size=(640, 480), matrix=matrix)
-    found = recorded(DOTS, camera=camera, beside="", method="reprojection")
+    found = recorded(DOTS, camera=camera, adjust="nothing", method="reprojection")
     assert 1e3 * found.mean_error == pytest.approx(2.899, abs=0.02)
 
 
 def test_dots_with_the_nominal_target_reach_the_goal_of_the_mean_error() -> None:
-    found = recorded(DOTS, beside="")
+    found = recorded(DOTS, adjust="nothing")
     assert 1e3 * found.mean_error <= 2.26
     assert found.target_scale == 1.0
 

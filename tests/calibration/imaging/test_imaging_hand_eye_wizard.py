@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from imaging_scenes import CAMERA, SHEET, scene
 
+from smartcam.calibration.formats.robots import ROBOTS, pose_to
 from smartcam.calibration.imaging.hand_eye import HandEyeCalibration
 from smartcam.calibration.imaging.hand_eye_wizard import SUGGESTIONS, hand_eye_wizard
 from smartcam.calibration.imaging.rendering import render
@@ -127,3 +128,49 @@ async def test_views_are_there_again_after_a_crash(tmp_path: Path) -> None:
     assert again.current["step"] == view["step"] == "view-4"
     assert len(cell.poses) == left
     again.close()
+
+
+async def test_poses_typed_as_the_robot_writes_them_are_the_same(tmp_path: Path) -> None:
+    cell = Cell()
+    wizard = hand_eye_wizard(
+        suggested=SHEET,
+        take_picture=cell.take_picture,
+        save_to=lambda name: tmp_path / f"{name}.json",
+        camera=CAMERA,
+    )
+    session = Session(wizard, parameters={"name": "gripper", "robot": "kuka"})
+    for step in ("about", "sheet", "rulers"):
+        assert session.current["step"] == step
+        await say(session)
+    for number in range(6):
+        view = session.current
+        assert ("svg" in (view["preview"] or {})) == (number > 0)
+        await say(session, typed(cell.poses[0]))
+        cell.poses.pop(0)
+    view = await session.submit(session.token, {"next": "view", "x": 1.0})
+    assert view["errors"]["a"] == "no answer"
+    await say(session, {"next": "calculate"})
+    for _ in range(3):
+        await say(session)
+    found = HandEyeCalibration.load(tmp_path / "gripper.json")
+    assert TRUTH.errors(found.camera_pose)[1] < 2e-4
+    assert found.robot_poses[0].source == "flange"
+
+
+async def test_pose_typed_that_is_none_costs_no_picture(tmp_path: Path) -> None:
+    cell = Cell()
+    wizard = hand_eye_wizard(
+        target=SHEET, take_picture=cell.take_picture, save_to=lambda name: tmp_path / name
+    )
+    session = Session(wizard, parameters={"robot": "xyzw"})
+    await say(session)
+    pose = dict.fromkeys(("x", "y", "z", "qx", "qy", "qz"), 0.1)
+    cell.hidden = 1
+    view = await session.submit(session.token, {**pose, "qw": 0.2})
+    assert "a quaternion of length 1" in view["errors"]["base"]
+    assert cell.hidden == 1
+    session.close()
+
+
+def typed(pose: Transform) -> dict[str, float]:
+    return dict(zip(ROBOTS["kuka"].numbers, pose_to("kuka", pose), strict=True))

@@ -111,6 +111,45 @@ def test_calibrate_intrinsics_of_a_bent_sheet_finds_its_shape() -> None:
     assert "mm rms from where they were meant to be" in remark.text
 
 
+def test_point_errors_of_a_view_left_out_are_its_held_out_error() -> None:
+    views = seen(LEFT, poses(8))
+    found, rest = calibrate_intrinsics(views), calibrate_intrinsics(views[1:])
+    (errors,) = rest.point_errors(views[:1])
+    assert errors.shape == (len(views[0].ids), 2)
+    rms = math.sqrt(float((errors**2).sum()) / (errors.size - 6))
+    assert rms == pytest.approx(found.views[0].held_out, rel=1e-3)
+
+
+def test_point_errors_of_another_target_are_taken_as_well() -> None:
+    found = calibrate_intrinsics(seen(LEFT, poses(8)))
+    finer = Checkerboard(columns=11, rows=8, square=0.02)
+    errors = np.concatenate(found.point_errors(seen(LEFT, poses(3, seed=9), target=finer)))
+    assert errors.std() == pytest.approx(0.05, rel=0.1)
+
+
+def test_point_errors_of_another_target_than_the_adjusted_one_are_refused() -> None:
+    bent = BOARD.points + np.random.default_rng(7).normal(size=(54, 3)) * 2e-4
+    views = seen(LEFT, poses(10), points=bent)
+    found = calibrate_intrinsics(views, sheet="free")
+    fresh = seen(LEFT, poses(3, seed=9), points=bent)
+    assert np.concatenate(found.point_errors(fresh)).std() < 0.08
+    other = dataclasses.replace(fresh[0], target=Checkerboard(columns=9, rows=6, square=0.026))
+    with pytest.raises(CalibrationError, match=r"whose points were adjusted, .*0\.026") as caught:
+        found.point_errors([other])
+    assert caught.value.code == Code.DIFFERENT_TARGETS
+
+
+@pytest.mark.parametrize("place", [(0, 1), (1, 0), (2, 0), (2, 1)])
+def test_camera_with_a_matrix_that_project_would_not_follow_is_refused(
+    place: tuple[int, int],
+) -> None:
+    matrix = LEFT.matrix.copy()
+    matrix[place] = 0.5
+    with pytest.raises(CalibrationError, match="focal lengths and no skew, got") as caught:
+        dataclasses.replace(LEFT, matrix=matrix)
+    assert caught.value.code == Code.SHAPE
+
+
 def test_calibrate_intrinsics_of_hidden_corners_uses_those_that_are_seen() -> None:
     target = Charuco(columns=8, rows=6, square=0.025, marker=0.018)
     views = seen(LEFT, poses(8), target=target)

@@ -10,6 +10,7 @@ from lenskit import FISHEYE, LEFT, RIG, RIGHT
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
+from smartcam.calibration.frames import Transform
 from smartcam.calibration.imaging.rectification import rectify
 
 if TYPE_CHECKING:
@@ -94,3 +95,20 @@ def test_rectify_of_what_cannot_be_raises(changes: dict[str, Any], code: Code, t
     with pytest.raises(CalibrationError, match=text) as caught:
         rectify(LEFT, right, RIG, **changes)
     assert caught.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift", "alpha"),
+    [
+        (np.diag([-1.0, -1.0, 1.0]), [0.02, 0.05, 0.0], 0.5),  # one camera on its head
+        (np.eye(3), [0.01, 0.0, -0.1], 1.0),  # one behind the other
+    ],
+)
+def test_rectify_of_cameras_that_no_rows_join_raises(
+    turn: Array, shift: list[float], alpha: float
+) -> None:
+    rig = Transform("right", "left", turn, np.array(shift))
+    text = "expected two cameras beside each other that see the same place the same way up"
+    with pytest.raises(CalibrationError, match=text) as caught:
+        rectify(LEFT, LEFT, rig, alpha=alpha)
+    assert caught.value.code == Code.OUT_OF_FIELD

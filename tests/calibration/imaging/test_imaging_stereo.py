@@ -194,6 +194,57 @@ def test_epipolar_distances_and_rectify_use_the_calibration() -> None:
     assert found.rectify(1.0).alpha == 1.0
 
 
+def test_point_errors_of_a_pair_left_out_are_its_held_out_errors() -> None:
+    left, right = pairs(6)
+    found = calibrate_stereo(left, right, sheet="exact")
+    rest = calibrate_stereo(left[1:], right[1:], sheet="exact")
+    (errors,) = rest.point_errors(left[:1], right[:1])
+    spacing, epipolar = (math.sqrt(float((one**2).mean())) for one in errors)
+    assert spacing == pytest.approx(found.pairs[0].held_out, rel=1e-3)
+    assert epipolar == pytest.approx(found.pairs[0].epipolar, rel=1e-3)
+
+
+def test_point_errors_of_a_moment_without_a_pair_are_none_at_all() -> None:
+    left, right = pairs(6)
+    found = _calibrated()
+    nobody, apart = found.point_errors(
+        [None, _part(left[0], slice(0, 20))], [right[0], _part(right[0], slice(20, 54))]
+    )
+    assert [one.size for one in (*nobody, *apart)] == [0, 0, 0, 0]
+
+
+def _part(view: TargetView, some: slice) -> TargetView:
+    return dataclasses.replace(
+        view, ids=view.ids[some], points=view.points[some], covariance=view.covariance[some]
+    )
+
+
+def test_point_errors_of_a_view_numbered_from_the_other_end_are_the_same() -> None:
+    found, around = _calibrated(), poses(2, seed=4, name="left")
+    dots = CircleGrid(columns=8, rows=6, spacing=0.025, diameter=0.01)
+    left = seen(LEFT, around, target=dots)
+    right = seen(RIGHT, [RIG @ one for one in around], target=dots)
+    turned = [
+        dataclasses.replace(
+            one, ids=47 - one.ids[::-1], points=one.points[::-1], covariance=one.covariance[::-1]
+        )
+        for one in right
+    ]
+    for one, other in zip(
+        found.point_errors(left, right), found.point_errors(left, turned), strict=True
+    ):
+        np.testing.assert_allclose(one.spacing, other.spacing, atol=1e-15)
+        np.testing.assert_allclose(one.epipolar, other.epipolar, atol=1e-12)
+
+
+def test_point_errors_of_images_of_another_size_are_refused() -> None:
+    left, right = pairs(1)
+    small = dataclasses.replace(right[0], size=(320, 240))
+    with pytest.raises(CalibrationError, match="640 x 480 pixels, got 320 x 240") as caught:
+        _calibrated().point_errors(left, [small])
+    assert caught.value.code == Code.WRONG_SIZE
+
+
 @pytest.mark.parametrize(
     ("target", "neighbours"),
     [
