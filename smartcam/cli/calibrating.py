@@ -172,12 +172,13 @@ def calibrate(
         from smartcam.calibration.drift import WIZARD
 
         started = WIZARD if check is not None else wizard or "plane"
+        named = next(one for one in (check, name, started) if one is not None)
         try:
             service = _service(folder, station)
             try:
                 if check is not None:
                     options.check_y_down(service.load(check), f"--check {check}")
-                service.start(check or name or started, started, parameters, fresh=fresh)
+                service.start(named, started, parameters, fresh=fresh)
                 await (_serve(service, options, place) if web else _drive(service.session, options))
             finally:
                 service.close()
@@ -238,7 +239,8 @@ class _Station:
 
         found: list[Wizard] = []
         if self._url is not None:
-            y_down = self._options.y_down
+            with self._options.camera(self._url):  # an address or option that cannot work
+                y_down = self._options.y_down
             found = [
                 plane_wizard(localize=self.localize, save_to=folder.calibration, y_down=y_down),
                 drift_wizard(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -152,7 +153,7 @@ _STATUS = {
 
 
 def _refused(error: CalibrationError) -> RefusedError:
-    came, _, expected = str(error).partition("; expected ")
+    came, expected = [*re.split(r"[;:] expected ", str(error), maxsplit=1), ""][:2]
     status = next((code for kind, code in _STATUS.items() if kind == error.code), 422)
     field = {"field": "code", "came": error.code, "expected": ""}
     return RefusedError(status, came, expected or "what the folder and its wizard can do", (field,))

@@ -244,3 +244,8 @@ def test_calibrate_with_an_option_of_the_page_alone_is_wrong_usage(tmp_path: Pat
     done = calibrating("bvs://127.0.0.1:9", tmp_path, [], "--web-port", "0")
     assert done.code == 2
     assert "--web-port needs --web" in done.err
+
+
+def test_calibrate_with_an_address_that_cannot_work_leaves_nothing(tmp_path: Path) -> None:
+    calibrating("http://camera", tmp_path, []).failed(2, "http")
+    assert not list(tmp_path.rglob("*.journal"))
