@@ -247,5 +247,5 @@ def test_calibrate_with_an_option_of_the_page_alone_is_wrong_usage(tmp_path: Pat
 
 
 def test_calibrate_with_an_address_that_cannot_work_leaves_nothing(tmp_path: Path) -> None:
-    calibrating("http://camera", tmp_path, []).failed(2, "http")
+    calibrating("http://camera", tmp_path, []).failed(2, "http", within=10)
     assert not list(tmp_path.rglob("*.journal"))

@@ -296,8 +296,15 @@ class PixelObservations:
         return dataclasses.replace(self.model, matrix=matrix, distortion=distortion)
 
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
-        """Return whitened residuals (V, 2 N) and their derivatives (V, 2 N, 6 + extra)."""
+        """Return whitened residuals (V, 2 N) and their derivatives (V, 2 N, 6 + extra).
+
+        They are NaN for a change to no target or no lens: of a size or focal length below 0.
+        """
         views, count = self.pixels.shape[:2]
+        full = self._full(change)
+        if min(1.0 + full[0], *(np.diag(self.model.matrix)[:2] + full[1:3])) <= 0:
+            nothing = np.full((views, 2 * count), np.nan)
+            return nothing, np.full((*nothing.shape, 6 + self.extra), np.nan)
         nominal = self.points @ np.swapaxes(seen.rotation, 1, 2)
         near = self.scale(change) * nominal
         there = linearize((near + seen.translation[:, None]).reshape(-1, 3), self.camera(change))
