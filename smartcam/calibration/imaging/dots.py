@@ -88,7 +88,7 @@ class GridMap:
 
     def __init__(self, flat: Array, pixels: Array) -> None:
         found = fit_homography(flat, pixels)
-        self.matrix = np.full((3, 3), np.nan) if found is None else found
+        self.matrix: Array = np.full((3, 3), np.nan) if found is None else found
         self._middle = flat.mean(axis=0)
         self._scale = np.abs(flat - self._middle).max()
         self._bend = np.zeros((10, 2))
