@@ -84,6 +84,8 @@ class Code(enum.StrEnum):
     """Views of several targets where those of one are expected."""
     BAD_VIEW = "BAD_VIEW"
     """A view that fits far worse than the others; it is left out."""
+    SWAPPED_SIDES = "SWAPPED_SIDES"
+    """The camera that is called right stands left of the one that is called left."""
     POOR_COVERAGE = "POOR_COVERAGE"
     """The views show the target in too few places, sizes or tilts to tell the lens well."""
     SHEET_NOT_EXACT = "SHEET_NOT_EXACT"

@@ -25,7 +25,6 @@ from smartcam.calibration.imaging.hand_eye_choice import (
     METHODS,
     NOTHING,
     Problem,
-    Solution,
     candidates,
     choose,
     steps_between,
@@ -37,12 +36,14 @@ from smartcam.calibration.imaging.hand_eye_fit import (
     Robot,
     RobotSigmas,
 )
-from smartcam.calibration.imaging.hand_eye_linear import (
-    check_motion,
-    second_turn,
-    solve_linear,
-)
+from smartcam.calibration.imaging.hand_eye_linear import check_motion, second_turn
 from smartcam.calibration.imaging.hand_eye_result import HandEyeCalibration, as_transform
+from smartcam.calibration.imaging.hand_eye_start import (
+    check_poses,
+    expected_error,
+    most_error,
+    poor_fit,
+)
 from smartcam.calibration.imaging.intrinsics import calibrate_intrinsics
 from smartcam.calibration.imaging.poses import CAMERA, TARGET, locate
 from smartcam.calibration.imaging.projection import excess, whitening
@@ -51,9 +52,11 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from smartcam.calibration.geometry import Array
     from smartcam.calibration.imaging.cameras import CameraModel
-    from smartcam.calibration.imaging.hand_eye_choice import Candidate
+    from smartcam.calibration.imaging.hand_eye_choice import Candidate, Solution
     from smartcam.calibration.imaging.hand_eye_fit import Setup
     from smartcam.calibration.imaging.poses import TargetPose
     from smartcam.calibration.imaging.views import TargetView
@@ -88,8 +91,14 @@ EXACT = 1e-7
 MOST_BAD = 1 / 3
 """Of the poses that may be left out."""
 
-OTHER_WAY = 5.0
-"""Poses that fit as many times better the other way round are taken for given the wrong way."""
+LEAST_GOOD = 5
+"""Poses that must be left where others, which belong to other views, are left out."""
+
+LEAST_KNOWN = 5
+"""Poses from which the robot's sigmas are estimated well enough to tell errors from them."""
+
+POOR = RobotSigmas(math.radians(0.25), 2e-3)
+"""Of a robot that is worse than most: a held-out error beyond what it gives is worth a remark."""
 
 POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
 """Of poses of the target that come without a covariance: their ratio counts."""
@@ -114,21 +123,26 @@ def calibrate_hand_eye(
         setup: whether the camera is on the hand (``eye-in-hand``, the target stays), or stands
             beside the robot (``eye-to-hand``, the target is on the hand).
         camera: its lens; None: calibrated from the same views, which should then tilt the target.
+            The expected errors take it as exact either way: from the same views it is not, and they
+            come out up to three times too small.
         method: ``auto``: the candidate that predicts left-out poses best; or the name of one, see
             :data:`~smartcam.calibration.imaging.hand_eye_choice.METHODS`.
         adjust: what is adjusted besides the poses: the target's ``scale`` (printers change it),
             the ``camera``, ``nothing``; ``auto``: what the held-out error asks for.
-        robot_sigmas: of each axis of the robot's poses; None: estimated.
+        robot_sigmas: of each axis of the robot's poses; None: estimated, of 5 poses or more: of
+            fewer the covariance is NaN.
         drop_bad: whether poses that are far off what the others say of them are left out (and
-            named), at most a third of them, and while 8 are left; else they are only named.
+            named), at most a third of them, and while 8 are left; else they are only named. Of
+            poses that are nowhere near, as those of other views, 5 must be left.
 
     The order of the poses does not matter.
 
     Raises:
         CalibrationError: ``TOO_FEW``, ``POSES_TOO_SIMILAR``, ``INSUFFICIENT_ROTATION``; ``SHAPE``:
             not as many views as poses, or of another image size; ``WRONG_FRAME``: poses of several
-            frames, or that fit only the other way round; ``DIFFERENT_TARGETS``; ``POOR_FIT``:
-            nothing fits; and what
+            frames, or that fit only when inverted or transposed; ``DIFFERENT_TARGETS``;
+            ``POOR_FIT``: nothing fits, as where poses and views are mixed up or lengths are in
+            millimetres; and what
             :func:`~smartcam.calibration.imaging.intrinsics.calibrate_intrinsics` says.
         MissingExtraError: SciPy or OpenCV is not installed, or OpenCV is 5.0.0.
     """
@@ -342,8 +356,8 @@ def _without_bad(
     seen: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
     """Return what the poses give that are not bad, with the errors of all of them."""
-    used, remarks = np.arange(problem.count), list[Remark]()
-    result = _solved(problem, asked, robot_poses[0])
+    used, remarks = _near(problem, asked, named)
+    result = _solved(problem.taken(used), asked, robot_poses[0])
     while len(bad := _bad(result)) and asked.drop_bad:
         worst = int(used[result.worst])
         fewer = used[used != worst]
@@ -354,9 +368,12 @@ def _without_bad(
             check_motion(problem.robot.taken(fewer))
         except CalibrationError:  # nothing is left without it
             break
-        remarks.append(_bad_view(result, result.worst, named[worst], "was not used"))
+        remarks[worst] = _bad_view(result, result.worst, named[worst], "was not used")
         used, result = fewer, _solved(problem.taken(fewer), asked, robot_poses[0])
-    remarks += [_bad_view(result, i, named[int(used[i])], "is used all the same") for i in bad]
+    for index in bad:
+        number = int(used[index])
+        kept = _bad_view(result, index, named[number], "is used all the same")
+        remarks.setdefault(number, kept)
     errors, left_out = np.full((2, problem.count), np.nan)
     for number in np.setdiff1d(np.arange(problem.count), used).tolist():
         (off,) = result.point_errors([robot_poses[number]], [seen[number]])
@@ -364,13 +381,42 @@ def _without_bad(
             errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
     errors[used], left_out[used] = result.errors, result.leave_one_out
     some = problem.taken(used)
+    _check_fit(some, result)
     return dataclasses.replace(
         result,
         errors=errors,
         leave_one_out=left_out,
         used=tuple(np.isin(np.arange(problem.count), used).tolist()),
-        warnings=(*_remarks(some, result), *remarks),
+        warnings=(*_remarks(some, result), *remarks.values()),
     )
+
+
+def _near(
+    problem: Problem, asked: _Asked, named: Sequence[str]
+) -> tuple[NDArray[np.intp], dict[int, Remark]]:
+    """Return the poses to begin with, and remarks on those, by number, that belong to other views.
+
+    Raises:
+        CalibrationError: ``WRONG_FRAME`` or ``POOR_FIT``.
+    """
+    agreed, everything = check_poses(problem), np.arange(problem.count)
+    gross = agreed.gross(most_error(problem))
+    left = problem.count - len(gross)
+    drop = asked.drop_bad and left >= LEAST_GOOD and len(gross) <= MOST_BAD * problem.count
+    used = np.setdiff1d(everything, gross) if drop else everything
+    try:
+        check_motion(problem.robot.taken(used))
+    except CalibrationError:  # nothing is left without them
+        drop, used = False, everything
+    done = "was not used" if drop else "is used all the same"
+    return used, {
+        index: Remark(
+            Code.BAD_VIEW,
+            f"{named[index]} is {1e3 * agreed.off[index]:.3g} mm off what most poses agree with to "
+            f"{1e3 * agreed.median:.3g} mm: it belongs to another view; it {done}",
+        )
+        for index in gross.tolist()
+    }
 
 
 def _bad(result: HandEyeCalibration) -> list[int]:
@@ -401,35 +447,23 @@ def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibrat
             expected=list(METHODS),
             got=method,
         )
-    _check_direction(problem)
     found = candidates(problem, free, method)
     chosen = choose(found, method=method, besides=next(iter(free)) if len(free) == 1 else None)
     if chosen is None or chosen.solution is None:
-        raise _poor(f"none at all {problem.count} poses", math.inf)
-    result = _result(problem, chosen, chosen.solution, found, pose)
-    off, size = float(np.median(result.errors)), _size(problem)
-    if off > size:
-        raise _poor(f"it {off:.3g} m off, where {size:.3g} m would be nowhere", off)
-    return result
+        raise poor_fit(f"none at all {problem.count} poses", None)
+    return _result(problem, chosen, chosen.solution, found, pose)
 
 
-def _poor(what: str, off: float) -> CalibrationError:
-    return CalibrationError(
-        f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "
-        "those of the views, in metres, and is the setup right?",
-        code=Code.POOR_FIT,
-        got=off,
-    )
+def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
+    """Raise where poses and views do not belong together.
 
-
-def _size(problem: Problem) -> float:
-    """Return the error at which a calibration says nothing, metres.
-
-    That is the target's extent, or without views half of its distance.
+    Raises:
+        CalibrationError: ``POOR_FIT``.
     """
-    if isinstance(problem.seen, PixelObservations):
-        return float(np.ptp(problem.seen.points.reshape(-1, 3), axis=0).max())
-    return 0.5 * float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
+    errors = result.errors if result.held_out_error is None else result.leave_one_out
+    off, most = float(np.median(errors)), most_error(problem)
+    if off > most:
+        raise poor_fit(f"one {1e3 * off:.3g} mm off, {1e3 * most:.3g} mm at most expected", off)
 
 
 def _result(
@@ -469,14 +503,22 @@ def _result(
 def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Array:
     """Return that of the steps of camera and target (12, 12).
 
-    Where the noise of the robot was part of the solution, it says; otherwise what the solutions
-    without some of the poses say, by the jackknife.
+    Where the noise of the robot was part of the solution, it says; where that was estimated, the
+    estimate's own chance makes it larger as it makes Student's t wider than a normal distribution.
+    Otherwise the solutions without some of the poses say, by the jackknife. NaN where the poses are
+    too few to estimate any noise.
     """
+    wider = 1.0
+    if problem.sigmas is None:
+        if problem.count < LEAST_KNOWN:
+            return np.full((12, 12), np.nan)
+        freedom = 3 * problem.count - 6  # half of the equations each tell one of the two sigmas
+        wider = freedom / (freedom - 2)
     if solution.adjusted is not None and solution.noise is not None:
         whole = solution.adjusted.information
         size = np.sqrt(np.maximum(np.diag(whole), np.finfo(np.float64).tiny))
         inverse = np.linalg.pinv(whole / np.outer(size, size), rcond=1e-14, hermitian=True)
-        joint: Array = (inverse / np.outer(size, size))[:12, :12]
+        joint: Array = wider * (inverse / np.outer(size, size))[:12, :12]
         return joint
     steps = np.array([steps_between(solution, other) for _, other in chosen.folds])
     if len(steps) < 2:
@@ -484,37 +526,6 @@ def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Arra
     off = steps - steps.mean(axis=0)
     folds: Array = (len(off) - 1) / len(off) * off.T @ off
     return folds
-
-
-def _check_direction(problem: Problem) -> None:
-    """Raise where the poses fit far better as the other setup's, or inverted.
-
-    Raises:
-        CalibrationError: ``WRONG_FRAME``.
-    """
-    robot = problem.robot
-    other = dataclasses.replace(
-        problem, robot=Robot(robot.poses, not robot.in_hand), seen=problem.seen
-    )
-    off = []
-    for one in (problem, other):
-        tried = (solve_linear(name, one.robot, one.poses) for name in ("park", "shah"))
-        medians = [_median(one, found) for found in tried if found is not None]
-        off.append(min(medians, default=math.inf))
-    if off[1] < _size(problem) and off[0] > OTHER_WAY * off[1]:
-        raise CalibrationError(
-            "hand-eye: expected poses of the flange in the base, and the setup as it is, got poses "
-            f"that are {1e3 * off[0]:.3g} mm off so, and {1e3 * off[1]:.3g} mm the other way "
-            "round: they are inverted, or the camera is on the other side",
-            code=Code.WRONG_FRAME,
-            expected="T_base_flange",
-            got=off[1],
-        )
-
-
-def _median(problem: Problem, found: tuple[Rigid, Rigid]) -> float:
-    errors = problem.errors(Solution(*found, np.zeros(problem.seen.extra)))
-    return float(np.median(np.concatenate(errors)))
 
 
 def _remarks(problem: Problem, result: HandEyeCalibration) -> list[Remark]:
@@ -548,6 +559,16 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> list[Remark]:
     if result.held_out_error is None:
         remarks.append(
             Remark(Code.NOT_HELD_OUT, "too few poses to leave one out: no held-out error")
+        )
+    elif result.held_out_error > (most := expected_error(problem, POOR)):
+        remarks.append(
+            Remark(
+                Code.POOR_FIT,
+                f"expected a held-out error of {1e3 * most:.3g} mm at most, as of a robot that is "
+                f"{1e3 * POOR.translation:g} mm and {math.degrees(POOR.rotation):g} deg off, got "
+                f"{1e3 * result.held_out_error:.3g} mm: did the robot stand still, does the target "
+                "or the camera slip, is a pose one of another view?",
+            )
         )
     return remarks
 

@@ -63,7 +63,8 @@ class HandEyeCalibration:
         held_out_error: rms of these over all points of the used poses, metres; None where there is
             none. It is what picking has to expect.
         covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
-            along those of its target, m) and of ``target_pose``.
+            along those of its target, m) and of ``target_pose``, the lens taken as exact unless it
+            was adjusted; NaN where fewer than 5 poses told the robot's noise.
         robot_sigmas: of each axis of the robot's poses, as given or estimated; None where they were
             taken for exact.
         robot_poses: ``T_base_flange``, as given.
@@ -103,12 +104,12 @@ class HandEyeCalibration:
 
     @property
     def rotation_error(self) -> float:
-        """Expected rms error of the camera's orientation, all axes together, radians."""
+        """Expected rms error of the camera's orientation, all axes together, radians, or NaN."""
         return math.sqrt(float(np.trace(self.covariance[:3, :3])))
 
     @property
     def translation_error(self) -> float:
-        """Expected rms error of the camera's position, all axes together, metres."""
+        """Expected rms error of the camera's position, all axes together, metres, or NaN."""
         return math.sqrt(float(np.trace(self.covariance[3:6, 3:6])))
 
     @property
@@ -235,7 +236,8 @@ class HandEyeCalibration:
     ) -> Array:
         """Return the rms error to expect of :meth:`to_plane`, of what the camera's pose adds to it.
 
-        The robot's own error at ``robot_pose`` and that of the pixels come on top.
+        The robot's own error at ``robot_pose`` and that of the pixels come on top, and that of the
+        lens unless it was adjusted.
 
         Args:
             pixels: (N, 2).
@@ -243,7 +245,7 @@ class HandEyeCalibration:
             robot_pose: as for :meth:`to_plane`.
 
         Returns:
-            (N,), metres.
+            (N,), metres; NaN where :attr:`covariance` is.
 
         Raises:
             CalibrationError: as :meth:`to_plane`.

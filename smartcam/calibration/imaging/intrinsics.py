@@ -137,7 +137,12 @@ class IntrinsicCalibration:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """Standard deviations by name: ``fx``, ``fy``, ``cx``, ``cy`` in pixels, ``k1``, ..."""
+        """Standard deviations by name: ``fx``, ``fy``, ``cx``, ``cy`` in pixels, ``k1``, ...
+
+        They hold to first order. The coefficients ``k1`` to ``k6`` of ``rational_polynomial`` make
+        up for each other so far that they may be tens of these deviations off the true ones, while
+        the lens they describe together, and ``fx`` to ``cy``, are right.
+        """
         names = parameter_names(self.camera.distortion_model)
         values = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()
         return dict(zip(names, values, strict=True))

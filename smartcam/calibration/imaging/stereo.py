@@ -36,6 +36,7 @@ from smartcam.calibration.imaging.sheet_shape import (
     held_out_residuals,
     leave_out,
 )
+from smartcam.calibration.imaging.stereo_checks import check_fit, remark_sides
 from smartcam.calibration.imaging.stereo_errors import PairErrors, pair_errors, spacing_errors
 from smartcam.calibration.imaging.stereo_start import (
     LEFT,
@@ -348,13 +349,15 @@ def calibrate_stereo(
             adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
             ``auto``: what has the smaller held-out reprojection error, where it is clearly smaller.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
-            most a third of them; else they are only named.
+            most a third of them; else they are only named. Of a pair whose views do not belong
+            together it is the right one.
 
     Raises:
         CalibrationError: ``TOO_FEW``: less than 3 pairs, 2 where both lenses are known;
             ``SHAPE``: lists of different lengths, or a coefficient that is none; ``WRONG_SIZE``,
             ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``; ``POOR_FIT``: no lens or no
-            transform shows the views; ``INSUFFICIENT_ROTATION``: the target was not tilted.
+            transform shows the views, as where those of many pairs are of different moments;
+            ``INSUFFICIENT_ROTATION``: the target was not tilted.
     """
     moments = as_moments(left_views, right_views)
     least = LEAST_PAIRS if left and right else LEAST_VIEWS
@@ -368,7 +371,7 @@ def calibrate_stereo(
             got=len(both),
         )
     lenses = Lenses((left, right), distortion_model, tuple(fixed))
-    moments, bundle = start(moments, lenses)
+    moments, bundle, apart = start(moments, lenses)
     sights = [
         Sight(side, number, view)
         for number, moment in enumerate(moments)
@@ -376,6 +379,10 @@ def calibrate_stereo(
         if view is not None
     ]
     most, bad = MOST_BAD * len(sights), list[Sight]()
+    bad += [one for one in sights if one.camera == 1 and one.pose in apart]
+    rest = [one for one in sights if one not in bad]
+    if drop_bad and len(bad) <= MOST_BAD * len(both) and len(_pairs(rest)) >= least:
+        sights = rest
     while True:
         adjusted = adjust_weighted(bundle, sights)
         if not math.isfinite(adjusted.weighted):
@@ -386,12 +393,13 @@ def calibrate_stereo(
         worst, ratio = worst_view([one.view for one in sights], adjusted)
         if ratio <= BAD:
             break
-        bad.append(sights[worst])
+        if sights[worst] not in bad:
+            bad.append(sights[worst])
         rest = sights[:worst] + sights[worst + 1 :]
         if not drop_bad or len(bad) > most or len(_pairs(rest)) < least:
             break
         sights, bundle = rest, adjusted.bundle
-    return _summary(_Found(moments, sights, bad, adjusted, least), sheet)
+    return _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
 
 
 def _pairs(sights: Sequence[Sight]) -> list[int]:
@@ -409,6 +417,7 @@ class _Found(NamedTuple):
         bad: those that fit badly, whether used or not.
         adjusted: the cameras.
         least: pairs that are needed.
+        apart: as :class:`~smartcam.calibration.imaging.stereo_start.Start` has it.
     """
 
     moments: list[Moment]
@@ -416,6 +425,7 @@ class _Found(NamedTuple):
     bad: list[Sight]
     adjusted: Adjusted
     least: int
+    apart: Mapping[int, float]
 
 
 class _HeldOut(NamedTuple):
@@ -487,6 +497,7 @@ def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
         sheet=None if points is None else points - found.sights[0].view.target.points,
         warnings=(),
     )
+    check_fit(calibration.rms, found.sights, found.bad)
     return dataclasses.replace(calibration, warnings=tuple(_remarks(calibration, found)))
 
 
@@ -520,13 +531,16 @@ def _remarks(calibration: StereoCalibration, found: _Found) -> list[Remark]:
     for one in found.bad:
         used = any(one is sight for sight in found.sights)
         done = "is used all the same" if used else "was not used"
-        remarks.append(
-            Remark(
-                Code.BAD_VIEW,
-                f"{label(one.view, one.pose)}, {SIDES[one.camera]}: fits more than {BAD:g} times "
-                f"worse than the others: it {done}",
+        off = f"fits more than {BAD:g} times worse than the others"
+        if one.camera == 1 and one.pose in found.apart:
+            pixels = found.apart[one.pose]
+            far = f"{pixels:.3g} pixels off" if math.isfinite(pixels) else "nowhere near"
+            off = (
+                f"is {far} where the left view and the other pairs have it: the two are of "
+                "different moments, or swapped"
             )
-        )
+        name = f"{label(one.view, one.pose)}, {SIDES[one.camera]}"
+        remarks.append(Remark(Code.BAD_VIEW, f"{name}: {off}; it {done}"))
     if calibration.rms > POOR:
         remarks.append(
             Remark(
@@ -536,6 +550,7 @@ def _remarks(calibration: StereoCalibration, found: _Found) -> list[Remark]:
                 "same moments",
             )
         )
+    remarks += remark_sides(calibration.transform)
     remarks += remark_sheet(calibration.sheet)
     if math.isnan(calibration.held_out):
         remarks.append(

@@ -24,7 +24,17 @@ if TYPE_CHECKING:
     from smartcam.calibration.imaging.cameras import CameraModel, DistortionModel
     from smartcam.calibration.imaging.views import TargetView
 
-__all__ = ["LEFT", "RIGHT", "SIDES", "Lenses", "Moment", "as_moments", "half_turned", "start"]
+__all__ = [
+    "LEFT",
+    "RIGHT",
+    "SIDES",
+    "Lenses",
+    "Moment",
+    "Start",
+    "as_moments",
+    "half_turned",
+    "start",
+]
 
 LEFT: Final = "left"
 """Name of the left camera's frame."""
@@ -37,6 +47,12 @@ SIDES: Final = (LEFT, RIGHT)
 
 GUESSES: Final = 20
 """Pairs at most that are tried for a first guess of the transform."""
+
+GROSS: Final = 10.0
+"""A pair that is more times the median off does not belong together, if it is far off, too."""
+
+FAR: Final = 0.01
+"""Of the longer side of the image: as far off is no noise, nor a lens that is not yet adjusted."""
 
 
 class Lenses(NamedTuple):
@@ -98,8 +114,23 @@ def as_moments(
     return moments
 
 
-def start(moments: list[Moment], lenses: Lenses) -> tuple[list[Moment], Bundle]:
-    """Return a first guess of everything, and right views numbered as the left ones are.
+class Start(NamedTuple):
+    """A first guess of everything.
+
+    Attributes:
+        moments: the right views numbered as the left ones are.
+        bundle: lenses, transform and poses.
+        apart: moments whose views do not belong together, and how far the right one is off where
+            the left one and the other pairs have it, pixels; infinite where that is behind it.
+    """
+
+    moments: list[Moment]
+    bundle: Bundle
+    apart: dict[int, float]
+
+
+def start(moments: list[Moment], lenses: Lenses) -> Start:
+    """Return a first guess of everything.
 
     Raises:
         CalibrationError: ``POOR_FIT``: no lens or no transform shows the views;
@@ -115,7 +146,7 @@ def start(moments: list[Moment], lenses: Lenses) -> tuple[list[Moment], Bundle]:
                 turned = locate(other, cameras[1]).transform
                 if _angle(one, turned) < _angle(one, two):
                     moments[number], poses[number] = (first, other), (one, turned)
-    rig = _rig(moments, poses, cameras[1])
+    rig, apart = _rig(moments, poses, cameras[1])
     to_left = Transform(RIGHT, LEFT, rig.rotation, rig.translation).inverse()
     firsts = []
     for one, two in poses:
@@ -126,7 +157,7 @@ def start(moments: list[Moment], lenses: Lenses) -> tuple[list[Moment], Bundle]:
         else:
             firsts.append(IDENTITY)
     basis = lenses.basis(0), lenses.basis(1)
-    return moments, Bundle(cameras, (IDENTITY, rig), tuple(firsts), basis)
+    return Start(moments, Bundle(cameras, (IDENTITY, rig), tuple(firsts), basis), apart)
 
 
 def _lens(moments: list[Moment], side: int, lenses: Lenses) -> CameraModel:
@@ -166,29 +197,37 @@ def half_turned(view: TargetView) -> TargetView:
     )
 
 
-def _rig(moments: list[Moment], poses: list[Poses], right: CameraModel) -> Motion:
-    """Return the pair's transform that fits most of the other pairs best."""
+def _rig(
+    moments: list[Moment], poses: list[Poses], right: CameraModel
+) -> tuple[Motion, dict[int, float]]:
+    """Return the pair's transform that fits most of the pairs best, and the pairs that do not fit.
+
+    Raises:
+        CalibrationError: ``POOR_FIT``.
+    """
     pairs = [
-        (one, two, moment[1])
-        for (one, two), moment in zip(poses, moments, strict=True)
+        (number, one, two, moment[1])
+        for number, ((one, two), moment) in enumerate(zip(poses, moments, strict=True))
         if one is not None and two is not None and moment[1] is not None
     ]
-    best, least = IDENTITY, math.inf
-    for one, two, _ in pairs[:: math.ceil(len(pairs) / GUESSES)]:
+    best, least, apart = IDENTITY, math.inf, dict[int, float]()
+    for _, one, two, _ in pairs[:: math.ceil(len(pairs) / GUESSES)]:
         rotation = two.rotation @ one.rotation.T
         guess = Motion(rotation, two.translation - rotation @ one.translation)
         off = []
-        for pose, _, view in pairs:
+        for _, pose, _, view in pairs:
             near = pose.apply(view.object_points) @ rotation.T + guess.translation
             distances = np.linalg.norm(right.project(near) - view.points, axis=1)
             off.append(float(np.nan_to_num(distances, nan=math.inf).mean()))
         middle = float(np.median(off))
         if middle < least:
             best, least = guess, middle
+            apart = {number: value for (number, *_), value in zip(pairs, off, strict=True)}
     if not math.isfinite(least):
         raise CalibrationError(
             f"stereo: expected one transform from left to right that fits most of the "
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?",
             code=Code.POOR_FIT,
         )
-    return best
+    far = max(GROSS * least, FAR * max(right.size))
+    return best, {number: off for number, off in apart.items() if off > far}

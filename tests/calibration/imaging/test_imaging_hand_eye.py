@@ -266,17 +266,6 @@ def _parts(transform: Transform) -> tuple[NDArray[np.float64], NDArray[np.float6
     return transform.rotation, transform.translation
 
 
-def test_hand_eye_of_poses_in_millimetres_is_refused() -> None:
-    poses, views = measured("eye-in-hand", 0.1, NOISE)
-    wrong = [dataclasses.replace(one, translation=1e3 * one.translation) for one in poses]
-    with refused("POOR_FIT", "are the poses those of the views, in metres"):
-        calibrate_hand_eye(wrong, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
-    truth = scene("eye-in-hand")
-    seen = [truth.seen(one) for one in truth.robot_poses]
-    with refused("POOR_FIT", "in metres, and is the setup right?"):
-        calibrate_hand_eye_from_poses(wrong, seen, setup="eye-in-hand")
-
-
 def test_hand_eye_with_a_wrong_lens_adjusts_it_and_says_so() -> None:
     poses, views = measured("eye-in-hand", 0.1, NOISE, poses=14, tilt=40.0)
     matrix = CAMERA.matrix.copy()

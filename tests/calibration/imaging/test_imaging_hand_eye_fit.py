@@ -147,6 +147,19 @@ def test_adjust_that_begins_behind_the_camera_has_no_cost() -> None:
     assert not found.converged
 
 
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_evaluate_of_no_lens_and_no_target_is_nan(number: int) -> None:
+    *_, seen = problem(True)
+    observed = pixels(seen, free=(0, 1, 2))
+    change = np.zeros(3)
+    change[number] = -2000.0
+    off, slopes = observed.evaluate(seen, change)
+    fits = observed.evaluate(seen, np.zeros(3))
+    assert np.isnan(off).all()
+    assert np.isnan(slopes).all()
+    assert [off.shape, slopes.shape] == [one.shape for one in fits]
+
+
 def test_adjust_corrects_a_robot_that_is_off() -> None:
     robot, camera, target, seen = problem(in_hand=False, poses=12)
     off = np.random.default_rng(2).normal(scale=[1e-3] * 3 + [3e-4] * 3, size=(12, 6))

@@ -111,6 +111,41 @@ def test_calibrate_stereo_names_a_view_of_another_moment_and_leaves_it_out() -> 
     assert np.linalg.norm(_off(found.transform)[3:]) < 4e-4
 
 
+def test_calibrate_stereo_leaves_a_swapped_pair_out() -> None:
+    left, right = pairs(8)
+    left[3], right[3] = right[3], left[3]
+    found = calibrate_stereo(left, right, sheet="exact")
+    assert not found.pairs[3].used[1]
+    assert sum(one.used == (True, True) for one in found.pairs) == 7
+    assert "pixels off where the left view and the other pairs have it" in found.warnings[0].text
+    assert found.warnings[0].text.startswith("03, right: is ")
+    assert np.linalg.norm(_off(found.transform)[3:]) < 4e-4
+
+
+def test_calibrate_stereo_of_shifted_pairs_is_refused() -> None:
+    left, right = pairs(6)
+    with pytest.raises(CalibrationError, match="are they in the same order") as caught:
+        calibrate_stereo(left, [*right[1:], right[0]], sheet="exact")
+    assert caught.value.code == Code.POOR_FIT
+
+
+def test_calibrate_stereo_told_to_keep_a_wrong_pair_is_refused_and_names_it() -> None:
+    left, right = pairs(6)
+    right[2] = dataclasses.replace(right[5], name="other")
+    with pytest.raises(CalibrationError, match=r"worst: other \(right\)") as caught:
+        calibrate_stereo(left, right, left=LEFT, right=RIGHT, sheet="exact", drop_bad=False)
+    assert caught.value.code == Code.POOR_FIT
+
+
+def test_calibrate_stereo_of_swapped_sides_says_so() -> None:
+    left, right = pairs(5)
+    found = calibrate_stereo(right, left, left=RIGHT, right=LEFT, sheet="exact")
+    assert [one.code for one in found.warnings] == [Code.SWAPPED_SIDES]
+    assert "left and right seem swapped" in found.warnings[0].text
+    assert "got it 79.7 mm on the left" in found.warnings[0].text
+    assert found.transform.translation[0] == pytest.approx(0.08, rel=0.01)
+
+
 def test_calibrate_stereo_numbers_a_sheet_that_looks_the_same_when_turned_alike() -> None:
     target = Checkerboard(columns=8, rows=6, square=0.025)
     assert target.turned_alike
