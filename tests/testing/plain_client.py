@@ -70,8 +70,7 @@ class PlainClient:
         self.wait(CONNECT)
         if "does not wait" not in self.sins:
             self.wait(STATUS)
-        for _ in range(2 if "two queries" in self.sins else 1):
-            self.send(QUERY)
+        self.send(QUERY, times=2 if "two queries" in self.sins else 1)
         self.active = struct.unpack("<I", self.wait(QUERY))[0]
         if "unknown request" in self.sins:
             self.send(0x99)
@@ -132,8 +131,8 @@ class PlainClient:
 
     # ------------------------------------------------------------------ messages
 
-    def send(self, number: int, body: bytes = b"") -> None:
-        self._socket.sendall(MAGIC + struct.pack("<II", len(body), number) + body)
+    def send(self, number: int, body: bytes = b"", *, times: int = 1) -> None:
+        self._socket.sendall((MAGIC + struct.pack("<II", len(body), number) + body) * times)
 
     def wait(self, wanted: int) -> bytes:
         """Return the body of the next message of a kind."""
