@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from rigid import NOON, after, close, refused, rotation_about, transforms
 
@@ -361,6 +361,7 @@ def times(count: int) -> list[Transform]:
 
 
 @pytest.mark.parametrize("form", TRAJECTORIES)
+@example(microseconds=[10**17], transform=Transform("world", "body", np.eye(3), np.zeros(3)))
 @given(
     microseconds=st.lists(st.integers(0, 10**17), max_size=3),
     transform=transforms("world", "body"),

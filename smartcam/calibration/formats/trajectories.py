@@ -32,7 +32,7 @@ MAX_LINE = 4096
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _LAST = Decimal(253_402_300_799)  # the year 9999
 _COLUMN = re.compile(r"\s*([A-Za-z_]+)\s*(?:\[([^\]]*)\])?\s*")
-_TIME = re.compile(r"[0-9]{1,20}(?:\.[0-9]{0,20})?(?:[eE][-+]?[0-9]{1,2})?")
+_TIME = re.compile(r"[0-9]{1,21}(?:\.[0-9]{0,20})?(?:[eE][-+]?[0-9]{1,2})?")
 
 
 class _Header(NamedTuple):
