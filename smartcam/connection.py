@@ -1,8 +1,9 @@
 """One TCP or UDP link to a camera, used once.
 
-The transport hands bytes to the machine of ``protocols/``. What comes out, a chunk of events per
-delivery, goes straight to the receiver that was named with :meth:`Link.deliver_to`: no task is
-switched for it. Before there is one, chunks wait in a bounded queue for :meth:`Link.receive`.
+The transport hands bytes to the machine of ``protocols/``. What comes out waits in a bounded queue,
+a chunk of events a delivery, for the receive task, which takes one chunk in a turn of the event
+loop (:meth:`Link.receive`). So nothing that a chunk causes runs in the transport's callbacks, and a
+camera that floods takes no more of a turn than others.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ import socket
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam.doorbell import Doorbell
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.protocols.base import Dialect, Role, Transport
-from smartcam.protocols.machine import Event, LinkFailed, LinkMachine, State
+from smartcam.protocols.machine import Event, LinkFailed, LinkMachine, ResultBurst, State
 from smartcam.protocols.messages import Disconnect, Message, Sender
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from smartcam.protocols.base import Protocol
     from smartcam.protocols.framing import Frame
@@ -31,19 +33,36 @@ __all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
 logger: logging.Logger = logging.getLogger("smartcam.connection")
 
 MAX_CHUNKS = 256
-"""Chunks that wait while a session is made, where a few are normal; beyond this TCP stops reading
-and UDP drops, which is counted."""
+"""Chunks that wait for the receive task, where one is normal; beyond this TCP stops reading and UDP
+drops, which is counted."""
 
+MAX_QUEUED = 1 << 18
+"""Bytes whose events wait for the receive task; beyond this TCP stops reading. A large frame counts
+when it is whole, so one of those may wait beyond it."""
+
+CHUNK_EVENTS = 64
+"""Events of a chunk, each container counted: what one camera may have done in a turn of the event
+loop, half a millisecond or less."""
+
+FEW_EVENTS = 4
+"""So many events are one chunk without a look at what they weigh: bursts are bounded as well."""
 
 MAX_REST = 256
 """Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
 
 
 class Chunk(NamedTuple):
-    """Events that one delivery of bytes gave, and the loop time when it came."""
+    """Events that one delivery of bytes gave, or some of them.
+
+    Attributes:
+        received_at: loop time when it came.
+        events: what it gave, in order.
+        size: bytes that came since the chunk before; 0 for what is not a delivery's first.
+    """
 
     received_at: float
     events: list[Event]
+    size: int = 0
 
 
 class TraceEntry(NamedTuple):
@@ -104,8 +123,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._replies = machine.replies
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
-        self._receiver: Callable[[Chunk], None] | None = None
-        self._wakeup: asyncio.Future[None] | None = None
+        self._queued = 0  # bytes that the chunks stand for
+        self._handed_on = 0  # bytes that came until the last chunk
+        self._doorbell = Doorbell(self._loop)  # of the task that receives
         self._closed: asyncio.Future[None] = self._loop.create_future()
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()
@@ -144,41 +164,24 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         await self._writable.wait()
 
     async def receive(self) -> Chunk:
-        """Return the next chunk; waits without a bound, who asks has a deadline.
+        """Return the next chunk, one in a turn of the event loop; waits as long as the link lives.
 
         Raises:
             ConnectionLostError: the link is gone and every chunk was taken.
 
         Cancellation: safe, nothing is lost.
         """
+        if self._chunks:
+            await asyncio.sleep(0)  # others have their turn
         while not self._chunks:
             if self._loss is not None:
                 raise self.lost_error()
-            await self._wait()
+            await self._doorbell
         chunk = self._chunks.popleft()
-        if len(self._chunks) < MAX_CHUNKS // 2:
+        self._queued -= chunk.size
+        if self._paused and len(self._chunks) < MAX_CHUNKS // 2 and self._queued < MAX_QUEUED // 2:
             self._resume()
         return chunk
-
-    def deliver_to(self, receiver: Callable[[Chunk], None]) -> None:
-        """Hand every chunk to ``receiver`` as it comes, first those that wait.
-
-        Args:
-            receiver: takes a chunk; it never waits and never raises.
-        """
-        while self._chunks:
-            receiver(self._chunks.popleft())
-        self._receiver = receiver
-        self._resume()
-
-    async def wait_lost(self) -> ConnectionLostError:
-        """Wait until the link is gone and return why; without a bound, it is the link's life.
-
-        What came before was delivered by then. Cancellation: safe.
-        """
-        while self._loss is None:
-            await self._wait()
-        return self.lost_error()
 
     async def close(self, timeout: float) -> None:
         """Send Disconnect, end the link in order, within ``timeout`` seconds; else abort it.
@@ -316,34 +319,28 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._flush()
 
     def _hand_on(self) -> None:
+        """Queue what the last bytes gave for the receive task."""
         events = self.machine.events()
         if not events or self._closing:
             return
-        chunk = Chunk(self.heard_at, events)
-        if self._receiver is not None:
-            self._receiver(chunk)
+        received = self.machine.counters.bytes_received
+        size, self._handed_on = received - self._handed_on, received
+        self._queued += size
+        if len(events) <= FEW_EVENTS:
+            self._chunks.append(Chunk(self.heard_at, events, size))
         else:
-            self._chunks.append(chunk)
-            self._wake()
+            for some in portions(events):
+                self._chunks.append(Chunk(self.heard_at, some, size))
+                size = 0
         last = events[-1]
         if isinstance(last, LinkFailed):
             self._lose(last.error)
             self._transport.abort()
-        elif (
-            len(self._chunks) >= MAX_CHUNKS
-            and not self._paused
-            and self.machine.transport is Transport.TCP
-        ):
-            self._paused = True
-            self._transport.pause_reading()
-
-    async def _wait(self) -> None:
-        """Wait until something is there to take, or the link is gone."""
-        self._wakeup = self._loop.create_future()
-        try:
-            await self._wakeup
-        finally:
-            self._wakeup = None
+        elif not self._paused and self.machine.transport is Transport.TCP:
+            self._paused = len(self._chunks) >= MAX_CHUNKS or self._queued >= MAX_QUEUED
+            if self._paused:
+                self._transport.pause_reading()
+        self._doorbell.ring()
 
     def _resume(self) -> None:
         if self._paused:
@@ -361,11 +358,21 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._loss = reason
             self._show_rest()
         self._writable.set()
-        self._wake()
+        self._doorbell.ring()
 
-    def _wake(self) -> None:
-        if self._wakeup is not None and not self._wakeup.done():
-            self._wakeup.set_result(None)
+
+def portions(events: list[Event]) -> Iterator[list[Event]]:
+    """Give events in lists of about :data:`CHUNK_EVENTS`, each container of a burst counted."""
+    some: list[Event] = []
+    weight = 0
+    for event in events:
+        weight += len(event.data) if type(event) is ResultBurst else 1
+        some.append(event)
+        if weight >= CHUNK_EVENTS:
+            yield some
+            some, weight = [], 0
+    if some:
+        yield some
 
 
 async def open_link(

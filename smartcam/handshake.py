@@ -73,6 +73,11 @@ BUSY_PAUSE = 0.05
 """Seconds until a camera that was too busy to name its application is asked again."""
 
 
+MAX_EARLY = 1 << 20
+"""Bytes that may come while a session is made, beside one frame of ``max_length``. Making one takes
+a few round trips, and the fastest camera sends a fraction of it meanwhile."""
+
+
 OPENING = "opening the link"
 CONNECTING = "waiting for the answer to Connect"
 
@@ -135,9 +140,16 @@ class Try:
 
 @dataclass(slots=True)
 class _Collector:
-    """Takes events until a wanted one is there; keeps the rest for the client."""
+    """Takes events until a wanted one is there; keeps the rest for the client.
+
+    Attributes:
+        link: where they come from.
+        most: bytes that may come meanwhile.
+    """
 
     link: Link
+    most: int
+    size: int = 0
     early: list[Chunk] = field(default_factory=list[Chunk])
     version: int | None = None
     statuses: int = 0
@@ -146,6 +158,11 @@ class _Collector:
 
     async def take(self) -> None:
         chunk = await self.link.receive()
+        self.size += chunk.size
+        if self.size > self.most:
+            raise RemoteProtocolError(
+                f"{self.size} bytes came before there was a session; {self.most} are accepted"
+            )
         self.early.append(chunk)
         dialect = self.link.machine.dialect
         for event in chunk.events:
@@ -273,7 +290,7 @@ async def attempt(
         trace=trace,
         liveness_timeout=liveness_timeout,
     )
-    collector = _Collector(link)
+    collector = _Collector(link, MAX_EARLY + max_length)
     try:
         link.send(*([Disconnect()] if disconnect_first else []), Connect())
         progress.step = CONNECTING

@@ -1,7 +1,7 @@
 """The life of a client: sessions, one after the other, and what happens between them.
 
-One task per client, the library's only bare ``create_task``. It makes a session, reads its link to
-the end, tells everybody that it is over, and by the :class:`~smartcam.backoff.Backoff` makes the
+One task per client, the library's only bare ``create_task``. It makes a session, has the receive
+task read its link to the end, tells everybody that it is over, and by the :class:`~smartcam.backoff.Backoff` makes the
 next. When the camera was lost again soon after a reconnect another client has it: then it stops.
 """
 
@@ -26,7 +26,7 @@ from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.protocols.base import Transport
 
 if TYPE_CHECKING:
-    from smartcam.connection import Chunk, Link
+    from smartcam.connection import Link
     from smartcam.conversation import Conversation
     from smartcam.observers import Observers
     from smartcam.settings import Address, CameraSettings
@@ -71,7 +71,6 @@ class Supervisor:
         self._reading = False  # a link, whose end it notices by itself
         self._short_lived = 0  # sessions in a row that were lost soon
         self._excused = False  # an early loss of this session is no other client's doing
-        self._failure: Exception | None = None  # of ours, while a chunk was dispatched
         self._restarting: Link | None = None  # the camera was told to restart over this link
 
     # ------------------------------------------------------------------ for the client
@@ -233,12 +232,14 @@ class Supervisor:
         error: ConnectionLostError
         self._reading = True
         try:
-            async with self._turns.session(restore=settings.restore and self.session is not None):
+            restore = settings.restore and self.session is not None
+            async with self._turns.session(restore=restore) as tasks:
                 self._adopt(session)
                 limit, longest = settings.liveness_timeout, settings.switch_timeout
                 with watched(link, self._talk, limit, longest):
-                    error = await self._read(link)
-                self._inbox.fail(error)  # ends the jobs' waits too
+                    name = f"smartcam[{self._talk.name}].receive"
+                    error = await tasks.create_task(self._receive(link), name=name)
+                self._tell_of_loss(link, error)  # ends the jobs' waits too
         finally:
             self._reading = False
             self._talk.end_polling()
@@ -261,13 +262,20 @@ class Supervisor:
             self._opened.set_result(None)
         self._tell()
 
-    async def _read(self, link: Link) -> ConnectionLostError:
-        """Have every chunk dispatched until the link ends; return why it did."""
-        link.deliver_to(self._take)
-        error = await link.wait_lost()
-        failure, self._failure = self._failure, None
-        if failure is not None:
-            raise failure
+    async def _receive(self, link: Link) -> ConnectionLostError:
+        """The receive task: have each chunk dispatched until the link ends; return why it did."""
+        inbox = self._inbox
+        while True:
+            try:
+                chunk = await link.receive()
+            except ConnectionLostError as error:
+                return error
+            inbox.dispatch(chunk)
+            if inbox.active_in_doubt:
+                self._talk.ask_what_is_active()
+
+    def _tell_of_loss(self, link: Link, error: ConnectionLostError) -> None:
+        """Tell everybody that a link has ended; what came before is dispatched."""
         restarting = self._restarting is link
         expected = self._closing or restarting
         reason = "the camera restarts" if restarting else str(error.__cause__)
@@ -283,18 +291,6 @@ class Supervisor:
             )
         )
         self._tell()
-        return error
-
-    def _take(self, chunk: Chunk) -> None:
-        """Dispatch a chunk; called by the link as it comes."""
-        try:
-            self._inbox.dispatch(chunk)
-            if self._inbox.active_in_doubt:
-                self._talk.ask_what_is_active()
-        except Exception as exc:  # noqa: BLE001 - a fault of ours: the task raises it
-            self._failure = exc
-            if self.session is not None:
-                self.session.link.abort(exc)
 
     async def _reconnect(self, loss: ConnectionLostError) -> Session:
         """Make a new session, as often as the policy says.

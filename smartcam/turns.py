@@ -84,20 +84,23 @@ class Turns:
     # ------------------------------------------------------------------ for the supervisor
 
     @contextlib.asynccontextmanager
-    async def session(self, *, restore: bool) -> AsyncGenerator[None]:
+    async def session(self, *, restore: bool) -> AsyncGenerator[asyncio.TaskGroup]:
         """A session is there as long as the body runs; ends when its jobs have.
+
+        Gives the group of the session's tasks.
 
         Args:
             restore: have the application and the run state again that were wanted.
         """
-        async with asyncio.TaskGroup() as self._jobs:
+        async with asyncio.TaskGroup() as jobs:
+            self._jobs = jobs
             try:
                 owed, self._owed = self._owed, None
                 if owed is not None:
                     self._start_job("going_back", self._go_back(owed))
                 elif restore:
                     self._start_job("restoring", self._restore())
-                yield
+                yield jobs
             finally:
                 self._jobs = None
 

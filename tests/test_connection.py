@@ -167,68 +167,61 @@ async def test_receive_cancelled_loses_nothing(server: Listener) -> None:
     link.abort()
 
 
-# ---------------------------------------------------------------------- a receiver
+# ---------------------------------------------------------------------- one chunk in a turn
 
 
-async def test_deliver_to_hands_over_what_waits_then_every_chunk_as_it_comes(
-    server: Listener,
-) -> None:
+async def test_receive_takes_one_chunk_in_a_turn_of_the_loop(server: Listener) -> None:
     link, peer = await session(server)
-    await deliver(link, peer, STATUS + RESULT)
-    await deliver(link, peer, BUSY)
-    heard: list[Chunk] = []
-    link.deliver_to(heard.append)
-    assert [chunk.events for chunk in heard] == [[RUNNING, HELLO], [BUSY_REPORT]]
-    await deliver(link, peer, RESULT * 3 + RESULT[:-1])
-    await deliver(link, peer, RESULT[-1:] + b"noise")
-    burst = ResultBurst(application=21, data=[b"Hello"] * 3)
-    assert [chunk.events for chunk in heard[2:3]] == [[burst]]
-    hello, failed = heard[3].events
-    assert hello == HELLO
-    assert isinstance(failed, LinkFailed)
-    error = await link.wait_lost()
-    assert error.__cause__ is failed.error
-    assert [chunk.received_at for chunk in heard] == sorted(chunk.received_at for chunk in heard)
-    assert len(link._chunks) == 0
-
-
-async def test_deliver_to_after_the_queue_was_full_reads_on(
-    server: Listener, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(connection, "MAX_CHUNKS", 2)
-    link, peer = await session(server)
-    for _ in range(2):
-        await deliver(link, peer, STATUS)
-    assert not link._transport.is_reading()
-    heard: list[Chunk] = []
-    link.deliver_to(heard.append)
-    for _ in range(5):
+    for _ in range(3):
         await deliver(link, peer, BUSY)
-    assert [chunk.events for chunk in heard] == [[RUNNING]] * 2 + [[BUSY_REPORT]] * 5
-    assert link._transport.is_reading()
+    turns: list[int] = []
+
+    async def read() -> None:
+        for _ in range(3):
+            await link.receive()
+            turns.append(len(turns))
+
+    reading = asyncio.create_task(read())
+    for turn in range(1, 4):
+        await asyncio.sleep(0)
+        assert len(turns) <= turn
+    await reading
+    assert len(turns) == 3
     link.abort()
 
 
-async def test_wait_lost_tells_everything_that_came_before_and_may_be_cancelled(
-    server: Listener,
-) -> None:
+async def test_delivery_with_many_events_is_several_chunks(server: Listener) -> None:
     link, peer = await session(server)
-    waiting = asyncio.create_task(link.wait_lost())
-    await asyncio.sleep(0)
-    await deliver(link, peer, BUSY)
-    await asyncio.sleep(0)
-    assert not waiting.done()
-    heard: list[Event] = []
-    link.deliver_to(lambda chunk: heard.extend(chunk.events))
-    waiting.cancel()
-    await asyncio.wait({waiting})
-    assert waiting.cancelled()
-    peer.write(STATUS + RESULT[:5])
-    peer.close()
+    await deliver(link, peer, RESULT * 120 + BUSY * 10)
+    chunks = [await link.receive() for _ in range(3)]
+    assert [sum(map(weight, chunk.events)) for chunk in chunks] == [64, 64, 2]
+    assert [chunk.size > 0 for chunk in chunks] == [True, False, False]
+    assert len({chunk.received_at for chunk in chunks}) == 1
+    assert link._queued == 0
+    link.abort()
+
+
+def weight(event: Event) -> int:
+    return len(event.data) if isinstance(event, ResultBurst) else 1
+
+
+async def test_queued_bytes_pause_reading_then_everything_arrives(
+    server: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "MAX_QUEUED", 1000)
+    link, peer = await session(server)
+    large = HANDBOOK.encode(m.ResultContainer(application=21, data=bytes(990)))
+    await deliver(link, peer, large)
+    assert not link._transport.is_reading()
+    peer.write(large * 3)
+    expected = [m.ResultContainer(application=21, data=bytes(990))] * 4
+    found: list[Event] = []
     async with asyncio.timeout(LIMIT):
-        error = await link.wait_lost()
-    assert isinstance(error.__cause__, ConnectionResetError)
-    assert heard == [BUSY_REPORT, RUNNING, LinkEnded(pending=5)]
+        while len(found) < 4:
+            found += one_by_one((await link.receive()).events)
+            assert link._queued <= 4 * len(large)
+    assert found == expected
+    link.abort()
 
 
 async def test_frames_of_any_size_come_whole_through_the_transports_reads(
@@ -236,7 +229,6 @@ async def test_frames_of_any_size_come_whole_through_the_transports_reads(
 ) -> None:
     link, peer = await session(server)
     heard: list[Event] = []
-    link.deliver_to(lambda chunk: heard.extend(one_by_one(chunk.events)))
     sizes = [0, 4083, 4084, 4085, 300_000, 1, *[70] * 20_000, (1 << 20) - 4, 5_000, 7]
     said = [
         m.ResultContainer(application=size % 2, data=size.to_bytes(4, "big") * (size // 4))
@@ -244,7 +236,9 @@ async def test_frames_of_any_size_come_whole_through_the_transports_reads(
     ]
     stream = b"".join(map(HANDBOOK.encode, said))
     peer.write(stream)
-    await until(lambda: link.machine.counters.frames_received == 1 + len(said))
+    async with asyncio.timeout(LIMIT):
+        while len(heard) < len(said):
+            heard += one_by_one((await link.receive()).events)
     assert heard == said
     assert link.machine.counters.bytes_received == 16 + len(stream)
     link.abort()
@@ -620,7 +614,7 @@ async def test_trace_shows_what_is_left_of_an_unfinished_frame(server: Listener,
     await until(lambda: len(link.machine.pending) == 15)
     if how == "the camera closes":
         peer.close()
-        await link.wait_lost()
+        await until(lambda: link.lost)
     link.give_up(TimeoutError("silence"))
     left = [entry for entry in entries if entry.direction == "!"]
     assert [(entry.message, entry.hex) for entry in left] == [

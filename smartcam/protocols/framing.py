@@ -45,6 +45,10 @@ many bytes of results fit into a subscriber's queue where each has 16 bytes or m
 keeps up loses nothing."""
 
 
+LEAST_READ = 1 << 10
+"""Bytes that one read takes at most where the frames are many and small."""
+
+
 class Frame(NamedTuple):
     """One frame: message id and the bytes behind the header."""
 
@@ -111,7 +115,7 @@ class Framer:
     """
 
     __slots__ = (
-        *("_buffer", "_filled", "_header", "_large", "_max_length", "_read"),
+        *("_buffer", "_filled", "_header", "_large", "_max_length", "_most", "_read"),
         *("_start", "_store", "_window"),
     )
 
@@ -126,6 +130,7 @@ class Framer:
         self._filled = 0
         self._store = memoryview(b"")  # where a transport writes; large frames stay there
         self._window = self._store  # what of it the next read may take
+        self._most = MOST_READ  # what it may be in the end
 
     @property
     def buffered(self) -> int:
@@ -181,7 +186,9 @@ class Framer:
             self._fill(count)
             return self._large is None
         data = self._window[:count]
-        if count == len(self._window) < MOST_READ:
+        if count < len(self._window):
+            self._most = MOST_READ
+        elif count < self._most:
             self._window = self._store = memoryview(bytearray(min(2 * count, MOST_READ)))
         if self._start < len(self._buffer):
             self.feed(data)
@@ -193,6 +200,14 @@ class Framer:
             if len(self._window) > MOST_READ:
                 self._window = self._store[:MOST_READ]
         return True
+
+    def read_less(self) -> None:
+        """Take half as much a read: the last one had too many frames for one go.
+
+        As long as reads are filled; who has little to say is not held back.
+        """
+        self._most = max(LEAST_READ, min(len(self._window), MOST_READ) // 2)
+        self._window = self._store[: self._most]
 
     def cut(self) -> tuple[int, int, int] | None:
         """Return the next whole frame as id and place of its payload, or None for "more bytes".

@@ -37,6 +37,15 @@ __all__ = [
 ]
 
 
+MAX_BURST = 64
+"""Containers of one :class:`ResultBurst`: who takes it does so many at once, and nothing else."""
+
+
+MANY_EVENTS = 128
+"""Events of one read beyond which the next one takes fewer bytes: cutting frames and making messages
+of them is not to hold up other cameras."""
+
+
 class State(enum.Enum):
     """Where a link is."""
 
@@ -135,7 +144,7 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultBurst:
-    """Two or more result containers of one application, one right after the other.
+    """Result containers of one application, one right after the other; :data:`MAX_BURST` at most.
 
     The client's machine gives it for containers that came in one delivery, so that a camera that
     runs free costs no object for each. Iterating gives them one by one.
@@ -383,6 +392,8 @@ class Machine:
         cut = self._framer.filled(count)
         if cut:
             self._receive_frames()
+            if len(self._events) > MANY_EVENTS:
+                self._framer.read_less()
         return cut
 
     def receive_eof(self) -> None:
@@ -549,7 +560,10 @@ class Machine:
         if more:
             self.counters.frames_received += len(more)
             more.insert(0, first.data)
-            self._events[-1] = ResultBurst(application=first.application, data=more)
+            del self._events[-1]
+            for place in range(0, len(more), MAX_BURST):
+                some = more[place : place + MAX_BURST]
+                self._events.append(ResultBurst(application=first.application, data=some))
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
         """Whether the client shall see it: an answer that nothing asked for is counted only."""

@@ -1,0 +1,76 @@
+"""What the receive task sleeps on: a wake-up without a turn of the event loop.
+
+A future wakes its task by way of the event loop: a handle, another turn, another system call. For
+each delivery of bytes that costs more than all that is done with them. Who rings here from a
+callback of the loop, as a transport does, has the task go on at once. It is a task nevertheless:
+what it raises ends it, and never reaches who rang.
+
+This is what the event loop's own tasks and futures agree on (``_asyncio_future_blocking``), which
+other implementations of futures rest on, too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import contextvars
+    from collections.abc import Callable, Generator
+
+__all__ = ["Doorbell"]
+
+
+class Doorbell:
+    """One task may ``await`` it, again and again; :meth:`ring` has it go on.
+
+    Args:
+        loop: the loop of both.
+
+    Cancellation: safe; the task is woken by the loop.
+    """
+
+    __slots__ = ("_asyncio_future_blocking", "_context", "_loop", "_wake")
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._asyncio_future_blocking = False
+        self._wake: Callable[[Doorbell], None] | None = None  # None: nobody waits
+        self._context: contextvars.Context | None = None
+
+    def ring(self) -> None:
+        """Have the task go on: at once, or in the loop's next turn where another task rings."""
+        wake, context = self._wake, self._context
+        if wake is None or context is None:
+            return
+        self._wake = None
+        if asyncio.current_task(self._loop) is None:
+            context.run(wake, self)
+        else:
+            self._loop.call_soon(wake, self, context=context)
+
+    # ------------------------------------------------------------------ what a task asks of a future
+
+    def __await__(self) -> Generator[Doorbell, None, None]:
+        self._asyncio_future_blocking = True
+        yield self
+
+    def get_loop(self) -> asyncio.AbstractEventLoop:
+        """The loop that the task runs in."""
+        return self._loop
+
+    def add_done_callback(
+        self, wake: Callable[[Doorbell], None], *, context: contextvars.Context
+    ) -> None:
+        """The task sleeps now; ``wake`` has it go on."""
+        self._wake, self._context = wake, context
+
+    def cancel(self, msg: Any = None) -> bool:
+        """The task is being cancelled: it is woken, and then told."""
+        wake, self._wake = self._wake, None
+        if wake is not None:
+            self._loop.call_soon(wake, self, context=self._context)
+        return False
+
+    def result(self) -> None:
+        """Nothing comes with the ring."""
