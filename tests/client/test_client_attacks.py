@@ -32,7 +32,7 @@ SHORT = 0.05
 LONG = 30.0
 """Seconds of one that is not."""
 
-IDLE = 200
+IDLE = 100
 """Loop steps in which a client that has something to send without waiting sends it."""
 
 FRAMED = ("handbook", "thesis", "b16")
@@ -73,13 +73,12 @@ class Attack:
         """Wait until so many containers have come to the client."""
         await until(lambda: self.camera.statistics().received >= count)
 
-    async def sends_or_waits(self) -> None:
-        """Wait until the client has sent something more; or does not, and waits."""
-        before = self.box.writes
-        for _ in range(IDLE):
-            if self.box.writes > before:
-                return
+    async def rests(self) -> None:
+        """Wait until the client has sent all that it sends without hearing anything."""
+        steps, seen = 0, self.box.writes
+        while steps < IDLE:
             await asyncio.sleep(0)
+            steps, seen = (steps + 1 if seen == self.box.writes else 0), self.box.writes
 
     def run_of(self, result: Result) -> Run:
         """Return the run that a result is of."""
@@ -158,7 +157,7 @@ async def test_second_result_does_not_pay_what_the_next_trigger_owes(
         one.box.let_out()
         await one.heard(3)
         following = one.call()
-        await one.sends_or_waits()
+        await one.rests()
         one.box.towards.release()
         one.assert_own(await following)
         await one.works()
@@ -180,7 +179,7 @@ async def test_second_results_of_each_trigger_shift_nothing(dialect: str) -> Non
             one.box.let_out()
             await one.heard(received + 1)
             following = one.call()
-            await one.sends_or_waits()
+            await one.rests()
             one.box.towards.release()
             one.assert_own(await following)
         await one.works()
@@ -222,7 +221,7 @@ async def test_first_trigger_of_a_client_does_not_get_what_its_predecessor_left(
 
             box.before = before  # what is left comes while the trigger is on its way
             following = one.call()
-            await one.sends_or_waits()
+            await one.rests()
             if not box.takes_trigger:  # it waits for that
                 box.let_out()
             one.assert_own(await following)
@@ -246,7 +245,7 @@ async def test_sensors_result_does_not_pay_what_a_trigger_owes(
         one.box.sensor()
         await one.heard(2)
         following = one.call()
-        await one.sends_or_waits()
+        await one.rests()
         one.box.towards.release()
         one.assert_own(await following)
         await one.works()
@@ -295,10 +294,10 @@ async def shifted(
 ) -> bool:
     """Trigger, have what is on the line come one by one, say whether the result is another's."""
     call = call or one.call()
-    await one.sends_or_waits()
+    await one.rests()
     while not call.done() and not one.box.back.empty:
         one.box.back.pass_on()
-        await one.sends_or_waits()
+        await one.rests()
     if not call.done():
         one.box.back.release()
     run = one.run_of(await call)
@@ -391,10 +390,10 @@ async def test_trigger_behind_one_cancelled_right_after_its_sending_has_its_resu
         await one.triggered(2)
         await cancelled(given_up)
         following = one.call()
-        await one.sends_or_waits()
+        await one.rests()
         one.box.back.release()
         for _ in range(10):  # it may have more to ask meanwhile
-            await one.sends_or_waits()
+            await one.rests()
         one.box.let_out()
         one.assert_own(await following)
         await one.works()
@@ -436,7 +435,7 @@ async def test_bid_sensors_result_before_the_answer_to_a_trigger_is_not_ours(
         await ends(one, given_up)
         following = one.call()
         for _ in range(10):
-            await one.sends_or_waits()
+            await one.rests()
         box.let_out()
         box.sensor()
         one.assert_own(await following)
