@@ -38,7 +38,7 @@ import smartcam
 from smartcam import exceptions
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterable, Sequence
+    from collections.abc import Callable, Coroutine, Iterable, Sequence
 
     from line_camera import Run, Step
 
@@ -191,6 +191,7 @@ VARIANTS = (
     ),
     Variant(
         name="udp number",
+        share=0.4,
         transport="udp",
         number="int32",
         results=SEVERAL,
@@ -574,7 +575,7 @@ class Storm:
     async def _hear_the_rest(self, client: SmartCamera) -> None:
         """Have every container that was sent."""
         await self._calm()
-        while not self.camera.idle:
+        while not self.camera.idle:  # noqa: ASYNC110 - it is a matter of the line, too
             await asyncio.sleep(INSPECTION)
         with contextlib.suppress(exceptions.LinkError):
             await client.query_application()
@@ -626,7 +627,9 @@ async def storms(
 
 # ---------------------------------------------------------------------- the table
 
-COLUMNS = {
+COMMON = ("result", "TriggerTimeoutError", "cancelled", "OvertriggeredError")
+
+COLUMNS: dict[str, Callable[[Figures], object]] = {
     "calls": lambda one: one.calls,
     "results": lambda one: one.outcomes["result"],
     "timeouts": lambda one: one.outcomes["TriggerTimeoutError"],
@@ -647,7 +650,6 @@ COLUMNS = {
     "in a row": lambda one: one.longest,
     "seconds": lambda one: f"{one.seconds:.1f}",
 }
-COMMON = ("result", "TriggerTimeoutError", "cancelled", "OvertriggeredError")
 
 
 def table(done: Sequence[Figures]) -> str:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import adversary_storm
-import pytest
 from adversary_storm import VARIANTS
+
+if TYPE_CHECKING:
+    import pytest
 
 CALLS = 100
 SEED = 1
