@@ -350,10 +350,20 @@ class LineCamera:
         self._trigger(SENSOR, self.plan)
         self._flush()
 
-    def sensor_runs(self, count: int) -> None:
-        """A sensor triggers again and again, each time when the last run is over."""
-        for _ in range(count):
-            self._trigger(SENSOR, at_once)
+    def sensor_runs(self, count: int, *, shown: int = 1_200) -> None:
+        """A sensor triggers again and again, each time when the last run is over.
+
+        Args:
+            count: how often.
+            shown: the last ones, which are said; the others are counted on only.
+        """
+
+        def without_pauses(run: Run) -> Sequence[Step]:
+            return [(0.0, what) for _, what in self.plan(run)]
+
+        self._number = (self._number + max(0, count - shown)) & 0xFFFFFFFF
+        for _ in range(min(count, shown)):
+            self._trigger(SENSOR, without_pauses)
         self._flush()
 
     def let_out(self) -> None:
