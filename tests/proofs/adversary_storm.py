@@ -670,7 +670,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Storm of an adversary.")
     parser.add_argument("--triggers", type=int, default=5_000, help="calls per variant")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--at-once", type=int, default=6, help="variants side by side")
+    parser.add_argument("--at-once", type=int, default=40, help="variants side by side")
     parser.add_argument("--only", default="", help="variants with this in their name")
     options = parser.parse_args(arguments)
     variants = [one for one in VARIANTS if options.only in one.name]
