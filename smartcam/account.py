@@ -58,6 +58,7 @@ class Account:
         received: containers that came.
         empty_slots: all-zero records that interpreters skipped.
         extra_results: containers for a trigger that had its results already.
+        inspections_by_others: inspections that something else has triggered.
         overtriggers: times the Overtriggered bit rose.
         sessions: sessions made.
         last_error: text of the last error of a link.
@@ -70,6 +71,7 @@ class Account:
         self.received: int = 0
         self.empty_slots: int = 0
         self.extra_results: int = 0
+        self.inspections_by_others: int = 0
         self.overtriggers: int = 0
         self.sessions: int = 0
         self.last_error: str | None = None
@@ -77,6 +79,11 @@ class Account:
         self.processing: Times = Times()
         self._wire = Counters()  # of the links that are over
         self._open: Counters | None = None
+
+    def count(self, fate: str, containers: int = 1) -> None:
+        """Count containers with what became of them, in one step: the sum always holds."""
+        self.received += containers
+        self.fates[fate] += containers
 
     def begin(self, wire: Counters) -> None:
         """Count a session, and what goes over its link from now on."""
@@ -98,6 +105,7 @@ class Account:
             **wire,
             empty_slots=self.empty_slots,
             extra_results=self.extra_results,
+            inspections_by_others=self.inspections_by_others,
             overtriggers=self.overtriggers,
             sessions=self.sessions,
             reconnects=max(0, self.sessions - 1),

@@ -76,6 +76,8 @@ class Conversation:
         self.poll: StatusPoll | None = None  # where the status does not come by itself
         self.numbered: bool = False  # a trigger may be given a sequence number
         self.acknowledged: bool = False  # a trigger is answered
+        self.fences: bool = False  # a Query in front of a trigger tells what is older
+        self.confirms: bool = False  # a status behind its answer tells whether it was taken
         self.at_end: list[Callable[[], None]] = []  # called when there will be no session any more
 
     def begin(self, link: Link) -> None:
@@ -88,7 +90,12 @@ class Conversation:
         dialect = link.machine.dialect
         self.numbered = dialect.has(m.SetSequenceNumber)
         self.acknowledged = dialect.has(m.TriggerAnswer)
-        if not dialect.capabilities.status_by_itself:
+        by_itself = dialect.capabilities.status_by_itself
+        # who does one thing after the other needs neither
+        self.fences = self.ordered and not dialect.in_order
+        self.confirms = self.fences and self.acknowledged and not by_itself
+        self.inbox.on_held = self.ask_what_is_active
+        if not by_itself:
             self.poll = StatusPoll(link, self.inbox, self._patience)
             self.inbox.on_status_wanted = self.poll.wanted
             self.poll.wanted()
@@ -442,13 +449,23 @@ class Conversation:
         await self.await_owed(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline, due=self.due_after(deadline))
 
+    def expect_fence(self, sent_at: float, deadline: float) -> None:
+        """A Query went out in front of a trigger; its answer is owed, and nobody waits for it."""
+        self.inbox.fence_open = True
+        self._due[m.QueryAnswer] = max(deadline, sent_at + self._patience)
+
+    def owes(self, key: type[m.Message] | int) -> bool:
+        """Whether an answer of this kind is open."""
+        inbox = self.inbox
+        return key in inbox.answers or (key is m.QueryAnswer and inbox.fence_open)
+
     def due_after(self, deadline: float) -> float:
         """Return until when an answer may come that a trigger waits for, however short that is."""
         return max(deadline, asyncio.get_running_loop().time() + self._patience)
 
     def ask_for_life(self, due: float) -> bool:
         """Send a Query unless one is open; its answer is owed until ``due`` (loop time)."""
-        if m.QueryAnswer in self.inbox.answers:
+        if self.owes(m.QueryAnswer):
             return False
         link = self.require_link()
         if self.poll is not None:
@@ -598,6 +615,8 @@ class Conversation:
         Raises:
             ResponseTimeoutError: it did not come; the link is given up if its own time is over too.
         """
+        if self.owes(key) and key not in self.inbox.answers:
+            self.inbox.next_answer(key)  # to the Query in front of a trigger
         while (owed := self.inbox.answers.get(key)) is not None:
             try:
                 await self._take_answer(owed, deadline)

@@ -49,7 +49,7 @@ class Doorbell:
         else:
             self._loop.call_soon(wake, self, context=context)
 
-    # ------------------------------------------------------------------ what a task asks of a future
+    # ------------------------------------------------------------------ for the task's machinery
 
     def __await__(self) -> Generator[Doorbell, None, None]:
         self._asyncio_future_blocking = True

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, cast
 
 from smartcam.account import Account
-from smartcam.attribution import Attribution, PendingTrigger
+from smartcam.attribution import Attribution, PendingTrigger, Verdict
 from smartcam.exceptions import (
     CameraFaultError,
     ConnectionClosedError,
@@ -35,7 +35,7 @@ from smartcam.models import (
     StatusChanged,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Verdict
+from smartcam.protocols.base import Verdict as CodeVerdict
 from smartcam.protocols.machine import ResultBurst
 from smartcam.streams import Subscribers
 
@@ -101,30 +101,39 @@ class Inbox:
         self.status_streams: Subscribers[Status] = Subscribers()
         self.event_streams: Subscribers[CameraEvent] = Subscribers()
         self.account: Account = Account()
+        self.fence_open: bool = False  # the Query in front of the last trigger is not answered
         self.statuses_heard: int = 0
         self.on_status_wanted: Callable[[], None] | None = None  # where it has to be asked for
+        self.on_held: Callable[[], None] | None = None  # have a Query answered
+        # containers of which it is not known yet whether they are the trigger's
+        self._held: list[tuple[m.ResultContainer, float, datetime]] = []
         self._dialect: Dialect | None = None
         self._observers = observers
+        self._observed = bool(observers)
         self._status_waiters: list[_StatusWaiter] = []
         self._asked_at: dict[object, float] = {}
         self.active_in_doubt: bool = False  # somebody else loaded an application
         self.loads_by_others: int = 0
         self._heard_status = False  # in this session
         self._loaded_by_us = False
-        self._warned_extra = False
+        self._warned_extra = self._warned_others = False
+        self._lossy = False  # a message may come twice, or not
         self._takers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
             m.StatusReport: self._on_status,
             m.ResultContainer: self._on_result,
             ResultBurst: self._on_burst,
             m.QueryAnswer: self._on_active,
             m.SwitchAnswer: self._on_switched,
+            m.TriggerAnswer: self._on_trigger_answer,
         }
 
     def begin(self, dialect: Dialect, *, ordered: bool) -> None:
         """A new session; ``ordered`` where messages come in order and none is lost (TCP)."""
         self.end = None
         self._dialect = dialect
-        self._heard_status = self._warned_extra = self.active_in_doubt = False
+        self._heard_status = self.active_in_doubt = self.fence_open = False
+        self._warned_extra = self._warned_others = False
+        self._lossy = not ordered
         # where the status has to be asked for, changes of it are missed
         complete = ordered and dialect.capabilities.status_by_itself
         self.attribution.begin_session(ordered=complete)
@@ -154,6 +163,7 @@ class Inbox:
             answer.set_result(error)
         self.answers.clear()
         self._asked_at.clear()
+        self.fence_open = False
         waiting: list[asyncio.Future[Any]] = [*self.next_results]
         waiting += [waiter.outcome for waiter in self._status_waiters]
         pending = self.attribution.pending
@@ -165,6 +175,7 @@ class Inbox:
                 future.set_exception(error)
         self.next_results.clear()
         self._status_waiters.clear()
+        self.release_held()
 
     def finish(self) -> None:
         """Nothing more will come: end the streams, quietly if it was us who closed."""
@@ -253,23 +264,32 @@ class Inbox:
                 self.account.round_trip.add(now - asked_at)
             future.set_result(message)
 
-    def _verdict(self, code: int) -> Verdict:
-        return Verdict.DONE if self._dialect is None else self._dialect.code(code).verdict
+    def _verdict(self, code: int) -> CodeVerdict:
+        return CodeVerdict.DONE if self._dialect is None else self._dialect.code(code).verdict
 
     def _on_active(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
-        if self._verdict(answer.code) is Verdict.DONE:
+        if self.fence_open:
+            self.fence_open = False
+            self.attribution.on_fence(int(self.status or 0))
+        elif self._held:
+            self.attribution.on_answer_to_query()
+            self.release_held()
+        if answer.application != self.active and self._verdict(answer.code) is CodeVerdict.DONE:
             self.set_active(answer.application, at)
 
     def _on_switched(self, answer: m.SwitchAnswer, now: float, at: datetime) -> None:
         verdict = self._verdict(answer.code)
-        if verdict is Verdict.DONE:
+        if verdict is CodeVerdict.DONE:
             self.expected = answer.application
             self.input_in_doubt = False
             self._loaded_by_us = True
             self.attribution.settled()
         known = self._dialect is None or answer.application in self._dialect.application_ids
-        if verdict is Verdict.DONE or known:  # too busy, or too short, to say
+        if verdict is CodeVerdict.DONE or known:  # too busy, or too short, to say
             self.set_active(answer.application, at)
+
+    def _on_trigger_answer(self, answer: m.TriggerAnswer, now: float, at: datetime) -> None:
+        self.attribution.on_answer()
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         before, status = self.status, report.status
@@ -282,7 +302,13 @@ class Inbox:
             self._note_changes(risen, fallen)
         if risen & _FAILING or fallen & _RUNNING:
             self._fail_trigger(risen, fallen)
-        self.attribution.on_status(was, bits)
+        if self.attribution.on_status(was, bits):
+            self._note_others()
+        if self._held:
+            self.release_held()
+        pending = self.attribution.pending
+        if pending is not None and pending.results:
+            self._complete(now)
         self._note_loading(was, bits)
         if status != before and self._is_watched:
             self.publish(StatusChanged(camera=self.name, at=at, status=status, previous=before))
@@ -300,7 +326,7 @@ class Inbox:
     @property
     def _is_watched(self) -> bool:
         """Whether anybody would see an event."""
-        watched = bool(self.event_streams) or bool(self._observers)
+        watched = bool(self.event_streams) or self._observed
         return watched or logger.isEnabledFor(logging.DEBUG)
 
     def _note_loading(self, was: int | None, bits: int) -> None:
@@ -359,8 +385,7 @@ class Inbox:
         self.set_active(burst.application, at)
         count = len(burst.data)
         account = self.account
-        account.received += count
-        account.fates["streamed"] += count
+        account.count("streamed", count)
         if self.attribution.satisfied:
             self._note_extra(count)
         for stream in self.result_streams:
@@ -373,7 +398,7 @@ class Inbox:
         what cannot be interpreted is an item of its own.
         """
         application = burst.application
-        if not self.attribution.quiet or self.next_results or self._observers:
+        if not self.attribution.quiet or self.next_results or self._observed:
             return None
         if self.expected not in {None, application} or not self._listening():
             return None
@@ -391,9 +416,21 @@ class Inbox:
             for number, data, value in zip(numbers, burst.data, values, strict=False)
         ]
 
-    def _on_result(self, container: m.ResultContainer, now: float, at: datetime) -> None:
+    def release_held(self) -> None:
+        """Give the containers their fate of which it was not known whether they are the trigger's.
+
+        They are, if nothing of it was seen to begin since; what came before that is older.
+        """
+        held, self._held = self._held, []
+        pending = self.attribution.pending
+        older = pending is None or pending.outcome.done() or pending.run.begun
+        for container, now, at in held:
+            self._on_result(container, now, at, older=older)
+
+    def _on_result(
+        self, container: m.ResultContainer, now: float, at: datetime, *, older: bool = False
+    ) -> None:
         account, attribution = self.account, self.attribution
-        account.received += 1
         if container.application < 0:  # a quirk: it does not say whose it is
             active = m.UNNAMED_APPLICATION if self.active is None else self.active
             container = replace(container, application=active)
@@ -406,14 +443,26 @@ class Inbox:
         if self.active != container.application:
             self.set_active(container.application, at)
         if expected is not None and container.application != expected:
-            account.fates["wrong_application"] += 1
+            account.count("wrong_application")
             if pending is not None:
                 attribution.give_up(pending)  # ours may still come
                 pending.outcome.set_exception(self._wrong_application(container, expected))
             return
         numbering = attribution.numbering
         number = numbering.number(container, self.endian) if numbering is not None else None
-        verdict = attribution.judge(number)
+        verdict = attribution.judge_other(number) if older else attribution.judge(number)
+        if verdict.fate == "held":
+            if (
+                self.on_held is not None
+                and pending is not None
+                and len(self._held) < pending.wanted
+            ):
+                self._held.append((container, now, at))
+                self.on_held()
+                return
+            verdict = attribution.judge_other(number)
+        if self._lossy and verdict.fate == "triggered" and self._is_double(container, pending):
+            verdict = Verdict("nobody", extra=True)
         if verdict.extra:
             self._note_extra()
         owner = pending if verdict.fate == "triggered" else None
@@ -424,16 +473,21 @@ class Inbox:
             if fate == "nobody":
                 fate = "streamed" if listening else "unclaimed"
             if not listening:
-                account.fates[fate] += 1
+                account.count(fate)
                 return
         try:
             result = self._interpret(container, owner, now, at)
         except InterpretationError as error:
-            account.fates["late" if fate == "late" else "uninterpretable"] += 1
+            account.count("late" if fate == "late" else "uninterpretable")
             self._deliver_error(error, owner, number, now, current=current)
         else:
-            account.fates[fate] += 1
+            account.count(fate)
             self._deliver(result, owner, now, current=current)
+
+    def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
+        """Whether it is a datagram that came twice, as far as can be told: one like it is there."""
+        results = pending.results if pending is not None else []
+        return any(one.raw == container.data for one in results)
 
     def _note_extra(self, count: int = 1) -> None:
         self.account.extra_results += count
@@ -445,6 +499,12 @@ class Inbox:
                 self.name,
             )
 
+    def _note_others(self) -> None:
+        self.account.inspections_by_others += 1
+        if not self._warned_others:
+            self._warned_others = True
+            logger.warning("%s ! something else triggers the camera, too", self.name)
+
     def _listening(self) -> bool:
         return any(not stream.ended for stream in self.result_streams) or any(
             not future.done() for future in self.next_results
@@ -454,7 +514,7 @@ class Inbox:
         self, container: m.ResultContainer, owner: PendingTrigger | None, now: float, at: datetime
     ) -> Result:
         interpretation = owner.interpretation if owner is not None else self.interpretation
-        number = self.account.received
+        number = self.account.received + 1
         value, sequence, empty_slots = interpretation(
             container, self.endian, camera=self.name, number=number, at=at
         )
@@ -475,7 +535,7 @@ class Inbox:
         self, result: Result, owner: PendingTrigger | None, now: float, *, current: bool
     ) -> None:
         """Hand a result on; ``current`` where it is not known to be an older trigger's."""
-        if self._observers:
+        if self._observed:
             self._observers.result(result)
         for stream in self.result_streams:
             stream.offer(result, now)
@@ -484,11 +544,19 @@ class Inbox:
                 future.set_result(result)
         if owner is not None:
             owner.results.append(result)
-            if len(owner.results) == owner.wanted:
-                self._end_input_doubt(owner)
-                self.account.processing.add(now - owner.sent_at)
-                self.attribution.done(owner)
-                owner.outcome.set_result(owner.results)
+            self._complete(now)
+
+    def _complete(self, now: float) -> None:
+        """End the trigger under way if it has all its results, and nothing speaks against it."""
+        owner = self.attribution.pending
+        if owner is None or len(owner.results) < owner.wanted or not owner.run.confirmed:
+            return
+        if owner.outcome.done():
+            return
+        self._end_input_doubt(owner)
+        self.account.processing.add(now - owner.sent_at)
+        self.attribution.done(owner)
+        owner.outcome.set_result(owner.results)
 
     def _deliver_error(
         self,

@@ -405,6 +405,9 @@ class Statistics:
         empty_slots: all-zero records skipped by interpreters.
         extra_results: containers that came for a trigger which had its results already; they are
             counted as streamed or unclaimed too.
+        inspections_by_others: inspections that something else has triggered, a sensor or a person:
+            Waiting for Trigger went away, and not at a trigger of ours. Told over TCP where the
+            status comes by itself.
         overtriggers: times the Overtriggered bit rose.
         sessions: sessions made.
         reconnects: sessions made after the first.
@@ -432,6 +435,7 @@ class Statistics:
     unclaimed: int = 0
     empty_slots: int = 0
     extra_results: int = 0
+    inspections_by_others: int = 0
     overtriggers: int = 0
     sessions: int = 0
     reconnects: int = 0

@@ -1,8 +1,9 @@
 """The life of a client: sessions, one after the other, and what happens between them.
 
 One task per client, the library's only bare ``create_task``. It makes a session, has the receive
-task read its link to the end, tells everybody that it is over, and by the :class:`~smartcam.backoff.Backoff` makes the
-next. When the camera was lost again soon after a reconnect another client has it: then it stops.
+task read its link to the end, tells everybody that it is over, and by the
+:class:`~smartcam.backoff.Backoff` makes the next. When the camera was lost again soon after a
+reconnect another client has it: then it stops.
 """
 
 from __future__ import annotations

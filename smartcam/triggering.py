@@ -1,7 +1,7 @@
 """Triggers: from the camera's readiness to the results, or to the reason why there are none.
 
-What is left over from earlier triggers is settled first, so that no late result passes for the next
-one's (:mod:`smartcam.attribution`).
+What is left over from earlier triggers is settled first, and a fence goes out in front of each, so
+that no older result passes for the next one's (:mod:`smartcam.attribution`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.alarm import Alarm
-from smartcam.attribution import PendingTrigger
+from smartcam.attribution import PendingTrigger, Run
 from smartcam.conversation import is_ready
 from smartcam.exceptions import (
     CameraBusyError,
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 __all__ = ["TriggerRequest", "Triggers"]
 
 _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
+_SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
 _SPEAKS_AGAINST = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
 )  # of these Waiting alone is to be set before a trigger
@@ -56,6 +57,9 @@ OVERTRIGGERED_GRACE = 1.0
 cannot tell that ours was dropped; a camera on which it stays set must not stop the line."""
 
 _WHY_READY = "; it does not while it inspects, and an application that runs free never does"
+
+
+_FENCE, _TRIGGER = m.Query(), m.Trigger()
 
 
 class TriggerRequest(NamedTuple):
@@ -134,10 +138,12 @@ class Triggers:
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
-        attribution, loop = self.inbox.attribution, self._talk.loop or asyncio.get_running_loop()
-        if self._talk.poll is not None:
-            await self._talk.refresh_status(deadline)
+        talk, attribution = self._talk, self.inbox.attribution
+        if talk.poll is not None:
+            await talk.refresh_status(deadline)
+            attribution.heard()
         self._raise_fault()
+        cleared = False
         if request.input_data is not None and self.inbox.input_in_doubt:
             raise InputContainerError(
                 f"{self.name}: input data of an earlier trigger, which had no result, may still be "
@@ -146,42 +152,55 @@ class Triggers:
             )
         if self.inbox.expected is not None and self.inbox.active != self.inbox.expected:
             await self._check_application(deadline)
-        if self._doubtful is not None and self._doubtful is self._talk.link:
-            await self._talk.ask_for_status(deadline)
-            await self._talk.fence(deadline)  # it has come by then, or is lost again
+        if self._doubtful is not None and self._doubtful is talk.link:
+            await talk.ask_for_status(deadline)
+            await talk.fence(deadline)  # it has come by then, or is lost again
             self._doubtful = None
+            attribution.heard()
         interpretation = request.interpretation
-        numbering = interpretation.numbering(self.inbox.active) if self._talk.numbered else None
+        numbering = interpretation.numbering(self.inbox.active) if talk.numbered else None
         # an older result shows by its number where each container has one
         decided = numbering is not None and numbering.always
-        if self._talk.halted or (attribution.debt is not None and not decided):
-            await self._settle_debt(deadline, wait=request.wait)
-        if int(self._talk.status) & _SPEAKS_AGAINST != _WAITING:
-            await self._wait_for_trigger(deadline, wait=request.wait)
-        if int(self._talk.status) & _OVERTRIGGERED:
-            await self._clear_overtriggered(deadline)
-            await self._wait_for_trigger(deadline, wait=request.wait)
-        while attribution.unsettled and not decided and self._talk.ordered:
-            await self._settle_others(deadline)
-            await self._wait_for_trigger(deadline, wait=request.wait)
+        if attribution.doubted:  # the trigger before may not show in the status yet
+            await talk.fence(deadline)
+            attribution.heard()
+        if talk.halted_at is not None or attribution.debt is not None:
+            await self._settle_debt(deadline, wait=request.wait, decided=decided)
+        while True:
+            status = int(talk.status)
+            if status & _SPEAKS_AGAINST != _WAITING:
+                await self._wait_for_trigger(deadline, wait=request.wait)
+            elif status & _OVERTRIGGERED and not cleared:
+                cleared = True
+                await self._clear_overtriggered(deadline)
+            elif talk.fences and talk.owes(m.QueryAnswer):  # one can be open
+                await talk.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+            else:
+                break
+        number, certain = None, False
+        if numbering is not None:
+            number, certain = attribution.take_number(numbering.highest)
+        fenced = talk.fences and not (certain and decided)
+        loop = talk.loop or asyncio.get_running_loop()
         pending = PendingTrigger(
             loop.create_future(),
-            request.interpretation,
+            interpretation,
             request.input_data is not None,
             loop.time(),
             datetime.now(UTC),
-            wanted=request.results,
-            number=attribution.take_number(numbering.highest) if numbering is not None else None,
+            request.results,
+            number,
             # where each application has its own interpreter none is read with another's layout
-            application=None if request.interpretation.by_application else self.inbox.active,
+            None if interpretation.by_application else self.inbox.active,
+            Run(reached=not fenced, confirmed=not talk.confirms),
         )
-        return await self._await_results(pending, request.input_data, deadline)
+        return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
 
     async def _await_results(
-        self, pending: PendingTrigger, input_data: bytes | None, deadline: float
+        self, pending: PendingTrigger, input_data: bytes | None, deadline: float, *, fenced: bool
     ) -> list[Result]:
         inbox, outcome, link = self.inbox, pending.outcome, self._talk.require_link()
-        words: list[m.Message] = []
+        words: list[m.Message] = [_FENCE] if fenced else []
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
         if self._talk.acknowledged:
@@ -189,12 +208,16 @@ class Triggers:
         if input_data is not None and link.machine.dialect.answers(m.SetInput):
             due = self._talk.due_after(deadline)
             await self._talk.command(m.SetInput(data=input_data), deadline, due=due)
+            if fenced and self._talk.owes(m.QueryAnswer):
+                await self._talk.await_owed(m.QueryAnswer, _TRIGGER, deadline)
         elif input_data is not None:
             words.append(m.SetInput(data=input_data))
         inbox.attribution.send(pending)
         self._alarm.set(deadline)
         try:
-            link.send(*words, m.Trigger())
+            link.send(*words, _TRIGGER)
+            if fenced:
+                self._talk.expect_fence(pending.sent_at, deadline)
             if self._talk.acknowledged:
                 self._expect_acknowledgement(pending, deadline)
             else:
@@ -209,13 +232,14 @@ class Triggers:
         except TimeoutError as exc:
             inbox.attribution.give_up(pending)
             # it may have been stopped: then Waiting did not drop for this trigger
-            certain = self._talk.ordered or pending.dropped_waiting
+            certain = self._talk.ordered or pending.run.begun
             self._doubtful = None if certain else link
             waited = max(0.0, deadline - pending.sent_at)
             came = f"{len(pending.results)} of {pending.wanted} results"
             raise TriggerTimeoutError(
                 f"{self.name}: {came if pending.results else 'no result'} within "
-                f"{round(waited, 2):g} s of the trigger; status: {self._talk.status}",
+                f"{round(waited, 2):g} s of the trigger; status: {self._talk.status}"
+                f"{_told_of_fence(pending)}",
                 waited=waited,
             ) from exc
         except asyncio.CancelledError:
@@ -227,6 +251,7 @@ class Triggers:
         finally:
             self._alarm.clear()
             inbox.attribution.pending = None
+            inbox.release_held()
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
         """Have the trigger end at once where the camera says that it took none."""
@@ -300,23 +325,26 @@ class Triggers:
                 ) from exc
 
     def _raise_fault(self) -> None:
-        if Status.SYSTEM_ERROR in self._talk.status:
+        if int(self._talk.status) & _SYSTEM_ERROR:
             raise CameraFaultError(f"{self.name}: the camera reports System Error")
 
-    async def _settle_debt(self, deadline: float, *, wait: bool) -> None:
-        """Await the result of an earlier trigger, or make it impossible.
+    async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:
+        """Await the result of an earlier trigger, or make it impossible, unless a number decides.
 
         Stop voids the inspection under way, a Query is the fence: what comes before its answer
         came from before. Without a Stop the inspection's end is awaited: the camera waits for a
         trigger again. A camera that does one thing after the other needs the fence only.
         Source: that Stop voids the inspection is inferred.
         """
+        attribution = self.inbox.attribution
+        if not self._talk.halted and (decided or attribution.debt is None):
+            return
         if self._talk.dialect.in_order or not self._talk.dialect.has(m.Stop):
             await self._wait_for_trigger(deadline, wait=wait)
             await self._talk.fence(deadline)
-            self.inbox.attribution.settled()
+            attribution.settled()
             return
-        attribution, now = self.inbox.attribution, asyncio.get_running_loop().time()
+        now = asyncio.get_running_loop().time()
         if not self._talk.halted and Status.RUNNING in self._talk.status:
             grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
             with contextlib.suppress(TimeoutError):
@@ -346,19 +374,21 @@ class Triggers:
         with contextlib.suppress(TimeoutError):
             await self.inbox.wait_status(_is_not_overtriggered, grace)
 
-    async def _settle_others(self, deadline: float) -> None:
-        """Have heard the result of an inspection that somebody else triggered."""
-        attribution = self.inbox.attribution
-        attribution.unsettled = False  # the next one may begin meanwhile
-        try:
-            await self._talk.fence(deadline)
-        except BaseException:
-            attribution.unsettled = True
-            raise
-
 
 def _is_not_overtriggered(status: Status) -> bool:
     return Status.OVERTRIGGERED not in status
+
+
+def _told_of_fence(pending: PendingTrigger) -> str:
+    """Return what an error text says of the fence, and of containers that came before it."""
+    if not pending.run.reached:
+        return "; the question in front of the trigger was not answered"
+    if not pending.run.confirmed:
+        return "; no status came that tells whether the trigger was taken"
+    if pending.early:
+        what = "result came" if pending.early == 1 else "results came"
+        return f"; {pending.early} {what} before the trigger had reached the camera, from before it"
+    return ""
 
 
 def _is_decided(status: Status) -> bool:

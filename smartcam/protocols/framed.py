@@ -308,9 +308,9 @@ class FramedDialect(Dialect):
     _answers: dict[int, int | None] = field(
         init=False, repr=False, default_factory=dict[int, int | None]
     )
-    # whole frames of the messages that have no body
-    _constant: dict[type[Message], bytes] = field(
-        init=False, repr=False, default_factory=dict[type[Message], bytes]
+    # of the messages that have no body: whole frame, id, id of the answer
+    constant: dict[type[Message], tuple[bytes, int, int | None]] = field(
+        init=False, repr=False, default_factory=dict[type[Message], Any]
     )
     _variants: dict[tuple[str, ...], FramedDialect] = field(
         init=False, repr=False, default_factory=dict[tuple[str, ...], Any]
@@ -321,12 +321,14 @@ class FramedDialect(Dialect):
             codec = Codec(row, self)
             self._encoders[row.type] = codec
             self._decoders[row.type.sender, row.message_id] = codec
-            if not row.fields:
-                self._constant[row.type] = self.encode(row.type())
         for row in self.table:
             if issubclass(row.type, Request):
                 answer = self._encoders.get(row.type.answer) if row.type.answer else None
                 self._answers[row.message_id] = None if answer is None else answer.message_id
+        for row in self.table:
+            if not row.fields:
+                frame = self.encode(row.type())
+                self.constant[row.type] = frame, row.message_id, self.answer_id(row.message_id)
 
     @property
     def quirks(self) -> tuple[str, ...]:
@@ -523,8 +525,8 @@ class FramedDialect(Dialect):
 
     def encode(self, message: Message) -> bytes:
         """Return a message's bytes on the wire; raises as :meth:`to_frame`."""
-        constant = self._constant.get(type(message))
-        return self.encode_frame(self.to_frame(message)) if constant is None else constant
+        constant = self.constant.get(type(message))
+        return self.encode_frame(self.to_frame(message)) if constant is None else constant[0]
 
     def surplus(self, sender: Sender, frame: Frame) -> int:
         """Return how many bytes a known message's body is longer than documented."""

@@ -42,8 +42,8 @@ MAX_BURST = 64
 
 
 MANY_EVENTS = 128
-"""Events of one read beyond which the next one takes fewer bytes: cutting frames and making messages
-of them is not to hold up other cameras."""
+"""Events of one read beyond which the next one takes fewer bytes: cutting frames, and making
+messages of them, must not hold up other cameras."""
 
 
 class State(enum.Enum):
@@ -429,9 +429,16 @@ class Machine:
                 f"{type(message).__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        data = self.dialect.encode(message)
-        message_id = self.dialect.message_id(message)
-        owed = self._answer_id(message_id, answered)
+        constant = self.dialect.constant.get(type(message))
+        if constant is not None:
+            data, message_id, owed = constant
+        else:
+            data, message_id = self.dialect.encode(message), self.dialect.message_id(message)
+            owed = self.dialect.answer_id(message_id)
+        if self.role is Role.CAMERA or answered is False:
+            owed = None
+        elif answered:
+            owed = message_id
         if owed in self._open:
             raise LocalProtocolError(
                 f"an answer to message {message_id:#04x} is still owed; one request of an id "
@@ -453,12 +460,6 @@ class Machine:
         return outbox
 
     # ------------------------------------------------------------------ inside
-
-    def _answer_id(self, request_id: int, answered: bool | None) -> int | None:
-        if self.role is Role.CAMERA or answered is False:
-            return None
-        answer_id = self.dialect.answer_id(request_id)
-        return request_id if answered else answer_id
 
     def _receive_frames(self) -> None:
         framer = self._framer

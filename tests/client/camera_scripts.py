@@ -66,3 +66,9 @@ async def lose_and_come_back(box: HandmadeCamera, camera: SmartCamera) -> None:
     box.hang_up()
     await until(lambda: camera.statistics().sessions > sessions)
     await camera.wait_connected(SOON)
+
+
+def only(times: int, answer: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """Return what answers so many times as before, and then no more."""
+    left = iter(range(times))
+    return lambda payload: b"" if next(left, None) is None else answer(payload)

@@ -276,6 +276,7 @@ async def test_trigger_takes_its_own_from_the_middle_of_bursts(*, together: bool
         box.script[TRIGGER] = lambda _: b""
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER, 2)
+        await until(lambda: not camera._inbox.fence_open)
         older, own, extra = numbered(box, 2, 1), numbered(box, 1, 100), numbered(box, 3, 200)
         frames = [*older, box.status_frame(RUNNING), *own, *extra, box.status_frame(READY)]
         await say(camera, box, *frames, together=together)
@@ -314,8 +315,9 @@ async def test_triggers_of_several_results_take_as_many_of_a_burst(*, together: 
         box.script[TRIGGER] = lambda _: b""
         triggering = asyncio.create_task(camera.trigger(results_per_trigger=3))
         await box.wait_for(TRIGGER)
+        await until(lambda: not camera._inbox.fence_open)
         results = camera.results()
-        await say(camera, box, *numbered(box, 5), together=together)
+        await say(camera, box, box.status_frame(RUNNING), *numbered(box, 5), together=together)
         own = await triggering
         assert [one.number for one in own] == [1, 2, 3]
         assert (await queued(results))[:3] == own
@@ -487,15 +489,16 @@ async def test_deadline_and_cancellation_in_one_turn_of_the_loop_are_one_end(fir
         await box.wait_for(TRIGGER)
         expire = camera._triggers._expire
 
-        def at_once() -> None:
+        def at_once(cancel: Callable[[], object]) -> None:
             if first == "deadline":
                 expire()
             if first == "result":
-                hear(camera, box.result_frame())
-            triggering.cancel()
+                own = box.status_frame(RUNNING) + box.result_frame() + box.status_frame(READY)
+                hear(camera, own)
+            cancel()
             expire()
 
-        asyncio.get_running_loop().call_soon(at_once)
+        asyncio.get_running_loop().call_soon(at_once, triggering.cancel)
         await asyncio.wait({triggering})
         assert triggering.cancelled()
         del triggering
@@ -517,8 +520,8 @@ async def test_trigger_whose_deadline_passes_while_the_camera_takes_no_bytes_end
         assert isinstance(error, TriggerTimeoutError)
         assert error.waited == pytest.approx(SHORT, abs=0.02)
         assert camera._inbox.attribution.pending is None
-        await say(camera, box, box.result_frame(b"late"), together=True)
-        assert fates(camera) == {"late": 1}
+        await say(camera, box, box.result_frame(b"older"), together=True)
+        assert fates(camera) == {"streamed": 1}  # the trigger has not reached the camera
         assert len(await queued(results)) == 1
         del error
         gc.collect()
@@ -535,8 +538,8 @@ async def test_deadline_then_cancellation_of_a_trigger_that_is_stuck_are_one_end
         await cancelled(triggering)
         del triggering
         gc.collect()
-        await say(camera, box, box.result_frame(b"late"), together=True)
-        assert fates(camera) == {"late": 1}
+        await say(camera, box, box.result_frame(b"older"), together=True)
+        assert fates(camera) == {"unclaimed": 1}  # the trigger has not reached the camera
 
 
 async def test_closed_client_leaves_no_timer_of_a_trigger() -> None:

@@ -19,6 +19,7 @@ from camera_by_hand import (
     RUNNING,
     TRIGGER,
     HandmadeCamera,
+    words,
 )
 from clientkit import SHORT, balance, by_hand, steps, until
 
@@ -191,7 +192,8 @@ async def test_image_sized_answer_pays_no_idle_wait(monkeypatch: pytest.MonkeyPa
         box.script[TRIGGER] = lambda _: sent
         before = sum(work.sizes)
         triggering = asyncio.create_task(camera.trigger(timeout=60))
-        await until(lambda: sum(work.sizes) == before + len(sent))
+        answer = box.frame(QUERY, words(box.active))  # to the question in front of the trigger
+        await until(lambda: sum(work.sizes) == before + len(answer) + len(sent))
         loop = asyncio.get_running_loop()
         now = loop.time()
         with monkeypatch.context() as standing:

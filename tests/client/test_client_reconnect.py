@@ -317,7 +317,7 @@ async def test_everything_is_counted_over_all_sessions() -> None:
         assert statistics.triggered == 3
         assert statistics.frames_sent == len(box.received)
         assert statistics.bytes_sent == sum(12 + len(payload) for _, payload in box.received)
-        assert statistics.frames_received == 4 * 3 + 3 * 3  # three at Connect, three at a trigger
+        assert statistics.frames_received == 4 * 3 + 3 * 4  # three at Connect, four at a trigger
         assert statistics.processing.count == 3
         assert "closed the connection" in str(statistics.last_error)
         balance(statistics)
@@ -328,7 +328,7 @@ async def test_statistics_stay_during_an_outage_and_after_the_end() -> None:
         await camera.trigger()
         await lose(box, camera)
         before = camera.statistics()
-        assert (before.triggered, before.frames_sent) == (1, 4)
+        assert (before.triggered, before.frames_sent) == (1, 5)
         await camera.close()
         assert dataclasses.replace(camera.statistics(), subscribers=[]) == before
 

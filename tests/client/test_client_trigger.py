@@ -26,6 +26,7 @@ from camera_by_hand import (
     WAITING,
     HandmadeCamera,
 )
+from camera_scripts import only
 from clientkit import SHORT, balance, by_hand, cancelled, emulated, gone, steps, until
 
 import smartcam
@@ -49,6 +50,7 @@ from smartcam import (
 from smartcam.connection import Chunk
 from smartcam.protocols import messages as m
 
+BEGUN = m.StatusReport(status=Status.RUNNING, endian=0)
 ECHO = {
     "id": 5,
     "layout": "part: int32",
@@ -363,7 +365,7 @@ async def test_triggers_with_input_at_once_get_their_own_results() -> None:
         )
         assert [result.value.part for result in results] == list(range(8))
         sent = [entry.message_id for entry in emulator.log if entry.direction == "in"]
-        assert sent[-16:] == [INPUT, TRIGGER] * 8
+        assert sent[-24:] == [QUERY, INPUT, TRIGGER] * 8
 
 
 async def test_trigger_with_one_container_too_many_raises() -> None:
@@ -430,7 +432,7 @@ async def test_trigger_cancelled_owes_a_result_that_the_next_one_never_gets() ->
         box.script[STOP] = lambda _: box.result_frame(b"late") + box.status_frame(0)
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"found"
-        assert box.since(mark) == [STOP, QUERY, START, TRIGGER]
+        assert box.since(mark) == [QUERY, STOP, QUERY, START, QUERY, TRIGGER]
         statistics = camera.statistics()
         assert (statistics.late, statistics.triggered) == (1, 1)
 
@@ -443,10 +445,10 @@ async def test_trigger_timed_out_owes_a_result_that_the_next_one_never_gets() ->
         box.send(box.result_frame(b"late"))
         late = await anext(results)
         assert (late.raw, late.triggered_at) == (b"late", None)
-        box.script[TRIGGER] = lambda _: box.result_frame(b"ours")
+        box.script[TRIGGER], box.container = box._trigger, b"ours"
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"ours"
-        assert box.since(mark) == [TRIGGER]  # the debt was paid
+        assert box.since(mark) == [QUERY, QUERY, TRIGGER]  # the debt was paid
         assert camera.statistics().late == 1
 
 
@@ -472,7 +474,7 @@ async def test_trigger_cancelled_at_the_emulator_is_voided_by_the_next() -> None
         clock.advance(0.05)
         assert (await following).raw.startswith(b"Hello World")
         sent = [entry.message_id for entry in emulator.log if entry.direction == "in"]
-        assert sent[-5:] == [TRIGGER, STOP, QUERY, START, TRIGGER]
+        assert sent[-7:] == [QUERY, TRIGGER, STOP, QUERY, START, QUERY, TRIGGER]
         statistics = camera.statistics()
         assert (statistics.received, statistics.triggered) == (1, 1)
 
@@ -488,7 +490,7 @@ async def test_debt_of_a_stopped_application_is_forgotten() -> None:
         await camera.start()
         mark = len(box.ids)
         await camera.trigger()
-        assert box.since(mark) == [TRIGGER]
+        assert box.since(mark) == [QUERY, TRIGGER]
 
 
 async def test_debt_is_paid_by_a_switch() -> None:
@@ -499,17 +501,18 @@ async def test_debt_is_paid_by_a_switch() -> None:
         await camera.switch_application(3)
         mark = len(box.ids)
         assert (await camera.trigger()).application == 3
-        assert box.since(mark) == [TRIGGER]
+        assert box.since(mark) == [QUERY, TRIGGER]
 
 
 @pytest.mark.parametrize("phase", [STOP, QUERY, START])
 async def test_fence_cancelled_half_way_is_put_up_again(phase: int) -> None:
     async with by_hand() as (box, camera):
         script = dict(box.script)
-        box.script |= {TRIGGER: quiet, phase: quiet}
+        box.script |= {TRIGGER: quiet}
         await gone(camera.trigger(timeout=SHORT))
+        box.script[phase] = quiet
         fencing = asyncio.create_task(camera.trigger())
-        await box.wait_for(phase, 2 if phase == QUERY else 1)
+        await box.wait_for(phase, 3 if phase == QUERY else 1)
         await cancelled(fencing)
         box.script |= script
         box.send(script[phase](b""))
@@ -520,10 +523,10 @@ async def test_fence_cancelled_half_way_is_put_up_again(phase: int) -> None:
 async def test_fence_cancelled_leaves_the_stop_that_the_user_wants() -> None:
     async with by_hand() as (box, camera):
         query = box.script[QUERY]
-        box.script |= {TRIGGER: quiet, QUERY: quiet}
+        box.script |= {TRIGGER: quiet, QUERY: only(2, query)}
         await gone(camera.trigger(timeout=SHORT))
         fencing = asyncio.create_task(camera.trigger())
-        await box.wait_for(QUERY, 2)
+        await box.wait_for(QUERY, 4)  # at connect, before either trigger, behind the Stop
         await cancelled(fencing)
         box.script[QUERY] = query
         box.send(query(b""))
@@ -535,10 +538,10 @@ async def test_fence_cancelled_leaves_the_stop_that_the_user_wants() -> None:
 async def test_fence_cancelled_then_switched_runs_again() -> None:
     async with by_hand() as (box, camera):
         query = box.script[QUERY]
-        box.script |= {TRIGGER: quiet, QUERY: quiet}
+        box.script |= {TRIGGER: quiet, QUERY: only(2, query)}
         await gone(camera.trigger(timeout=SHORT))
         fencing = asyncio.create_task(camera.trigger())
-        await box.wait_for(QUERY, 2)
+        await box.wait_for(QUERY, 4)  # at connect, before either trigger, behind the Stop
         await cancelled(fencing)
         box.script[QUERY] = query
         box.send(query(b""))
@@ -549,8 +552,9 @@ async def test_fence_cancelled_then_switched_runs_again() -> None:
 async def test_fence_too_slow_for_a_short_trigger_leaves_the_link() -> None:
     async with by_hand() as (box, camera):
         script = dict(box.script)
-        box.script |= {TRIGGER: quiet, QUERY: quiet}
+        box.script[TRIGGER] = quiet
         await gone(camera.trigger(timeout=SHORT))
+        box.script[QUERY] = quiet
         for _ in range(2):
             with pytest.raises(TriggerTimeoutError, match=r"Query.*no trigger was sent"):
                 await camera.trigger(timeout=SHORT)
@@ -561,8 +565,9 @@ async def test_fence_too_slow_for_a_short_trigger_leaves_the_link() -> None:
 
 async def test_fence_never_answered_gives_the_link_up_in_the_end() -> None:
     async with by_hand(request_timeout=SHORT) as (box, camera):
-        box.script |= {TRIGGER: quiet, QUERY: quiet}
+        box.script[TRIGGER] = quiet
         await gone(camera.trigger(timeout=SHORT))
+        box.script[QUERY] = quiet
         with pytest.raises(TriggerTimeoutError, match="no answer to Query"):
             await camera.trigger(timeout=2 * SHORT)
         await until(lambda: not camera.connected)
@@ -571,10 +576,10 @@ async def test_fence_never_answered_gives_the_link_up_in_the_end() -> None:
 async def test_fence_cancelled_then_a_switch_refused_runs_again() -> None:
     async with by_hand() as (box, camera):
         query = box.script[QUERY]
-        box.script |= {TRIGGER: quiet, QUERY: quiet}
+        box.script |= {TRIGGER: quiet, QUERY: only(2, query)}
         await gone(camera.trigger(timeout=SHORT))
         fencing = asyncio.create_task(camera.trigger())
-        await box.wait_for(QUERY, 2)
+        await box.wait_for(QUERY, 4)  # at connect, before either trigger, behind the Stop
         await cancelled(fencing)
         box.script[QUERY] = query
         box.send(query(b""))
@@ -588,6 +593,7 @@ async def test_result_that_comes_while_its_caller_is_being_cancelled_is_late() -
         trigger, box.script[TRIGGER] = box.script[TRIGGER], quiet
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER)
+        await until(lambda: not camera._inbox.fence_open)
         triggering.cancel()
         camera._inbox.dispatch(Chunk(0.0, [m.ResultContainer(application=7, data=b"late")]))
         await asyncio.wait({triggering})
@@ -596,7 +602,7 @@ async def test_result_that_comes_while_its_caller_is_being_cancelled_is_late() -
         box.script[TRIGGER] = trigger
         mark = len(box.ids)
         await camera.trigger()
-        assert box.since(mark) == [TRIGGER]  # nothing is owed
+        assert box.since(mark) == [QUERY, QUERY, TRIGGER]  # nothing is owed
 
 
 async def test_result_that_comes_before_its_caller_is_cancelled_owes_nothing() -> None:
@@ -604,12 +610,14 @@ async def test_result_that_comes_before_its_caller_is_cancelled_owes_nothing() -
         trigger, box.script[TRIGGER] = box.script[TRIGGER], quiet
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER)
-        camera._inbox.dispatch(Chunk(0.0, [m.ResultContainer(application=7, data=b"ours")]))
+        await until(lambda: not camera._inbox.fence_open)
+        camera._inbox.dispatch(Chunk(0.0, [BEGUN, m.ResultContainer(application=7, data=b"ours")]))
+        camera._inbox.dispatch(Chunk(0.0, [m.StatusReport(status=Status(READY), endian=0)]))
         await cancelled(triggering)
         box.script[TRIGGER] = trigger
         mark = len(box.ids)
         await camera.trigger()
-        assert box.since(mark) == [TRIGGER]
+        assert box.since(mark) == [QUERY, TRIGGER]
 
 
 @pytest.mark.parametrize("waiting", ["trigger", "next_result"])
@@ -617,7 +625,7 @@ async def test_result_at_the_very_deadline_is_returned(waiting: str) -> None:
     async with by_hand() as (box, camera):
         box.script[TRIGGER] = quiet
         loop = asyncio.get_running_loop()
-        chunk = Chunk(0.0, [m.ResultContainer(application=7, data=b"just")])
+        chunk = Chunk(0.0, [BEGUN, m.ResultContainer(application=7, data=b"just")])
         deadline = loop.time() + SHORT
         task = asyncio.ensure_future(getattr(camera, waiting)(timeout=SHORT))
         loop.call_at(deadline - 0.001, camera._inbox.dispatch, chunk)
@@ -797,13 +805,15 @@ async def test_trigger_is_traced(caplog: pytest.LogCaptureFixture) -> None:
     entries = frames.entries
     names = [(entry.direction, entry.message) for entry in entries]
     at = names.index((">", "Trigger"))
-    assert names[at : at + 4] == [
+    assert names[at - 1 : at + 5] == [
+        (">", "Query"),
         (">", "Trigger"),
+        ("<", "QueryAnswer"),
         ("<", "StatusReport"),
         ("<", "ResultContainer"),
         ("<", "StatusReport"),
     ]
-    assert entries[at + 2].fields == {"application": 7, "data": b"found".hex()}
+    assert entries[at + 3].fields == {"application": 7, "data": b"found".hex()}
     assert "> Trigger" in caplog.text
 
 
