@@ -6,6 +6,7 @@ import asyncio
 import functools
 from collections import Counter, deque
 from collections.abc import Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, overload
 
 from smartcam.exceptions import RemoteProtocolError, ResponseTimeoutError
@@ -13,15 +14,26 @@ from smartcam.protocols.framing import Frame
 from smartcam.protocols.messages import Message, Sender, UnknownMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from smartcam.emulator.parcels import Parcel
     from smartcam.protocols.framed import FramedDialect
 
-__all__ = ["Log", "LogEntry", "TrafficLog", "Visit"]
+__all__ = ["MAX_BYTES", "MAX_ENTRIES", "MAX_IDS", "Log", "LogEntry", "TrafficLog", "Visit"]
 
 MAX_ENTRIES = 10_000
 """Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
+
+MAX_BYTES = 1 << 25
+"""Bytes that the entries hold, read or not; the oldest go first. 10,000 results of seven parts
+fit; of the largest containers, 64 kB, it keeps 120."""
+
+MAX_IDS = 1000
+"""Message ids of which it is counted how often they came. Those of the dialect always are: more
+than these only a client makes that sends anything."""
+
+_ENTRY = 400  # bytes of an entry with its message, without what is as long as the payload
+_PER_BYTE = 4  # of each byte of a payload: one in the message, three in hex
 
 MAX_VISITS = 1000
 """Connections that have ended of which a record is kept; the oldest go first."""
@@ -87,31 +99,39 @@ _DIRECTIONS: dict[Sender, Direction] = {Sender.CLIENT: "in", Sender.CAMERA: "out
 class Log(Sequence[LogEntry]):
     """The last frames in both directions, oldest first; the oldest go where it is full.
 
-    Entries are made when somebody reads: until then a frame is kept as it went over the wire.
+    Entries are made when somebody reads: until then a frame is kept as it went over the wire. What
+    counts as full does not depend on it.
 
     Args:
         dialect: in which frames are decoded.
         maxlen: entries kept.
+        max_bytes: what they hold at most; the last one is kept however large it is.
 
     Attributes:
         maxlen: entries kept.
+        max_bytes: what they hold at most.
+        pushed_out: entries that are gone because it was full, since the beginning or the last
+            :meth:`clear`.
     """
 
-    def __init__(self, dialect: FramedDialect, maxlen: int = MAX_ENTRIES) -> None:
+    def __init__(
+        self, dialect: FramedDialect, maxlen: int = MAX_ENTRIES, max_bytes: int = MAX_BYTES
+    ) -> None:
         self.maxlen: int = maxlen
+        self.max_bytes: int = max_bytes
+        self.pushed_out: int = 0
         self._dialect = dialect
-        self._entries: deque[LogEntry] = deque(maxlen=maxlen)
-        self._unread: deque[LogEntry | _Traced] = deque(maxlen=maxlen)
-        self._count = 0  # entries that were read
-        # called for each frame: the deque's own
-        self.append: Callable[[LogEntry | _Traced], None] = self._unread.append
-        """Put an entry, or what one is made of, behind the others."""
+        self._entries: deque[LogEntry] = deque()
+        self._unread: deque[LogEntry | _Traced] = deque()  # behind those
+        self._weights: deque[int] = deque()  # of both, in the same order
+        self._size = 0  # their sum, bytes
+        self._gone = 0  # entries that there have been before them
 
     def __repr__(self) -> str:
         return f"Log({list(self)!r})"
 
     def __len__(self) -> int:
-        return min(len(self._entries) + len(self._unread), self.maxlen)
+        return len(self._weights)
 
     def __iter__(self) -> Iterator[LogEntry]:
         return iter(self._read())
@@ -129,18 +149,46 @@ class Log(Sequence[LogEntry]):
         entries = self._read()
         return entries[index] if isinstance(index, int) else list(entries)[index]
 
-    def since(self, serial: int) -> tuple[list[LogEntry], int]:
+    @property
+    def size(self) -> int:
+        """Bytes that the entries hold, counted as if all had been read."""
+        return self._size
+
+    def append(self, entry: LogEntry | _Traced) -> None:
+        """Put an entry, or what one is made of, behind the others."""
+        if isinstance(entry, LogEntry):
+            texts = sum(len(text) for text in (entry.error, entry.fault, entry.wire) if text)
+            weight = _ENTRY + _PER_BYTE * ((len(entry.hex) + 1) // 3) + texts
+        else:  # as it will be when it is read
+            fault = entry[4]
+            weight = _ENTRY + _PER_BYTE * len(entry[3].payload) + (len(fault) if fault else 0)
+        weights = self._weights
+        self._unread.append(entry)
+        weights.append(weight)
+        self._size += weight
+        while len(weights) > self.maxlen or (self._size > self.max_bytes and len(weights) > 1):
+            (self._entries or self._unread).popleft()
+            self._forget_oldest()
+            self.pushed_out += 1
+
+    def since(self, serial: int, limit: int | None = None) -> tuple[list[LogEntry], int]:
         """Return the entries behind the first ``serial`` ones, and how many there have been.
 
         ::
 
-            new, serial = emulator.log.since(serial)
+            new, count = emulator.log.since(serial)
+            missed = count - serial - len(new)
 
         Entries that are gone by then are missing in the list.
+
+        Args:
+            serial: how many are known already.
+            limit: entries that are returned at most, the oldest; default all.
         """
         entries = self._read()
-        new = self._count - max(0, serial)
-        return (list(entries)[-new:] if new > 0 else []), self._count
+        first = min(max(0, serial - self._gone), len(entries))
+        last = len(entries) if limit is None else first + limit
+        return list(islice(entries, first, last)), self._gone + len(entries)
 
     def popleft(self) -> LogEntry:
         """Take the oldest entry away.
@@ -148,21 +196,29 @@ class Log(Sequence[LogEntry]):
         Raises:
             IndexError: there is none.
         """
-        return self._read().popleft()
+        entry = self._read().popleft()
+        self._forget_oldest()
+        return entry
 
     def clear(self) -> None:
         """Take all away."""
-        self._read().clear()
+        self._gone += len(self)
+        self._entries.clear()
+        self._unread.clear()
+        self._weights.clear()
+        self._size = self.pushed_out = 0
+
+    def _forget_oldest(self) -> None:
+        """Leave the entry out of the account that was taken away in front."""
+        self._gone += 1
+        self._size -= self._weights.popleft()
 
     def _read(self) -> deque[LogEntry]:
-        unread = self._unread
-        if unread:
-            self._count += len(unread)
-            self._entries.extend(
-                entry if isinstance(entry, LogEntry) else self._entry(*entry) for entry in unread
-            )
-            unread.clear()
-        return self._entries
+        unread, entries = self._unread, self._entries
+        while unread:
+            one = unread.popleft()
+            entries.append(one if isinstance(one, LogEntry) else self._entry(*one))
+        return entries
 
     def _entry(
         self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None
@@ -186,7 +242,9 @@ class TrafficLog:
         self.visits: deque[Visit] = deque(maxlen=MAX_VISITS)
         self.entries: Log = Log(dialect)
         self._dialect = dialect
-        self._received: Counter[int | type[Message] | None] = Counter()
+        self._received: Counter[int | type[Message] | None] = Counter(
+            {row.message_id: 0 for row in dialect.table}
+        )
         self._changed: asyncio.Event | None = None  # there while somebody waits
 
     def add(
@@ -256,8 +314,10 @@ class TrafficLog:
 
     def _count(self, frame: Frame) -> None:
         message_id, payload = frame
-        self._received[message_id] += 1
-        self._received[_kind(self._dialect, message_id, len(payload))] += 1
+        received = self._received
+        if message_id in received or len(received) < MAX_IDS:
+            received[message_id] += 1
+        received[_kind(self._dialect, message_id, len(payload))] += 1
         if self._changed is not None:
             self._changed.set()
             self._changed = None

@@ -54,6 +54,7 @@ class CameraLog(Sequence["LogEntry"]):
         read: returns the entries.
         visits: returns the connections that have ended.
         links: returns who is connected; nobody where there are no connections.
+        pushed_out: returns how many entries are gone because the log was full.
     """
 
     def __init__(
@@ -61,8 +62,10 @@ class CameraLog(Sequence["LogEntry"]):
         read: Callable[[], list[LogEntry]],
         visits: Callable[[], list[Visit]],
         links: Callable[[], list[str]],
+        pushed_out: Callable[[], int] = lambda: 0,
     ) -> None:
         self._read = read
+        self._pushed_out = pushed_out
         self._visits = visits
         self._links = links
 
@@ -83,6 +86,11 @@ class CameraLog(Sequence["LogEntry"]):
             IndexError: there is none.
         """
         return self._read()[index]
+
+    @property
+    def pushed_out(self) -> int:
+        """Entries that are gone because the log was full; what is expected of all then fails."""
+        return self._pushed_out()
 
     @property
     def received(self) -> list[m.Message]:
@@ -111,7 +119,7 @@ class CameraLog(Sequence["LogEntry"]):
         """
         __tracebackhide__ = True
         wanted = [_known(one) for one in expected]
-        self._until(lambda entries: _in_order(entries, wanted, only=only), timeout)
+        self._until(lambda entries: _in_order(entries, wanted, only=only), timeout, whole=only)
 
     def expect_nothing_while_busy(
         self, *also: type[m.Message], grace: float = 0.0, timeout: float = 0.0
@@ -131,7 +139,7 @@ class CameraLog(Sequence["LogEntry"]):
         """
         __tracebackhide__ = True
         allowed = (*ALLOWED_WHILE_BUSY, *also)
-        self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout)
+        self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
 
     def expect_disconnect_before_close(self, *, timeout: float = 1.0) -> None:
         """See that every client that had a session ended it by Disconnect, and then its connection.
@@ -145,7 +153,7 @@ class CameraLog(Sequence["LogEntry"]):
             AssertionError: one did not, or is still connected.
         """
         __tracebackhide__ = True
-        self._until(self._unfinished, timeout)
+        self._until(self._unfinished, timeout, whole=True)
 
     def expect_no_errors(self) -> None:
         """See that all that clients sent was frames that the camera accepts.
@@ -154,7 +162,7 @@ class CameraLog(Sequence["LogEntry"]):
             AssertionError: something was ignored.
         """
         __tracebackhide__ = True
-        self._until(_refused, 0.0)
+        self._until(_refused, 0.0, whole=True)
 
     def _unfinished(self, entries: list[LogEntry]) -> str | None:
         last: dict[str, LogEntry] = {}
@@ -172,17 +180,22 @@ class CameraLog(Sequence["LogEntry"]):
         still = sorted(sessions.intersection(self._links()))
         return f"still connected: {', '.join(still)}" if still else None
 
-    def _until(self, finding: Callable[[list[LogEntry]], str | None], timeout: float) -> None:
-        """Look until nothing is found."""
+    def _until(
+        self, finding: Callable[[list[LogEntry]], str | None], timeout: float, *, whole: bool
+    ) -> None:
+        """Look until nothing is found; with ``whole`` nothing may be missing in the log."""
         __tracebackhide__ = True
         end = time.monotonic() + timeout
         while True:
             entries = self._read()
             found = finding(entries)
-            if found is None:
+            gone = self._pushed_out()
+            missing = f"{gone} older entries were pushed out of the full log" if gone else None
+            if found is None and not (missing and whole):
                 return
-            if time.monotonic() >= end:
-                raise AssertionError(f"{found}\n{_shown(entries)}")
+            if time.monotonic() >= end or found is None:
+                reasons = [one for one in (found, missing) if one]
+                raise AssertionError("\n".join([*reasons, _shown(entries)]))
             time.sleep(PAUSE)
 
 

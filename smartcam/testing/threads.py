@@ -220,6 +220,7 @@ class ThreadedCamera(_InLoop):
             read=lambda: self._look(lambda: list(emulator.log)),
             visits=lambda: self.visits,
             links=lambda: self.links if self.transport == "tcp" else [],
+            pushed_out=lambda: self._look(lambda: emulator.log.pushed_out),
         )
 
     def __repr__(self) -> str:

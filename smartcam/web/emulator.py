@@ -353,28 +353,21 @@ def _reset_scene(site: EmulatorSite, ask: Ask) -> object:
 
 async def _log(site: EmulatorSite, ask: Ask) -> object:
     emulator, part = _emulator(site, ask), ask.query
+    since: int = part.since or 0
     deadline = time.monotonic() + part.wait
-    while time.monotonic() < deadline and not emulator.log.since(part.since or 0)[0]:
+    while time.monotonic() < deadline and not emulator.log.since(since, 1)[0]:
         if await site.pause(LOOK_AGAIN):
             break
-    since: int = part.since or 0
-    entries, count = emulator.log.since(since)
-    first = count - len(entries)
-    kept = entries[: part.limit]
-    return {
-        "entries": [shown.camera_entry(first + i, entry, emulator) for i, entry in enumerate(kept)],
-        "next": first + len(kept),
-        "missed": max(0, first - since),
-    }
+    return shown.log_part(emulator, since, part.limit)[0]
 
 
 def _log_entry(site: EmulatorSite, ask: Ask) -> object:
     emulator, text = _emulator(site, ask), ask.path["serial"]
     serial = int(text) if text.isdecimal() and len(text) < 20 else -1
-    entries, count = emulator.log.since(serial)
-    first = count - len(entries)
-    if serial < 0 or serial != first or not entries:
-        there = f"{count - len(emulator.log)} to {count - 1}" if len(emulator.log) else "none"
+    entries, count = emulator.log.since(serial, 1)
+    first = count - len(emulator.log)
+    if not entries or serial < first:
+        there = f"{first} to {count - 1}" if len(emulator.log) else "none"
         raise RefusedError(404, f"log entry {text!r}", f"one that is there: {there}")
     return shown.camera_entry(serial, entries[0], emulator, whole=True)
 

@@ -28,6 +28,7 @@ __all__ = [
     "MAX_HEX",
     "MAX_LISTED",
     "MAX_LOOK_BACK",
+    "MAX_TOLD",
     "MAX_VALUES",
     "SENSOR",
     "camera_entry",
@@ -36,6 +37,7 @@ __all__ = [
     "faults_state",
     "kinds",
     "log_count",
+    "log_part",
     "log_range",
     "reported",
     "scene_state",
@@ -50,6 +52,10 @@ MAX_HEX = 512
 
 MAX_VALUES = 2048
 """Bytes of a result that a list of log entries shows decoded; the entry alone shows any."""
+
+MAX_TOLD = 1 << 18
+"""Bytes of payload that a list tells: of log entries, as far as it shows them, or of faults. More
+end the list; an answer stays a few megabytes of JSON, and no more than its entries is ever made."""
 
 MAX_LISTED = 1000
 """Faults that a list shows."""
@@ -119,13 +125,33 @@ def _application(application: Application) -> dict[str, Any]:
 
 def log_count(emulator: EmulatedCamera) -> int:
     """Return how many entries the log has had: the serial behind the last one."""
-    return emulator.log.since(sys.maxsize)[1]
+    return emulator.log.since(sys.maxsize, 0)[1]
 
 
 def log_range(emulator: EmulatedCamera) -> dict[str, int]:
     """Return the serials of the log: ``first`` that is there, ``next`` that will be."""
     count = log_count(emulator)
     return {"first": count - len(emulator.log), "next": count}
+
+
+def log_part(
+    emulator: EmulatedCamera, since: int, limit: int
+) -> tuple[dict[str, Any], list[LogEntry]]:
+    """Return entries from a serial on as JSON, and themselves: so many, or :data:`MAX_TOLD`.
+
+    ``next`` is the serial to go on with, ``missed`` how many are gone.
+    """
+    entries, count = emulator.log.since(since, limit)
+    first = min(max(since, count - len(emulator.log)), count)
+    told: list[dict[str, Any]] = []
+    room = MAX_TOLD
+    for serial, entry in enumerate(entries, first):
+        told.append(camera_entry(serial, entry, emulator))
+        room -= min(told[-1]["size"], MAX_VALUES)
+        if room <= 0:
+            break
+    part = {"entries": told, "next": first + len(told), "missed": max(0, first - since)}
+    return part, entries[: len(told)]
 
 
 def camera_entry(
@@ -138,11 +164,10 @@ def camera_entry(
         entry: the entry.
         emulator: the camera, which knows the layouts of results.
         whole: show all of a long payload, and its values; else what is left out is told by
-            ``size``, and by null in place of ``values``.
+            ``size`` and ``wire_size``, and by null in place of ``values``.
     """
-    size = (len(entry.hex) + 1) // 3
-    cut = not whole and size > MAX_HEX
-    message = entry.message
+    shown = None if whole else MAX_HEX * 3 - 1
+    message, wire = entry.message, entry.wire
     values = None if message is None else _values(message, emulator.device, whole=whole)
     return {
         "serial": serial,
@@ -153,12 +178,18 @@ def camera_entry(
         "message": None if message is None else type(message).__name__,
         "fields": {} if message is None else _fields(message, emulator.spoken),
         "values": values,
-        "hex": entry.hex[: MAX_HEX * 3 - 1] if cut else entry.hex,
-        "size": size,
+        "hex": entry.hex[:shown],
+        "size": _size(entry.hex),
         "error": entry.error,
         "fault": entry.fault,
-        "wire": entry.wire[: MAX_HEX * 3 - 1] if cut and entry.wire else entry.wire,
+        "wire": None if wire is None else wire[:shown],
+        "wire_size": None if wire is None else _size(wire),
     }
+
+
+def _size(text: str) -> int:
+    """Return how many bytes a text of hex has."""
+    return (len(text) + 1) // 3
 
 
 def _fields(message: m.Message, dialect: FramedDialect) -> dict[str, Any]:
@@ -199,11 +230,23 @@ def _byte_order(device: Device) -> ByteOrder:
 def faults_state(emulator: EmulatedCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
     """Return the faults that wait and the last ones that have happened."""
     waiting, fired = emulator.faults, list(emulator.fired)
+    last = (one.fault for one in reversed(fired))
     return {
-        "waiting": [_fault(one) for one in waiting[:limit]],
+        "waiting": [_fault(one) for one in waiting[: _as_many(waiting, limit)]],
         "waiting_count": len(waiting),
-        "fired": [_fired(one) for one in fired[-limit:]],
+        "fired": [_fired(one) for one in fired[len(fired) - _as_many(last, limit) :]],
     }
+
+
+def _as_many(faults: Iterable[BaseFault], limit: int) -> int:
+    """Return how many a list shows: ``limit``, or :data:`MAX_TOLD` bytes of what they insert."""
+    count, room = 0, MAX_TOLD
+    for fault in faults:
+        room -= len(getattr(fault, "data", None) or b"")
+        if count == limit or room < 0:
+            break
+        count += 1
+    return count
 
 
 def _fault(fault: BaseFault) -> dict[str, Any]:

@@ -69,14 +69,9 @@ class Watcher:
 
     def _log(self) -> News | None:
         emulator = self._emulator
-        entries, count = emulator.log.since(self._serial)
-        first = count - len(entries)
-        missed = max(0, first - self._serial)
-        if not entries and not missed:
-            self._serial = count  # a serial of another emulator's time may be higher
+        part, entries = shown.log_part(emulator, self._serial, MAX_LOG_NEWS)
+        self._serial = part["next"]  # a serial of another emulator's time may have been higher
+        if not entries and not part["missed"]:
             return None
-        kept = entries[:MAX_LOG_NEWS]
-        self._reported = shown.reported(emulator, kept) or self._reported
-        self._serial = first + len(kept)
-        told = [shown.camera_entry(first + i, entry, emulator) for i, entry in enumerate(kept)]
-        return News("log", {"entries": told, "next": self._serial, "missed": missed}, self._serial)
+        self._reported = shown.reported(emulator, entries) or self._reported
+        return News("log", part, self._serial)

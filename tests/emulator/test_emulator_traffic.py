@@ -1,11 +1,16 @@
-"""The emulator's log: entries are made when somebody reads them."""
+"""The emulator's log: entries are made when somebody reads them, and what they hold is bounded."""
 
 from __future__ import annotations
 
-import pytest
+import tracemalloc
 
-from smartcam.emulator import LogEntry
-from smartcam.emulator.traffic import Log, TrafficLog
+import camera_wire as wire
+import pytest
+from camera_wire import TcpClient
+
+from smartcam.emulator import EmulatedCamera, LogEntry
+from smartcam.emulator.links import MAX_INPUT
+from smartcam.emulator.traffic import MAX_BYTES, MAX_ENTRIES, MAX_IDS, Log, TrafficLog
 from smartcam.exceptions import FrameError, ResponseTimeoutError
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import HANDBOOK
@@ -78,6 +83,99 @@ def test_log_is_emptied_from_the_front_or_at_once() -> None:
         log.popleft()
 
 
+@pytest.mark.parametrize("look_after", range(11))
+def test_log_is_bounded_in_bytes_and_tells_what_went(look_after: int) -> None:
+    log = Log(HANDBOOK, max_bytes=20_000)
+    for number in range(10):
+        if number == look_after:
+            assert len(list(log)) == len(log)
+        log.append(
+            (0.5, PEER, m.Sender.CAMERA, Frame(0x20, bytes([number, 0, 0, 0, *1000 * [1]])), None)
+        )
+        assert log.size <= 20_000
+    kept, count = log.since(0)
+    assert [int(entry.hex[:2], 16) for entry in kept] == [6, 7, 8, 9]
+    assert (len(log), log.pushed_out, count) == (4, 6, 10)
+    assert count - len(kept) == 6  # missed
+
+
+def test_log_keeps_the_last_entry_however_large() -> None:
+    log = Log(HANDBOOK, max_bytes=1000)
+    log.append((0.5, PEER, m.Sender.CLIENT, Frame(0x21, bytes(5000)), None))
+    assert (len(log), log.pushed_out) == (1, 0)
+    put(log, 1)
+    assert (numbers(log), log.pushed_out) == ([1], 1)
+
+
+def test_log_counts_all_that_an_entry_says() -> None:
+    log = make()
+    log.append(LogEntry(0.5, "in", PEER, None, None, "00 00", 1000 * "e", 100 * "f", 3000 * "w"))
+    assert 4100 < log.size < 6000
+    log.popleft()
+    assert (log.size, log.pushed_out) == (0, 0)
+
+
+@pytest.mark.parametrize("reads", [False, True])
+def test_log_holds_no_more_memory_than_it_says(reads: bool) -> None:
+    tracemalloc.start()
+    try:
+        traffic = TrafficLog(HANDBOOK)
+        for number in range(500):
+            frame = Frame(0x20, number.to_bytes(4, "little") + bytes(MAX_INPUT - 4))
+            traffic.add(0.0, PEER, m.Sender.CAMERA, frame)
+            if reads and not number % 50:
+                list(traffic.entries)
+        held, _ = tracemalloc.get_traced_memory()
+        entries = list(traffic.entries)
+        read, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < 1.1 * MAX_BYTES
+    assert read < 1.1 * MAX_BYTES
+    assert len(entries) + traffic.entries.pushed_out == 500
+
+
+async def test_log_of_large_frames_is_bounded_on_the_wire() -> None:
+    async with EmulatedCamera() as emulator, await TcpClient.open(emulator) as client:
+        large = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x77, 0, 0, 0])
+        for _ in range(200):
+            client.send(large + bytes(MAX_INPUT))
+        await emulator.wait_received(0x77, count=200)
+        log = emulator.log
+        entries, count = log.since(0)
+        assert log.size <= MAX_BYTES
+        assert log.pushed_out == count - len(entries) > 0
+        frame, reason = entries[-2:]
+        assert frame.hex == bytes(MAX_INPUT).hex(" ")
+        assert reason.error is not None
+
+
+def test_log_counts_what_nobody_read() -> None:
+    log = make(0, 1)
+    _, before = log.since(0)
+    for number in range(2, 9):
+        put(log, number)
+    new, count = log.since(before)
+    assert (before, count, len(new), log.pushed_out) == (2, 9, 3, 6)
+
+
+def test_log_gives_no_more_than_asked_for() -> None:
+    log = make(1, 2, 3, 4)
+    assert [entry.hex[:2] for entry in log.since(0, 2)[0]] == ["02", "03"]
+    assert [entry.hex[:2] for entry in log.since(3, 2)[0]] == ["04"]
+    assert log.since(2**63 - 1, 1000) == ([], 4)
+    assert log.since(-5, 0) == ([], 4)
+
+
+def test_log_that_is_emptied_begins_anew() -> None:
+    log = make(1, 2, 3, 4)
+    assert log.pushed_out == 1
+    log.clear()
+    assert (len(log), log.size, log.pushed_out) == (0, 0, 0)
+    put(log, 5)
+    assert log.since(4) == (list(log), 5)
+
+
 def test_frames_and_what_makes_none_stay_in_order() -> None:
     traffic = TrafficLog(HANDBOOK)
     traffic.add(1.0, PEER, m.Sender.CLIENT, QUERY, "delay")
@@ -101,3 +199,14 @@ async def test_frames_of_a_wrong_size_count_by_id_only() -> None:
     for what, count in ((m.SwitchApplication, 2), (m.UnknownMessage, 1)):
         with pytest.raises(ResponseTimeoutError, match=f"received {count - 1} of {count}"):
             await traffic.wait_received(what, count=count, timeout=0.0)
+
+
+async def test_ids_that_are_none_are_counted_within_a_bound() -> None:
+    traffic = TrafficLog(HANDBOOK)
+    for number in range(2 * MAX_IDS):
+        traffic.add(0.0, PEER, m.Sender.CLIENT, Frame(0x1000 + number, b""))
+    assert len(traffic._received) <= MAX_IDS + 1
+    traffic.add(0.0, PEER, m.Sender.CLIENT, QUERY)
+    await traffic.wait_received(m.Query)
+    await traffic.wait_received(0x30)
+    assert len(traffic.entries) <= MAX_ENTRIES

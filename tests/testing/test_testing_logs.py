@@ -75,6 +75,26 @@ def test_message_that_did_not_come_is_named_with_the_log(emulator: ThreadedCamer
     assert failure(emulator.log.expect, 0x40, timeout=0).startswith("expected message 0x40, at fir")
 
 
+def test_log_that_was_full_is_told_and_is_no_proof(emulator: ThreadedCamera) -> None:
+    log = emulator.log
+    with talk(emulator, CONNECT, QUERY):
+        log.expect(m.Query, "QueryAnswer")
+        assert log.pushed_out == 0
+        emulator.run(lambda camera: setattr(camera.log, "maxlen", 3))
+    with talk(emulator, CONNECT, DISCONNECT):
+        emulator.wait_received(m.Disconnect)
+    gone = f"{log.pushed_out} older entries were pushed out of the full log\n"
+    log.expect("ConnectAnswer", "Disconnect")  # what is there is there
+    assert gone in failure(log.expect, "Query", timeout=0)
+    # of what went, nobody knows whether it was right
+    assert failure(log.expect, "Disconnect", only=True).startswith(gone)
+    assert failure(log.expect_nothing_while_busy).startswith(gone)
+    assert failure(log.expect_no_errors).startswith(gone)
+    assert gone in failure(log.expect_disconnect_before_close, timeout=0)
+    emulator.run(lambda camera: camera.log.clear())
+    log.expect_no_errors()
+
+
 def test_order_counts(emulator: ThreadedCamera) -> None:
     with talk(emulator, CONNECT, QUERY):
         emulator.log.expect(m.Connect, m.Query)

@@ -11,7 +11,7 @@ import pytest
 from sitekit import Raw, served
 
 import smartcam
-from smartcam.emulator import EmulatedCamera
+from smartcam.emulator import EmulatedCamera, LogEntry
 from smartcam.emulator.faults import FAULTS
 from smartcam.emulator.scene import PIECES
 from smartcam.exceptions import ConfigurationError
@@ -19,7 +19,7 @@ from smartcam.models import Status
 from smartcam.web import EmulatorSite
 from smartcam.web.calls import MAX_BODY
 from smartcam.web.emulator import CALLS, MAX_PARTS
-from smartcam.web.shown import MAX_HEX, MAX_VALUES
+from smartcam.web.shown import MAX_HEX, MAX_TOLD, MAX_VALUES
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -337,6 +337,67 @@ async def test_log_cuts_a_long_payload_and_one_entry_has_all() -> None:
     assert (len(bytes.fromhex(cut["hex"])), cut["values"]) == (MAX_HEX, None)
     assert len(bytes.fromhex(whole["hex"])) == whole["size"]
     assert whole["values"] == {"a": "x", "b": "y"}
+
+
+def large(count: int) -> dict[str, Any]:
+    """Return an application whose results are as long as a list of entries shows any."""
+    layout = "(text: string[100])*"
+    values = [{"text": f"{number}"} for number in range((MAX_VALUES - 4) // 100)]
+    return {"id": count, "layout": layout, "constant": values, "processing_time": 0}
+
+
+async def test_log_ends_where_it_told_enough_and_goes_on_from_there() -> None:
+    async with (
+        served(applications=[large(5)], running=True) as world,
+        smartcam.connect(world.emulator.url),
+    ):
+        for _ in range(300):
+            assert world.emulator.device.trigger()
+            world.clock.advance(0)
+        count = world.emulator.log.since(0)[1]
+        seen: list[int] = []
+        answers = 0
+        while len(seen) < count:
+            part = await world.caller.get(f"log?since={len(seen)}")
+            assert sum(one["size"] for one in part["entries"]) <= MAX_TOLD + MAX_VALUES
+            seen += [one["serial"] for one in part["entries"]]
+            answers += 1
+    assert seen == list(range(count))
+    assert answers == 3
+
+
+async def test_log_tells_what_was_pushed_out() -> None:
+    async with served(running=True, active=21) as world, smartcam.connect(world.emulator.url):
+        world.emulator.log.max_bytes = 5000
+        for _ in range(20):
+            world.emulator.device.trigger()
+            world.clock.advance(1)
+        gone = world.emulator.log.pushed_out
+        part = await world.caller.get("log")
+    assert gone > 20
+    assert (part["missed"], part["entries"][0]["serial"]) == (gone, gone)
+
+
+async def test_log_cuts_what_really_passed_too() -> None:
+    passed = bytes(5000).hex(" ")
+    async with served() as world:
+        world.emulator.log.append(
+            LogEntry(0.0, "out", "somebody", 0x01, None, "01", None, "corrupt", passed)
+        )
+        (cut,) = (await world.caller.get("log"))["entries"]
+        whole = await world.caller.get("log/0")
+    assert (cut["hex"], cut["size"], cut["wire_size"]) == ("01", 1, 5000)
+    assert len(bytes.fromhex(cut["wire"])) == MAX_HEX
+    assert whole["wire"] == passed
+
+
+async def test_list_of_faults_ends_where_it_told_enough() -> None:
+    async with served() as world:
+        large = {"kind": "insert", "on": "QueryAnswer", "data": "00" * 60_000}
+        for _ in range(10):
+            await world.caller.post("faults", large)
+        told = await world.caller.get("faults")
+    assert (len(told["waiting"]), told["waiting_count"]) == (4, 10)
 
 
 async def test_log_tells_what_is_gone() -> None:
