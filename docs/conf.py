@@ -81,6 +81,7 @@ LIMITS = (
     "attribution.MAX_OWED",
     "supervisor.TAKEN_WITHIN",
     "exceptions.MAX_EXCERPT",
+    "accepting.ACCEPT_PAUSE",
     "emulator.links.MAX_INPUT",
     "emulator.links.MAX_LINKS",
     "emulator.links.WRITE_LIMIT",

@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 from pydantic import ValidationError
 
+from smartcam.accepting import Acceptor
 from smartcam.emulator.clock import NANOSECONDS, Clock, RealClock
 from smartcam.emulator.insight_commands import Commands, InSightQuirks
 from smartcam.emulator.insight_connection import MAX_LOGGED, MAX_SESSIONS, Connection
@@ -99,6 +101,7 @@ class EmulatedInSight:
         device: the camera behind the wire, for looking; to make it do something, use the methods
             of the emulator.
         log: what was heard and said, the last 10,000.
+        crowded_out: clients that were sent away because too many were connected.
         refuse_login: refuse every user.
         silent: hear commands and do them, but say nothing.
 
@@ -128,6 +131,7 @@ class EmulatedInSight:
         self.clock: Clock = RealClock() if clock is None else clock
         self.device: InSightDevice = InSightDevice(jobs, active=active, online=online, image=image)
         self.log: deque[InSightLogEntry] = deque(maxlen=MAX_ENTRIES)
+        self.crowded_out: int = 0
         self.refuse_login: bool = False
         self.silent: bool = False
         self._users = {"admin": ""} if users is None else dict(users)
@@ -136,8 +140,9 @@ class EmulatedInSight:
             self.device, evaluations=evaluations, info=info, quirks=_quirks(quirks)
         )
         self._port = port
-        self._server: asyncio.Server | None = None
-        self._connections: set[Connection] = set()
+        self._socket: socket.socket | None = None
+        self._acceptor = Acceptor(lambda: Connection(self), _log, name="smartcam.insight")
+        self._connections: dict[Connection, None] = {}  # the oldest stands first
         self._ordered: deque[_Ordered] = deque()
         self._heard: Counter[str] = Counter()
         self._changed: asyncio.Event | None = None  # there while somebody waits
@@ -283,16 +288,23 @@ class EmulatedInSight:
 
         Cancellation: leaves it stopped.
         """
-        if self._server is not None:
+        if self._socket is not None:
             return
         loop = asyncio.get_running_loop()
         try:
-            self._server = await loop.create_server(lambda: Connection(self), self.host, self._port)
+            found = await loop.getaddrinfo(self.host, self._port, type=socket.SOCK_STREAM)
+            family, address = found[0][0], found[0][4]
+            listener = socket.create_server(
+                (str(address[0]), self._port), family=family, backlog=MAX_SESSIONS
+            )
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
                 f"emulator: cannot listen on {self.host}:{self._port}: {exc}"
             ) from exc
-        self._port = self._server.sockets[0].getsockname()[1]
+        listener.setblocking(False)
+        self._socket = listener
+        self._port = listener.getsockname()[1]
+        self._acceptor.open(listener)
         self._offset = self._clock_time() - self.device.now
         self._act(lambda: None)
         _log.info("= %s: listening on %s", self.name, self.url)
@@ -302,31 +314,39 @@ class EmulatedInSight:
 
         Cancellation: everything is closed nevertheless.
         """
-        if self._server is None:
+        if self._socket is None:
             return
         self._act(lambda: None)  # what was due happens
-        server, self._server = self._server, None
-        server.close()
+        listener, self._socket = self._socket, None
+        self._acceptor.close()
+        listener.close()
         self._disarm()
         for one in list(self._connections):
             one.close("the emulator stops")
-        await server.wait_closed()
+        await self._acceptor.wait_closed()
+        await asyncio.sleep(0)  # transports that were aborted let go of their sockets now
         _log.info("= %s: stopped", self.name)
 
     # ------------------------------------------------------------------ for connections
 
     def enter(self, connection: Connection) -> int | None:
-        """Take a connection; returns its number, None if there are too many."""
-        if len(self._connections) >= MAX_SESSIONS:
+        """Take a connection; returns its number, None if there are too many or it is too late."""
+        if self._socket is None:
             return None
+        if len(self._connections) >= MAX_SESSIONS:
+            self.crowded_out += 1
+            waiting = next((one for one in self._connections if not one.logged_in), None)
+            if waiting is None:
+                return None
+            waiting.close(f"{MAX_SESSIONS} others are open, it waited for its login for longest")
         taken = {one.number for one in self._connections}
         number = next(one for one in range(MAX_SESSIONS) if one not in taken)
-        self._connections.add(connection)
+        self._connections[connection] = None
         return number
 
     def leave(self, connection: Connection) -> None:
         """A connection is gone; harmless when said twice."""
-        self._connections.discard(connection)
+        self._connections.pop(connection, None)
 
     def greeting(self, number: int) -> bytes:
         """Return what a new connection is told; two spaces before the model (clients, derived)."""
@@ -369,12 +389,12 @@ class EmulatedInSight:
 
     def _act(self, action: Callable[[], object]) -> None:
         """Do something to the device, its time brought up, and see to what follows by itself."""
-        if self._server is not None:
+        if self._socket is not None:
             self.device.advance_to(self._clock_time() - self._offset)
         try:
             action()
         finally:
-            if self._server is not None:
+            if self._socket is not None:
                 self._arm()
 
     def _arm(self) -> None:

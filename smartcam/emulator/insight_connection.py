@@ -18,7 +18,8 @@ __all__ = ["MAX_LOGGED", "MAX_SESSIONS", "MAX_WAITING", "WRITE_LIMIT", "Connecti
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_SESSIONS = 16
-"""Connections at a time; more are closed at once. The real camera's bound is not published."""
+"""Connections at a time. For a newcomer the one makes room that waits for its login for longest;
+where all are logged in, it is closed at once. The real camera's bound is not published."""
 
 MAX_WAITING = 1 << 16
 """Bytes of commands that wait behind one under way; more are left to the network."""
@@ -75,7 +76,7 @@ class Connection(asyncio.Protocol):
         self.peer = f"{address[0]}:{address[1]}" if address else "?"
         number = self._emulator.enter(self)
         if number is None:
-            self.close(f"{MAX_SESSIONS} connections are open already")
+            self.close("no place is free")
             return
         self.number = number
         self._say(self._emulator.greeting(number))

@@ -14,9 +14,9 @@ import os
 import socket
 import struct
 from abc import ABC, abstractmethod
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Protocol, cast
 
+from smartcam.accepting import Acceptor
 from smartcam.emulator.passage import Passage, Watch
 from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
 from smartcam.protocols import messages as m
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from smartcam.protocols.framing import Frame
 
 __all__ = [
-    "ACCEPT_PAUSE",
     "FAREWELL",
     "MAX_INPUT",
     "MAX_LINKS",
@@ -51,10 +50,8 @@ MAX_INPUT = 1 << 16
 script manual p. 35, published for that side)."""
 
 MAX_LINKS = 32
-"""Clients that are looked at. The camera serves one; a few more may wait to take over."""
-
-ACCEPT_PAUSE = 1.0
-"""Seconds until the next try where the system has no socket left."""
+"""Clients that are looked at. The camera serves one; a few more may wait to take over. A newcomer
+always gets in: the one without a session for longest makes room."""
 
 WRITE_LIMIT = 1 << 20
 """Bytes kept for a client that does not read, or held back by faults; more end its connection."""
@@ -171,6 +168,9 @@ class Link(ABC):
         if self._passage is None or not self._passage.dead:
             self.close(reason)
 
+    def unseated(self) -> None:  # noqa: B027  only where links have an order of their own
+        """The client has given the session back; it may stay."""
+
     def heard(self) -> None:
         """The camera heard something: write what it said to it."""
         self.flush()
@@ -259,12 +259,11 @@ class _TcpLink(Link, asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
         self.peer = _peer_text(transport.get_extra_info("peername"))
-        self._listener.links.add(self)
         if self._listener.down:
             self.close("the camera is down")
             return
-        if len(self._listener.links) > MAX_LINKS:
-            self.close(f"{MAX_LINKS} connections are open already")
+        self._listener.enter(self)
+        if self.closed:
             return
         # the camera does so too (newest SC manual p. 40: published)
         with contextlib.suppress(OSError):  # the client may be gone already
@@ -294,7 +293,7 @@ class _TcpLink(Link, asyncio.Protocol):
             self._farewell.cancel()
         by_client = not self.closed
         self._leave()
-        self._listener.links.discard(self)
+        self._listener.links.pop(self, None)
         with self._station.step():
             self._station.lost(self)
         self._station.parted(self, by_client=by_client, reset=exc is not None)
@@ -308,8 +307,13 @@ class _TcpLink(Link, asyncio.Protocol):
         self._transport.write(data)
         return True
 
+    def unseated(self) -> None:
+        if self in self._listener.links:
+            del self._listener.links[self]
+            self._listener.links[self] = None
+
     def close(self, reason: str) -> None:
-        self._listener.links.discard(self)
+        self._listener.links.pop(self, None)
         if not self.closed:
             self._leave()
             _log.info("= %s: connection closed: %s", self.peer, reason)
@@ -346,9 +350,16 @@ class _TcpLink(Link, asyncio.Protocol):
 
 
 class Listener(ABC):
-    """The camera's port; it can be shut and opened again."""
+    """The camera's port; it can be shut and opened again.
+
+    Attributes:
+        crowded_out: links that made room for newcomers.
+    """
 
     kind: socket.SocketKind
+
+    def __init__(self) -> None:
+        self.crowded_out: int = 0
 
     @property
     @abstractmethod
@@ -375,22 +386,19 @@ class Listener(ABC):
 
 
 class TcpListener(Listener):
-    """Accepts connections.
-
-    Not by ``asyncio.Server``: a connection that it has accepted but not yet wrapped when it is
-    closed stays open until the garbage collector finds it, and a client would wait for ever.
-    """
+    """Accepts connections."""
 
     kind = socket.SOCK_STREAM
 
     def __init__(self, station: Station) -> None:
-        self.links: set[_TcpLink] = set()
+        super().__init__()
+        self.links: dict[_TcpLink, None] = {}  # the one without a session for longest stands first
         self.down: bool = True
         """Whether connections that were accepted before are too late."""
         self._station = station
-        self._socket: socket.socket | None = None
-        self._waiting: asyncio.Task[None] | asyncio.TimerHandle | None = None
-        self._adopting: set[asyncio.Task[Any]] = set()
+        self._acceptor = Acceptor(
+            lambda: _TcpLink(self, self._station), _log, name="smartcam.emulator"
+        )
 
     @property
     def all_links(self) -> list[Link]:
@@ -399,9 +407,8 @@ class TcpListener(Listener):
 
     async def serve(self, sock: socket.socket) -> None:
         """Serve a bound socket that listens."""
-        self._socket = sock
         self.down = False
-        self._listen(sock)
+        self._acceptor.open(sock)
 
     def shut(self) -> None:
         """Close the port and every link, at once; the socket is its owner's to close."""
@@ -412,69 +419,20 @@ class TcpListener(Listener):
 
     def close_port(self) -> None:
         """Close the port, at once; the socket is its owner's to close."""
-        sock, self._socket = self._socket, None
-        if sock is not None:
-            with contextlib.suppress(NotImplementedError):
-                asyncio.get_running_loop().remove_reader(sock)
-        if self._waiting is not None:
-            self._waiting.cancel()
-            self._waiting = None
+        self._acceptor.close()
 
     async def wait_closed(self) -> None:
         """Wait until the event loop has let go of all sockets."""
-        if self._adopting:
-            await asyncio.wait(self._adopting)
+        await self._acceptor.wait_closed()
         await super().wait_closed()
 
-    def _listen(self, sock: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        try:
-            loop.add_reader(sock, self._accept, sock)
-        except NotImplementedError:  # Windows' proactor
-            self._waiting = loop.create_task(
-                self._accept_for_ever(sock), name="smartcam.emulator.accept"
-            )
-
-    def _accept(self, sock: socket.socket) -> None:
-        try:
-            connection, _ = sock.accept()
-        except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-            return  # the client has changed its mind
-        except OSError as exc:  # no file descriptor is left: the reader would call without end
-            _log.warning("! a connection cannot be accepted: %s", exc)
-            loop = asyncio.get_running_loop()
-            loop.remove_reader(sock)
-            self._waiting = loop.call_later(ACCEPT_PAUSE, self._listen, sock)
-            return
-        connection.setblocking(False)
-        self._adopt(connection)
-
-    async def _accept_for_ever(self, sock: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, _ = await loop.sock_accept(sock)
-            except OSError as exc:
-                _log.warning("! a connection cannot be accepted: %s", exc)
-                await asyncio.sleep(ACCEPT_PAUSE)
-            else:
-                self._adopt(connection)
-
-    def _adopt(self, connection: socket.socket) -> None:
-        """Make a link of an accepted connection; one that is too late is closed by its link."""
-        loop = asyncio.get_running_loop()
-        task = loop.create_task(
-            loop.connect_accepted_socket(lambda: _TcpLink(self, self._station), connection),
-            name="smartcam.emulator.adopt",
-        )
-        self._adopting.add(task)
-        task.add_done_callback(partial(self._adopted, connection))
-
-    def _adopted(self, connection: socket.socket, task: asyncio.Task[Any]) -> None:
-        self._adopting.discard(task)
-        if task.cancelled() or task.exception() is not None:
-            _log.warning("! an accepted connection was lost: %s", task)
-            connection.close()
+    def enter(self, link: _TcpLink) -> None:
+        """Take a new connection; where there are too many, another one makes room."""
+        self.links[link] = None
+        if len(self.links) > MAX_LINKS:
+            self.crowded_out += 1
+            one = next(one for one in self.links if not self._station.serves(one))
+            one.close(f"{MAX_LINKS} others are open, it was without a session for longest")
 
 
 # ---------------------------------------------------------------------- UDP
@@ -534,6 +492,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
     kind = socket.SOCK_DGRAM
 
     def __init__(self, station: Station) -> None:
+        super().__init__()
         self.links: dict[Any, _UdpLink] = {}  # the one that was heard last stands last
         self._station = station
         self._transport: asyncio.DatagramTransport | None = None
@@ -574,6 +533,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         link = self.links.pop(addr, None) or _UdpLink(self, self._station, addr)
         self.links[addr] = link
         if len(self.links) > MAX_LINKS:
+            self.crowded_out += 1
             next(old for old in self.all_links if not self._station.serves(old)).close("idle")
         link.datagram_received(data)
 

@@ -268,6 +268,11 @@ class EmulatedCamera:
         return [link.peer for link in self._listener.all_links]
 
     @property
+    def crowded_out(self) -> int:
+        """Clients without a session that were sent away because too many were connected."""
+        return self._listener.crowded_out
+
+    @property
     def faults(self) -> list[Fault]:
         """The faults that still wait, in the order in which they were given."""
         return self.queue.waiting
@@ -486,6 +491,7 @@ class EmulatedCamera:
             if isinstance(message, m.Disconnect):
                 self._collect()
                 self._active = None
+                link.unseated()
         self._collect()
         self.device.tell_entered()
         if faults:

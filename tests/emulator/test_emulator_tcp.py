@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from typing import TYPE_CHECKING, Any
@@ -356,9 +357,69 @@ async def test_tcp_connections_are_bounded(
     emulator: EmulatedCamera, session: TcpClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(links, "MAX_LINKS", 2)
-    async with await TcpClient.open(emulator), await TcpClient.open(emulator) as third:
-        await third.expect_end()
-    await session.expect_nothing_but(wire.QUERY, wire.ACTIVE_1)
+    async with await TcpClient.open(emulator) as second, await TcpClient.open(emulator) as third:
+        await second.expect_end()
+        await session.expect_nothing_but(wire.QUERY, wire.ACTIVE_1)
+        assert (len(emulator.links), emulator.crowded_out) == (2, 1)
+        third.send(wire.CONNECT)
+        await third.expect(*HELLO)
+
+
+async def test_tcp_client_always_gets_in(
+    emulator: EmulatedCamera, session: TcpClient, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        idle = [
+            await stack.enter_async_context(await TcpClient.open(emulator))
+            for _ in range(3 * links.MAX_LINKS)
+        ]
+        for client in idle[::2]:
+            client.send(wire.QUERY, wire.MAGIC)  # what it says without a session does not count
+        await session.expect_nothing_but(wire.QUERY, wire.ACTIVE_1)
+        with caplog.at_level(logging.INFO, logger="smartcam.emulator"):
+            newcomer = await stack.enter_async_context(await TcpClient.open(emulator))
+            newcomer.send(wire.CONNECT)
+            await newcomer.expect(*HELLO)
+        assert "32 others are open, it was without a session for longest" in caplog.text
+        await session.expect_end()
+        for client in idle[: 2 * links.MAX_LINKS]:
+            await client.expect_end()
+        assert len(emulator.links) <= links.MAX_LINKS
+        assert emulator.crowded_out == 2 * links.MAX_LINKS + 2
+        assert [one.ended_by for one in emulator.visits] == ["camera"] * len(emulator.visits)
+
+
+async def test_tcp_client_that_had_a_session_makes_room_after_those_that_had_none(
+    emulator: EmulatedCamera, session: TcpClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(links, "MAX_LINKS", 3)
+    async with await TcpClient.open(emulator) as first, await TcpClient.open(emulator) as second:
+        first.send(wire.QUERY)
+        second.send(wire.QUERY)
+        session.send(wire.DISCONNECT)
+        await emulator.wait_received(m.Query, count=2)
+        await emulator.wait_received(m.Disconnect)
+        async with await TcpClient.open(emulator), await TcpClient.open(emulator):
+            await first.expect_end()
+            await second.expect_end()
+            session.send(wire.CONNECT)
+            await session.expect(*HELLO)
+
+
+async def test_tcp_client_without_a_session_holds_one_frame_at_most(
+    emulator: EmulatedCamera, client: TcpClient
+) -> None:
+    listener: Any = emulator._listener
+    bomb = wire.MAGIC + (links.MAX_INPUT + 1).to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
+    half = wire.MAGIC + links.MAX_INPUT.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
+    half += bytes(links.MAX_INPUT - 1)
+    client.send(bomb, bytes(3 * links.MAX_INPUT), half)
+    await until(lambda: len(listener.links) == 1)
+    (link,) = listener.links
+    await until(lambda: link._machine.buffered == len(half))
+    client.send(b"!")  # which makes it a whole one
+    await emulator.wait_received(0x21)
+    assert link._machine.buffered == 0
 
 
 # ---------------------------------------------------------------------- the operator

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import socket
 
 import insight_wire as wire
 import numpy as np
@@ -133,6 +135,40 @@ async def test_connection_too_many_is_closed() -> None:
         client = await stack.enter_async_context(await TelnetClient.open(emulator))
         await client.expect_end()
         assert len(emulator.links) == MAX_SESSIONS
+
+
+async def test_client_always_gets_in_where_not_all_are_logged_in() -> None:
+    async with EmulatedInSight() as emulator, contextlib.AsyncExitStack() as stack:
+        first = await stack.enter_async_context(await TelnetClient.log_in(emulator))
+        idle = [
+            await stack.enter_async_context(await TelnetClient.open(emulator))
+            for _ in range(3 * MAX_SESSIONS)
+        ]
+        async with await TelnetClient.open(emulator) as client:
+            await client.expect(wire.GREETING.replace(b"0\r", b"4\r"))
+            await client.ask(b"admin\r\n", wire.PASSWORD)
+            await client.ask(b"\r\n", wire.LOGGED_IN)
+            for one in idle[: 2 * MAX_SESSIONS]:
+                await one.reader.read()  # to its end
+            await first.ask(b"GO\r\n", b"0\r\n")
+            assert len(emulator.links) == MAX_SESSIONS
+            assert emulator.crowded_out == 2 * MAX_SESSIONS + 2
+
+
+@pytest.mark.parametrize("rounds", range(6))
+async def test_stop_while_a_client_is_being_accepted_leaves_nothing(rounds: int) -> None:
+    emulator = EmulatedInSight()
+    await emulator.start()
+    sock = socket.create_connection((emulator.host, emulator.port))
+    for _ in range(rounds):
+        await asyncio.sleep(0)
+    await emulator.stop()
+    sock.settimeout(5)
+    with sock, contextlib.suppress(ConnectionResetError):
+        while sock.recv(100):
+            pass
+    assert emulator.links == []
+    assert len(asyncio.all_tasks()) == 1
 
 
 async def test_clients_are_served_side_by_side() -> None:
