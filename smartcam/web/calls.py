@@ -7,6 +7,7 @@ plain functions: what they do to an emulator is done when they return.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import inspect
 import json
 import logging
@@ -19,6 +20,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import jsonable
+from smartcam.web.places import visitor_of
 from smartcam.web.refusals import RefusedError, refused_fields, shown
 
 if TYPE_CHECKING:
@@ -96,9 +98,11 @@ class Call(Generic[C]):
             query=_checked_query(self.query, request),
             body=await self._read_body(request),
         )
-        value = self.handler(site, ask)
-        if inspect.isawaitable(value):
-            value = await value
+        visitor = visitor_of(request)
+        with contextlib.nullcontext() if visitor is None else visitor.answer():
+            value = self.handler(site, ask)
+            if inspect.isawaitable(value):
+                value = await value
         return value if isinstance(value, web.StreamResponse) else _json(200, value)
 
     async def _read_body(self, request: web.Request) -> Any:
@@ -182,7 +186,7 @@ def routes(calls: Iterable[Call[C]], site: C) -> list[web.RouteDef]:
 
 
 def middleware(guard: Guard, prefix: str) -> Any:
-    """Return what stands before all handlers: the guard, and refusals as JSON.
+    """Return what stands before all handlers: the connection's place, the guard, refusals as JSON.
 
     Args:
         guard: the site's.
@@ -190,6 +194,14 @@ def middleware(guard: Guard, prefix: str) -> Any:
     """
 
     @web.middleware
+    async def placed(request: web.Request, handler: _Handler) -> web.StreamResponse:
+        visitor = visitor_of(request)
+        with contextlib.nullcontext() if visitor is None else visitor.request(request):
+            response = await guarded(request, handler)
+        if not request.content.is_eof():
+            response.force_close()
+        return response
+
     async def guarded(request: web.Request, handler: _Handler) -> web.StreamResponse:
         try:
             guard.check(request, is_call=request.path.startswith(prefix))
@@ -198,6 +210,8 @@ def middleware(guard: Guard, prefix: str) -> Any:
             refusal = exc
         except web.HTTPException as exc:
             refusal = _translated(exc, prefix)
+        except ConnectionError:
+            refusal = RefusedError(400, "a connection that ended", "the whole of a request")
         except ConfigurationError as exc:
             refusal = RefusedError(422, str(exc), "what this camera has")
         except Exception:  # noqa: BLE001  the last place: the client is told
@@ -206,7 +220,7 @@ def middleware(guard: Guard, prefix: str) -> Any:
         tried = f"{request.method} {request.path}"
         return _json(refusal.status, refusal.as_json(shown(tried)[1:-1]), refusal.headers)
 
-    return guarded
+    return placed
 
 
 def _translated(error: web.HTTPException, prefix: str) -> RefusedError:

@@ -14,10 +14,11 @@ from smartcam.web import shown
 from smartcam.web.calls import Ask, Call, as_table
 from smartcam.web.refusals import RefusedError
 from smartcam.web.site import API, Site
+from smartcam.web.streams import is_open
 from smartcam.web.watching import Watcher
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
     from types import TracebackType
     from typing import Self
 
@@ -32,6 +33,7 @@ __all__ = [
     "MAX_NAMES",
     "MAX_PARTS",
     "MAX_WAIT",
+    "MAX_WAITING",
     "EmulatorSite",
 ]
 
@@ -40,6 +42,9 @@ MAX_ENTRIES = 1000
 
 MAX_WAIT = 30.0
 """Seconds that a call waits for a log entry at most."""
+
+MAX_WAITING = 16
+"""Calls that wait for one at a time. With the event streams they leave half of the places free."""
 
 LOOK_AGAIN = 0.02
 """Seconds between two looks for it."""
@@ -86,6 +91,7 @@ class EmulatorSite:
                 raise ConfigurationError(f"web: {name!r} cannot stand in a path: name the camera")
         self.cameras: Mapping[str, EmulatedCamera] = cameras
         self._site = Site(self, CALLS, "emulator", host=host, port=port, token=token)
+        self._waiting = 0
 
     @property
     def url(self) -> str:
@@ -139,6 +145,25 @@ class EmulatorSite:
     async def pause(self, seconds: float) -> bool:
         """Wait for some time; True at once where the site stops."""
         return await self._site.streams.pause(seconds)
+
+    async def wait_for(
+        self, request: web.Request, condition: Callable[[], bool], seconds: float
+    ) -> None:
+        """Wait until something holds, for some time, and as long as site and client are there.
+
+        Raises:
+            RefusedError: 503, :data:`MAX_WAITING` calls wait already.
+        """
+        if self._waiting >= MAX_WAITING:
+            raise RefusedError(503, f"waiting call {MAX_WAITING + 1}", f"{MAX_WAITING} at one time")
+        self._waiting += 1
+        try:
+            deadline = time.monotonic() + seconds
+            while time.monotonic() < deadline and is_open(request) and not condition():
+                if await self.pause(LOOK_AGAIN):
+                    break
+        finally:
+            self._waiting -= 1
 
     def serve_events(self, request: web.Request, watcher: Watcher) -> Awaitable[web.StreamResponse]:
         """Serve an event stream."""
@@ -354,10 +379,12 @@ def _reset_scene(site: EmulatorSite, ask: Ask) -> object:
 async def _log(site: EmulatorSite, ask: Ask) -> object:
     emulator, part = _emulator(site, ask), ask.query
     since: int = part.since or 0
-    deadline = time.monotonic() + part.wait
-    while time.monotonic() < deadline and not emulator.log.since(since, 1)[0]:
-        if await site.pause(LOOK_AGAIN):
-            break
+
+    def came() -> bool:
+        return bool(emulator.log.since(since, 1)[0])
+
+    if part.wait:
+        await site.wait_for(ask.request, came, part.wait)
     return shown.log_part(emulator, since, part.limit)[0]
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import importlib.resources
+import logging
 import socket
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from aiohttp import web
 
+from smartcam.accepting import Acceptor
 from smartcam.exceptions import ConfigurationError
 from smartcam.web.calls import MAX_BODY, middleware, routes
 from smartcam.web.guard import HEADERS, Guard, checked_token, is_loopback, new_token
+from smartcam.web.places import KEEP_ALIVE, Places
 from smartcam.web.streams import Streams
 
 if TYPE_CHECKING:
@@ -21,7 +24,9 @@ if TYPE_CHECKING:
 
     from smartcam.web.calls import Call
 
-__all__ = ["API", "FAREWELL", "Site"]
+__all__ = ["API", "BACKLOG", "FAREWELL", "RESOLVE_TIMEOUT", "Site"]
+
+_log = logging.getLogger("smartcam.web")
 
 API = "/api"
 """Prefix of the paths of all calls."""
@@ -29,8 +34,8 @@ API = "/api"
 FAREWELL = 0.2
 """Seconds that an answer under way gets when the site stops, twice."""
 
-KEEP_ALIVE = 60.0
-"""Seconds that a connection stays open without a request."""
+BACKLOG = 128
+"""Connections that wait for being accepted; the system keeps them."""
 
 RESOLVE_TIMEOUT = 10.0
 """Seconds that the look-up of the host's address may take."""
@@ -83,7 +88,7 @@ class Site(Generic[S]):
         self._calls = tuple(calls)
         self._page = page
         self._port = port
-        self._runner: web.AppRunner | None = None
+        self._open: _Open | None = None
 
     @property
     def port(self) -> int:
@@ -121,7 +126,7 @@ class Site(Generic[S]):
 
         Cancellation: leaves it stopped.
         """
-        if self._runner is not None:
+        if self._open is not None:
             return
         self.streams = Streams()
         runner = web.AppRunner(
@@ -129,6 +134,7 @@ class Site(Generic[S]):
             access_log=None,
             shutdown_timeout=FAREWELL,
             keepalive_timeout=KEEP_ALIVE,
+            logger=_Calm(_log),
         )
         try:
             listener = await _listen(self.host, self._port, local=self.token is None)
@@ -136,24 +142,23 @@ class Site(Generic[S]):
             raise ConfigurationError(f"web: cannot listen on {self.base}: {exc}") from exc
         try:
             await runner.setup()
-            await web.SockSite(runner, listener).start()
         except BaseException:
             listener.close()
             await runner.cleanup()
             raise
         self._port = listener.getsockname()[1]
-        self._runner = runner
+        self._open = _Open(runner, listener)
 
     async def stop(self) -> None:
         """Close the port, every stream and every connection; does nothing if stopped.
 
         Cancellation: takes effect when all is closed, which two :data:`FAREWELL` take at most.
         """
-        runner, self._runner = self._runner, None
-        if runner is None:
+        opened, self._open = self._open, None
+        if opened is None:
             return
         self.streams.close()
-        closing = asyncio.ensure_future(runner.cleanup())
+        closing = asyncio.ensure_future(opened.close())
         try:
             await asyncio.shield(closing)
         except asyncio.CancelledError:
@@ -171,6 +176,39 @@ class Site(Generic[S]):
         for suffix in ("js", "css"):
             application.router.add_get(f"/{self._page}.{suffix}", _file(f"{self._page}.{suffix}"))
         return application
+
+
+class _Open:
+    """A site's port while it is open.
+
+    Not aiohttp's: that takes as many connections as come, and ``asyncio.Server`` fills the log
+    where there are too many.
+    """
+
+    def __init__(self, runner: web.AppRunner, listener: socket.socket) -> None:
+        if runner.server is None:
+            raise RuntimeError("the runner is not set up")
+        self.places: Places = Places(runner.server)
+        self._runner = runner
+        self._listener = listener
+        self._acceptor = Acceptor(self.places, _log, name="smartcam.web")
+        self._acceptor.open(listener)
+
+    async def close(self) -> None:
+        """Close port and connections."""
+        self.places.closed = True
+        self._acceptor.close()
+        self._listener.close()
+        await self._acceptor.wait_closed()
+        await self._runner.cleanup()
+
+
+class _Calm(logging.LoggerAdapter[logging.Logger]):
+    """Takes what aiohttp logs. It is about what clients send wrong: no errors with tracebacks."""
+
+    def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
+        """Log it at INFO at most."""
+        super().log(min(level, logging.INFO), msg, *args, **kwargs)
 
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
@@ -200,4 +238,6 @@ async def _listen(host: str, port: int, *, local: bool) -> socket.socket:
     family, _, _, _, address = found[0]
     if local and not is_loopback(str(address[0])):
         raise ValueError(f"{host} is {address[0]} here, which needs a token")
-    return socket.create_server((address[0], port), family=family, backlog=128)
+    listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)
+    listener.setblocking(False)
+    return listener

@@ -20,7 +20,7 @@ from smartcam.web.refusals import RefusedError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-__all__ = ["MAX_STREAMS", "PERIOD", "SLOW", "News", "Streams"]
+__all__ = ["MAX_STREAMS", "PERIOD", "SLOW", "News", "Streams", "is_open"]
 
 _log = logging.getLogger("smartcam.web")
 
@@ -83,10 +83,10 @@ class Streams:
         self._count += 1
         try:
             await response.prepare(request)
-            while not self._closing.is_set() and _is_open(request):
+            while not self._closing.is_set() and is_open(request):
                 await _write(response, "".join(one.as_text() for one in look()))
                 await self.pause(PERIOD)
-            if _is_open(request):
+            if is_open(request):
                 await _write(response, None)
         except TimeoutError:
             _log.info("= %s: event stream ended, its reader is too slow", request.remote)
@@ -110,7 +110,8 @@ class Streams:
         return self._closing.is_set()
 
 
-def _is_open(request: web.Request) -> bool:
+def is_open(request: web.Request) -> bool:
+    """Whether the client is still there."""
     transport = request.transport
     return transport is not None and not transport.is_closing()
 
