@@ -81,7 +81,9 @@ def test_log_that_was_full_is_told_and_is_no_proof(emulator: ThreadedCamera) -> 
         log.expect(m.Query, "QueryAnswer")
         assert log.pushed_out == 0
         emulator.run(lambda camera: setattr(camera.log, "maxlen", 3))
-    with talk(emulator, CONNECT, DISCONNECT):
+    with talk(emulator, CONNECT) as client:
+        emulator.wait_received(m.Connect, count=2)
+        client.sendall(DISCONNECT)
         emulator.wait_received(m.Disconnect)
     gone = f"{log.pushed_out} older entries were pushed out of the full log\n"
     log.expect("ConnectAnswer", "Disconnect")  # what is there is there

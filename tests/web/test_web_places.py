@@ -248,6 +248,18 @@ async def test_client_that_goes_in_the_middle_of_its_body_is_no_error(
     assert [one for one in caplog.records if one.levelno > logging.INFO] == []
 
 
+@pytest.mark.parametrize("rounds", range(6))
+async def test_site_that_stops_while_a_client_is_accepted_leaves_nothing(rounds: int) -> None:
+    async with served() as world:
+        sock = socket.create_connection(("127.0.0.1", world.site.port))
+        for _ in range(rounds):
+            await asyncio.sleep(0)
+        await world.site.stop()
+        sock.settimeout(5)
+        with sock, contextlib.suppress(ConnectionResetError):
+            assert sock.recv(1) == b""
+
+
 # ---------------------------------------------------------------------- what is told of it
 
 
