@@ -13,6 +13,8 @@ import collections
 import contextlib
 import logging
 import socket
+import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,7 +25,7 @@ from smartcam.protocols.machine import Event, LinkFailed, LinkMachine, ResultBur
 from smartcam.protocols.messages import Disconnect, Message, Sender
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from smartcam.protocols.base import Protocol
     from smartcam.protocols.framing import Frame
@@ -32,20 +34,23 @@ __all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
 
 logger: logging.Logger = logging.getLogger("smartcam.connection")
 
-MAX_CHUNKS = 256
-"""Chunks that wait for the receive task, where one is normal; beyond this TCP stops reading and UDP
-drops, which is counted."""
+MAX_CHUNKS = 2
+"""Chunks that wait for the receive task before TCP stops reading; it does so sooner where one is
+more than the task takes in a turn. It reads on when none is left: a camera that is faster than its
+results can be told has to wait itself."""
 
-MAX_QUEUED = 1 << 18
-"""Bytes whose events wait for the receive task; beyond this TCP stops reading. A large frame counts
-when it is whole, so one of those may wait beyond it."""
+MAX_DATAGRAMS = 256
+"""Datagrams that wait for it, where one is normal; beyond this they are dropped and counted."""
 
-CHUNK_EVENTS = 64
-"""Events of a chunk, each container counted: what one camera may have done in a turn of the event
-loop, half a millisecond or less."""
+TURN = 0.00015
+"""Seconds that the receive task takes in one turn of the event loop, about: from how long a chunk
+took follows how much the next one holds."""
 
-FEW_EVENTS = 4
-"""So many events are one chunk without a look at what they weigh: bursts are bounded as well."""
+CHUNK_FRAMES = (8, 256)
+"""Frames that a chunk holds at most, where they take long and where they do not."""
+
+FIRST_CHUNK = 64
+"""Frames of the first chunk, when it is not known how long they take."""
 
 MAX_REST = 256
 """Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
@@ -57,12 +62,14 @@ class Chunk(NamedTuple):
     Attributes:
         received_at: loop time when it came.
         events: what it gave, in order.
-        size: bytes that came since the chunk before; 0 for what is not a delivery's first.
+        size: bytes that came since the chunk before; 0 for the rest of one.
+        frames: in how many frames the events came.
     """
 
     received_at: float
     events: list[Event]
     size: int = 0
+    frames: int = 1
 
 
 class TraceEntry(NamedTuple):
@@ -123,8 +130,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._replies = machine.replies
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
-        self._queued = 0  # bytes that the chunks stand for
-        self._handed_on = 0  # bytes that came until the last chunk
+        self._bytes = self._frames = 0  # that came until the last chunk
+        self._most = FIRST_CHUNK  # frames of the next chunk
+        self._busy_since: float | None = None  # with the last chunk, where it was a large one
+        self._busy_with = 0
         self._doorbell = Doorbell(self._loop)  # of the task that receives
         self._closed: asyncio.Future[None] = self._loop.create_future()
         self._loss: BaseException | None = None
@@ -171,6 +180,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
         Cancellation: safe, nothing is lost.
         """
+        if self._busy_since is not None:
+            self._adapt(self._busy_since)
         if self._chunks:
             await asyncio.sleep(0)  # others have their turn
         while not self._chunks:
@@ -178,8 +189,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 raise self.lost_error()
             await self._doorbell
         chunk = self._chunks.popleft()
-        self._queued -= chunk.size
-        if self._paused and len(self._chunks) < MAX_CHUNKS // 2 and self._queued < MAX_QUEUED // 2:
+        if chunk.frames > self._most:
+            chunk, rest = split(chunk, self._most)
+            self._chunks.appendleft(rest)
+        if chunk.frames >= CHUNK_FRAMES[0]:
+            self._busy_since, self._busy_with = time.perf_counter(), chunk.frames
+        if self._paused and not self._chunks:
             self._resume()
         return chunk
 
@@ -269,7 +284,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""
         self.heard_at = self._loop.time()
-        if len(self._chunks) >= MAX_CHUNKS:
+        if len(self._chunks) >= MAX_DATAGRAMS:
             self.machine.counters.ignored_frames += 1
             return
         self.machine.receive_data(data)
@@ -323,24 +338,28 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         events = self.machine.events()
         if not events or self._closing:
             return
-        received = self.machine.counters.bytes_received
-        size, self._handed_on = received - self._handed_on, received
-        self._queued += size
-        if len(events) <= FEW_EVENTS:
-            self._chunks.append(Chunk(self.heard_at, events, size))
-        else:
-            for some in portions(events):
-                self._chunks.append(Chunk(self.heard_at, some, size))
-                size = 0
+        counters = self.machine.counters
+        size, self._bytes = counters.bytes_received - self._bytes, counters.bytes_received
+        frames, self._frames = counters.frames_received - self._frames, counters.frames_received
+        self._chunks.append(Chunk(self.heard_at, events, size, frames))
         last = events[-1]
         if isinstance(last, LinkFailed):
             self._lose(last.error)
             self._transport.abort()
         elif not self._paused and self.machine.transport is Transport.TCP:
-            self._paused = len(self._chunks) >= MAX_CHUNKS or self._queued >= MAX_QUEUED
+            self._paused = frames > self._most or len(self._chunks) >= MAX_CHUNKS
             if self._paused:
                 self._transport.pause_reading()
         self._doorbell.ring()
+
+    def _adapt(self, since: float) -> None:
+        """Have the next chunks hold as much as one turn takes, by how long the last one took."""
+        self._busy_since = None
+        took = time.perf_counter() - since
+        least, most = CHUNK_FRAMES
+        frames = int(self._busy_with * TURN / max(took, 1e-9))
+        frames = max(frames, self._most // 2)  # it may have been another process
+        self._most = max(least, min(most, frames))
 
     def _resume(self) -> None:
         if self._paused:
@@ -361,18 +380,23 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._doorbell.ring()
 
 
-def portions(events: list[Event]) -> Iterator[list[Event]]:
-    """Give events in lists of about :data:`CHUNK_EVENTS`, each container of a burst counted."""
-    some: list[Event] = []
-    weight = 0
-    for event in events:
-        weight += len(event.data) if type(event) is ResultBurst else 1
+def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
+    """Return a chunk of so many frames from a larger one, and its rest; a burst may be cut."""
+    some, left = list[Event](), frames
+    rest = collections.deque(chunk.events)
+    while left > 0 and rest:
+        event = rest.popleft()
+        if type(event) is ResultBurst:
+            if len(event.data) > left:
+                rest.appendleft(replace(event, data=event.data[left:]))
+                event = replace(event, data=event.data[:left])
+            left -= len(event.data)
+        else:
+            left -= 1
         some.append(event)
-        if weight >= CHUNK_EVENTS:
-            yield some
-            some, weight = [], 0
-    if some:
-        yield some
+    taken = frames - left
+    first = chunk._replace(events=some, frames=taken)
+    return first, chunk._replace(events=list(rest), size=0, frames=chunk.frames - taken)
 
 
 async def open_link(

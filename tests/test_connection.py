@@ -170,7 +170,10 @@ async def test_receive_cancelled_loses_nothing(server: Listener) -> None:
 # ---------------------------------------------------------------------- one chunk in a turn
 
 
-async def test_receive_takes_one_chunk_in_a_turn_of_the_loop(server: Listener) -> None:
+async def test_receive_takes_one_chunk_in_a_turn_of_the_loop(
+    server: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "MAX_CHUNKS", 8)
     link, peer = await session(server)
     for _ in range(3):
         await deliver(link, peer, BUSY)
@@ -190,14 +193,19 @@ async def test_receive_takes_one_chunk_in_a_turn_of_the_loop(server: Listener) -
     link.abort()
 
 
-async def test_delivery_with_many_events_is_several_chunks(server: Listener) -> None:
+async def test_delivery_with_many_frames_is_taken_in_several_turns(
+    server: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "CHUNK_FRAMES", (64, 64))
     link, peer = await session(server)
     await deliver(link, peer, RESULT * 120 + BUSY * 10)
+    assert not link._transport.is_reading()
     chunks = [await link.receive() for _ in range(3)]
+    assert [chunk.frames for chunk in chunks] == [64, 64, 2]
     assert [sum(map(weight, chunk.events)) for chunk in chunks] == [64, 64, 2]
-    assert [chunk.size > 0 for chunk in chunks] == [True, False, False]
+    assert [chunk.size for chunk in chunks] == [120 * len(RESULT) + 10 * len(BUSY), 0, 0]
     assert len({chunk.received_at for chunk in chunks}) == 1
-    assert link._queued == 0
+    assert link._transport.is_reading()
     link.abort()
 
 
@@ -205,22 +213,20 @@ def weight(event: Event) -> int:
     return len(event.data) if isinstance(event, ResultBurst) else 1
 
 
-async def test_queued_bytes_pause_reading_then_everything_arrives(
-    server: Listener, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("took", "frames"),
+    [(0.0, 256), (connection.TURN, 64), (connection.TURN * 1.5, 42), (60.0, 32)],
+)
+async def test_chunk_is_as_large_as_a_turn_takes(
+    server: Listener, took: float, frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection, "MAX_QUEUED", 1000)
+    now = [0.0]
+    monkeypatch.setattr(connection.time, "perf_counter", lambda: now[0])
     link, peer = await session(server)
-    large = HANDBOOK.encode(m.ResultContainer(application=21, data=bytes(990)))
-    await deliver(link, peer, large)
-    assert not link._transport.is_reading()
-    peer.write(large * 3)
-    expected = [m.ResultContainer(application=21, data=bytes(990))] * 4
-    found: list[Event] = []
-    async with asyncio.timeout(LIMIT):
-        while len(found) < 4:
-            found += one_by_one((await link.receive()).events)
-            assert link._queued <= 4 * len(large)
-    assert found == expected
+    await deliver(link, peer, RESULT * 400)
+    assert (await link.receive()).frames == connection.FIRST_CHUNK
+    now[0] += took
+    assert (await link.receive()).frames == frames
     link.abort()
 
 
@@ -425,11 +431,11 @@ async def test_queue_full_pauses_reading_then_everything_arrives(
     peer.write(BUSY * 100)
     await asyncio.sleep(0)
     assert len(link._chunks) == 8
-    assert await take(link, 4) == [RUNNING] * 4
+    assert await take(link, 7) == [RUNNING] * 7
     assert not link._transport.is_reading()
     assert await take(link, 1) == [RUNNING]
     assert link._transport.is_reading()
-    assert await take(link, 103) == [RUNNING] * 3 + [BUSY_REPORT] * 100
+    assert await take(link, 100) == [BUSY_REPORT] * 100
     link.abort()
 
 
@@ -595,7 +601,7 @@ async def test_udp_refused_port_is_lost() -> None:
 
 
 async def test_udp_queue_full_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "MAX_CHUNKS", 3)
+    monkeypatch.setattr(connection, "MAX_DATAGRAMS", 3)
     async with datagrams(connects) as camera:
         link = await udp_session(camera.port)
         camera.send(*[STATUS] * 5)

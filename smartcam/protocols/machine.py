@@ -37,11 +37,7 @@ __all__ = [
 ]
 
 
-MAX_BURST = 64
-"""Containers of one :class:`ResultBurst`: who takes it does so many at once, and nothing else."""
-
-
-MANY_EVENTS = 128
+MANY_EVENTS = 64
 """Events of one read beyond which the next one takes fewer bytes: cutting frames, and making
 messages of them, must not hold up other cameras."""
 
@@ -144,7 +140,7 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultBurst:
-    """Result containers of one application, one right after the other; :data:`MAX_BURST` at most.
+    """Two or more result containers of one application, one right after the other.
 
     The client's machine gives it for containers that came in one delivery, so that a camera that
     runs free costs no object for each. Iterating gives them one by one.
@@ -561,10 +557,7 @@ class Machine:
         if more:
             self.counters.frames_received += len(more)
             more.insert(0, first.data)
-            del self._events[-1]
-            for place in range(0, len(more), MAX_BURST):
-                some = more[place : place + MAX_BURST]
-                self._events.append(ResultBurst(application=first.application, data=some))
+            self._events[-1] = ResultBurst(application=first.application, data=more)
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
         """Whether the client shall see it: an answer that nothing asked for is counted only."""

@@ -13,7 +13,7 @@ from clientkit import balance
 
 import smartcam
 from smartcam import ConnectionClosedError, NotRunningError
-from smartcam.attribution import _Owed
+from smartcam.attribution import Run, _Owed
 from smartcam.emulator import EmulatedCamera
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ async def test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_res
 
 def _owe(camera: SmartCamera) -> None:
     """Have the client owe a result, as after a trigger that was given up."""
-    camera._inbox.attribution._owed.append(_Owed("late", None, 1))
+    camera._inbox.attribution._owed.append(_Owed("late", None, 1, Run(begun=True)))
 
 
 @pytest.mark.parametrize("dialect", ["handbook", "bid"])
