@@ -66,6 +66,7 @@ LIMITS = (
     "connection.MAX_CHUNKS",
     "connection.MAX_REST",
     "client.DEFAULT_MAX_QUEUE",
+    "client.DEFAULT_MAX_QUEUE_BYTES",
     "client.MAX_INTERPRETATIONS",
     "client.DEFAULT_TRIGGER_TIMEOUT",
     "handshake.DETECTION_SHARE",

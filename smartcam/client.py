@@ -47,6 +47,10 @@ QueueT = TypeVar("QueueT", bound=Queue[Any])
 DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
 
+DEFAULT_MAX_QUEUE_BYTES = 1 << 26
+"""Bytes of containers a subscriber's queue holds: 1024 of the 64 kB that a camera sends at most, so
+it bounds nothing but larger ones; what is made of them may take several times as much."""
+
 MAX_INTERPRETATIONS = 32
 """Texts given as ``interpret_as`` whose interpreters a client keeps."""
 
@@ -251,6 +255,7 @@ class SmartCamera:
         batch: Literal[False] = False,
         min_interval: float = 0.0,
         max_queue: int = DEFAULT_MAX_QUEUE,
+        max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[Result]: ...
 
@@ -261,6 +266,7 @@ class SmartCamera:
         batch: Literal[True],
         min_interval: float = 0.0,
         max_queue: int = DEFAULT_MAX_QUEUE,
+        max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> BatchSubscription[Result]: ...
 
@@ -270,6 +276,7 @@ class SmartCamera:
         batch: bool = False,
         min_interval: float = 0.0,
         max_queue: int = DEFAULT_MAX_QUEUE,
+        max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[Result] | BatchSubscription[Result]:
         """Subscribe to everything the camera sends, triggered or not; subscribed when called.
@@ -285,10 +292,19 @@ class SmartCamera:
                 for a camera that sends thousands a second. ``max_queue`` counts results.
             min_interval: seconds; results that come sooner after the last one are dropped.
             max_queue: results kept for a slow reader. One read of the link brings up to 32 KiB.
-            overflow: what happens beyond that.
+            max_queue_bytes: bytes that their containers may have together (``Result.raw``; values
+                may be larger). One that is larger alone is kept while no other is.
+            overflow: what happens beyond either.
         """
         kind = BatchSubscription[Result] if batch else Subscription[Result]
-        stream = kind("results", max_queue=max_queue, overflow=overflow, min_interval=min_interval)
+        stream = kind(
+            "results",
+            max_queue=max_queue,
+            max_queue_bytes=max_queue_bytes,
+            size_of=_size_of,
+            overflow=overflow,
+            min_interval=min_interval,
+        )
         return self._subscribed(self._inbox.result_streams, stream)
 
     def statuses(
@@ -780,6 +796,10 @@ class SmartCamera:
             ) from exc
         finally:
             self._inbox.next_results.discard(future)
+
+
+def _size_of(result: Result) -> int:
+    return len(result.raw)
 
 
 def _is_not_busy(status: Status) -> bool:

@@ -14,7 +14,6 @@ import contextlib
 import logging
 import socket
 import time
-from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -388,8 +387,8 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
         event = rest.popleft()
         if type(event) is ResultBurst:
             if len(event.data) > left:
-                rest.appendleft(replace(event, data=event.data[left:]))
-                event = replace(event, data=event.data[:left])
+                event, behind = event.cut(left)
+                rest.appendleft(behind)
             left -= len(event.data)
         else:
             left -= 1

@@ -389,7 +389,7 @@ class Inbox:
         if self.attribution.satisfied:
             self._note_extra(count)
         for stream in self.result_streams:
-            stream.offer_all(results, now)
+            stream.offer_all(results, now, burst.size)
 
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None where one may be anything else.
@@ -479,7 +479,8 @@ class Inbox:
             result = self._interpret(container, owner, now, at)
         except InterpretationError as error:
             account.count("late" if fate == "late" else "uninterpretable")
-            self._deliver_error(error, owner, number, now, current=current)
+            size = len(container.data)
+            self._deliver_error(error, owner, number, now, size=size, current=current)
         else:
             account.count(fate)
             self._deliver(result, owner, now, current=current)
@@ -538,7 +539,7 @@ class Inbox:
         if self._observed:
             self._observers.result(result)
         for stream in self.result_streams:
-            stream.offer(result, now)
+            stream.offer(result, now, len(result.raw))
         if current and self.next_results:
             for future in self._take_next_results():
                 future.set_result(result)
@@ -565,10 +566,13 @@ class Inbox:
         number: int | None,
         now: float,
         *,
+        size: int,
         current: bool,
     ) -> None:
+        if self.result_streams:
+            _let_go(error)
         for stream in self.result_streams:
-            stream.offer(error, now)
+            stream.offer(error, now, size)
         if current:
             for future in self._take_next_results():
                 future.set_exception(error)
@@ -601,3 +605,23 @@ class Inbox:
             expected=expected,
             got=container.application,
         )
+
+
+def _let_go(error: SmartCamError) -> None:
+    """Take the frames from an error that may wait in a queue: they hold a whole delivery's bytes.
+
+    What it came from gets a note instead that says where it was raised.
+    """
+    chain: list[BaseException | None] = [error]
+    while chain:
+        one = chain.pop()
+        place = one.__traceback__ if one is not None else None
+        if one is None or place is None:
+            continue
+        while place.tb_next is not None:
+            place = place.tb_next
+        if one is not error:
+            code = place.tb_frame.f_code
+            one.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
+        one.__traceback__ = None  # so that each comes once
+        chain += (one.__cause__, one.__context__)

@@ -343,6 +343,7 @@ class SubscriberStatistics:
         taken: items it took.
         dropped: items lost to the policy or to ``min_interval``.
         queued: items waiting.
+        queued_bytes: bytes of their containers; 0 for statuses and events.
     """
 
     name: str
@@ -351,6 +352,7 @@ class SubscriberStatistics:
     taken: int
     dropped: int
     queued: int
+    queued_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)

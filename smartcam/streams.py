@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import collections
 import enum
+import itertools
+import sys
 import weakref
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
@@ -12,7 +14,7 @@ from smartcam.exceptions import ConfigurationError, SmartCamError, SubscriberOve
 from smartcam.models import SubscriberStatistics
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterator, Sequence
     from types import TracebackType
     from typing import Self
 
@@ -31,6 +33,10 @@ class Overflow(enum.Enum):
     queued."""
 
 
+def _weightless(_item: object) -> int:
+    return 0
+
+
 class Queue(Generic[T]):
     """What both kinds of subscription are: a bounded queue with an account.
 
@@ -39,18 +45,32 @@ class Queue(Generic[T]):
         max_queue: items kept for a slow reader.
         overflow: what happens beyond that: a value of :class:`Overflow`.
         min_interval: seconds; an item that comes sooner after the last one kept is dropped.
+        max_queue_bytes: bytes that they may have together. An item that has more alone is kept
+            where no other is: it could never be delivered otherwise.
+        size_of: bytes of an item that is no error.
 
     Raises:
         ConfigurationError: an argument cannot work.
     """
 
     def __init__(
-        self, name: str, *, max_queue: int, overflow: str, min_interval: float = 0.0
+        self,
+        name: str,
+        *,
+        max_queue: int,
+        overflow: str,
+        min_interval: float = 0.0,
+        max_queue_bytes: int = sys.maxsize,
+        size_of: Callable[[T], int] = _weightless,
     ) -> None:
         if max_queue < 1 or not 0 <= min_interval < float("inf"):
             raise ConfigurationError(
                 f"{name}(): max_queue must be 1 or more (got {max_queue}), "
                 f"min_interval 0 or more seconds (got {min_interval})"
+            )
+        if max_queue_bytes < 1:
+            raise ConfigurationError(
+                f"{name}(): max_queue_bytes must be 1 or more (got {max_queue_bytes})"
             )
         try:
             self._overflow = Overflow(overflow)
@@ -59,6 +79,8 @@ class Queue(Generic[T]):
             raise ConfigurationError(f"{name}(): overflow is {known}, not {overflow!r}") from exc
         self._name = name
         self._max_queue = max_queue
+        self._max_queue_bytes = max_queue_bytes
+        self._size_of = size_of
         self._min_interval = min_interval
         self._items: collections.deque[T | SmartCamError] = collections.deque()
         self._ready = asyncio.Event()
@@ -67,6 +89,11 @@ class Queue(Generic[T]):
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # among the items
+        # Bytes are counted where items come; what was taken since is subtracted there, too, so that
+        # taking costs nothing. A parcel came together: number of its last item, items, bytes.
+        self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
+        self._bytes = 0  # of all parcels, of which some may be of items that are gone
+        self._evicted = 0  # those dropped that were queued before: only these have numbers
 
     @property
     def ended(self) -> bool:
@@ -75,6 +102,7 @@ class Queue(Generic[T]):
 
     def statistics(self) -> SubscriberStatistics:
         """Return the account as it is now."""
+        self._weigh()
         return SubscriberStatistics(
             name=self._name,
             policy=self._overflow.value,
@@ -82,13 +110,16 @@ class Queue(Generic[T]):
             taken=self._taken,
             dropped=self._dropped,
             queued=len(self._items),
+            queued_bytes=self._bytes,
         )
 
     def close(self) -> None:
         """Unsubscribe; what is queued counts as dropped. Idempotent."""
         self._dropped += len(self._items)
+        self._evicted += len(self._items)
         self._items.clear()
-        self._errors = 0
+        self._parcels.clear()
+        self._errors = self._bytes = 0
         self.end(None)
 
     async def _wait(self) -> None:
@@ -116,38 +147,47 @@ class Queue(Generic[T]):
 
     # ------------------------------------------------------------------ for the client
 
-    def offer(self, item: T | SmartCamError, now: float) -> None:
-        """Hand an item to the subscriber; never waits."""
+    def offer(self, item: T | SmartCamError, now: float, size: int = 0) -> None:
+        """Hand an item of ``size`` bytes to the subscriber; never waits."""
         if self._ended:
             return
         self._offered += 1
         if now - self._last < self._min_interval:
             self._dropped += 1
             return
-        if len(self._items) >= self._max_queue:
-            self._dropped += 1
-            if self._overflow is Overflow.ERROR:
-                self.end(
-                    SubscriberOverflowError(
-                        f"{self._name}(): more than {self._max_queue} items were waiting"
-                    )
-                )
-                return
-            self._errors -= isinstance(self._items.popleft(), SmartCamError)
+        items = self._items
+        full = len(items) >= self._max_queue or self._bytes + size > self._max_queue_bytes
+        if full and not self._make_room(size):
+            return
         self._last = now
         self._errors += isinstance(item, SmartCamError)
-        self._items.append(item)
+        items.append(item)
+        if size:
+            self._add_parcel(1, size)
         self._ready.set()
 
-    def offer_all(self, items: Sequence[T], now: float) -> None:
-        """Hand several items over that came together; as :meth:`offer` for each."""
-        if self._min_interval or len(self._items) + len(items) > self._max_queue:
+    def offer_all(self, items: Sequence[T], now: float, size: int = 0) -> None:
+        """Hand several items over that came together; as :meth:`offer` for each.
+
+        Args:
+            items: the items.
+            now: when they came.
+            size: of all of them.
+        """
+        queued = self._items
+        if (
+            self._min_interval
+            or len(queued) + len(items) > self._max_queue
+            or self._exceeded_by(size)
+        ):
             for item in items:
-                self.offer(item, now)
+                self.offer(item, now, self._size_of(item))
         elif items and not self._ended:
             self._offered += len(items)
             self._last = now
-            self._items.extend(items)
+            queued.extend(items)
+            if size:
+                self._add_parcel(len(items), size)
             self._ready.set()
 
     def end(self, error: SmartCamError | None) -> None:
@@ -156,6 +196,64 @@ class Queue(Generic[T]):
             self._ended = True
             self._end_error = error
         self._ready.set()
+
+    # ------------------------------------------------------------------ inside
+
+    def _make_room(self, size: int) -> bool:
+        """Do what the policy says for an item of ``size`` bytes; False where it is refused."""
+        items = self._items
+        while items:
+            if len(items) >= self._max_queue:
+                bound = f"{self._max_queue} items"
+            elif self._exceeded_by(size):
+                bound = f"{self._max_queue_bytes} bytes"
+            else:
+                break
+            self._dropped += 1
+            if self._overflow is Overflow.ERROR:
+                self.end(SubscriberOverflowError(f"{self._name}(): more than {bound} were waiting"))
+                return False
+            self._evicted += 1
+            self._errors -= isinstance(items.popleft(), SmartCamError)
+        return True
+
+    def _exceeded_by(self, size: int) -> bool:
+        """Whether ``size`` bytes more are too many."""
+        if self._bytes + size <= self._max_queue_bytes:
+            return False
+        self._weigh()
+        return self._bytes + size > self._max_queue_bytes
+
+    def _add_parcel(self, count: int, size: int) -> None:
+        """Count the bytes of the last ``count`` items, which are queued by now."""
+        parcels, queued = self._parcels, len(self._items)
+        if queued == count:  # nothing else is
+            parcels.clear()
+            self._bytes = size
+        else:
+            if len(parcels) >= queued:  # some are of items that are gone
+                self._subtract_gone()
+            self._bytes += size
+        parcels.append((self._taken + self._evicted + queued, count, size))
+
+    def _subtract_gone(self) -> int:
+        """Forget parcels of which nothing is queued; return how many items were ever gone."""
+        parcels, gone = self._parcels, self._taken + self._evicted
+        while parcels and parcels[0][0] <= gone:
+            self._bytes -= parcels.popleft()[2]
+        return gone
+
+    def _weigh(self) -> None:
+        """Have the bytes of all parcels be those of the items that are queued."""
+        gone, parcels = self._subtract_gone(), self._parcels
+        if parcels and parcels[0][0] - parcels[0][1] < gone:
+            # begun: from now on each item that is left of it is one
+            last, _, size = parcels.popleft()
+            left = cast("list[T]", list(itertools.islice(self._items, last - gone)))
+            sizes = [self._size_of(item) for item in left]
+            each = zip(range(gone + 1, last + 1), itertools.repeat(1), sizes, strict=False)
+            parcels.extendleft(reversed([*each]))
+            self._bytes += sum(sizes) - size
 
 
 class Subscription(Queue[T]):

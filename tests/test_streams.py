@@ -23,18 +23,18 @@ from smartcam.streams import BatchSubscription, Overflow, Queue, Subscribers, Su
 
 
 def subscription(
-    max_queue: int = 3, overflow: str = "drop_oldest", min_interval: float = 0.0
+    max_queue: int = 3, overflow: str = "drop_oldest", min_interval: float = 0.0, **more: Any
 ) -> Subscription[int]:
     return Subscription(
-        "results", max_queue=max_queue, overflow=overflow, min_interval=min_interval
+        "results", max_queue=max_queue, overflow=overflow, min_interval=min_interval, **more
     )
 
 
 def batches(
-    max_queue: int = 9, overflow: str = "drop_oldest", min_interval: float = 0.0
+    max_queue: int = 9, overflow: str = "drop_oldest", min_interval: float = 0.0, **more: Any
 ) -> BatchSubscription[int]:
     return BatchSubscription(
-        "results", max_queue=max_queue, overflow=overflow, min_interval=min_interval
+        "results", max_queue=max_queue, overflow=overflow, min_interval=min_interval, **more
     )
 
 
@@ -67,6 +67,7 @@ async def waiting(stream: Subscription[int]) -> asyncio.Task[int]:
         ({"min_interval": -0.1}, "min_interval 0 or more seconds (got -0.1)"),
         ({"min_interval": float("inf")}, "(got inf)"),
         ({"min_interval": float("nan")}, "(got nan)"),
+        ({"max_queue_bytes": 0}, "max_queue_bytes must be 1 or more (got 0)"),
         ({"overflow": "wait"}, "overflow is 'drop_oldest' or 'error', not 'wait'"),
     ],
 )
@@ -358,6 +359,105 @@ async def test_batch_end_wakes_a_waiting_reader(error: SmartCamError | None) -> 
         await task
 
 
+# ---------------------------------------------------------------------- bytes
+
+
+def weighed(kind: Any = Subscription, **options: Any) -> Any:
+    """Return a subscription that holds ten bytes; an item has as many as it says."""
+    options = {"max_queue": 99, "overflow": "drop_oldest", "max_queue_bytes": 10} | options
+    return kind("results", size_of=int, **options)
+
+
+def put(stream: Queue[int], *sizes: int) -> None:
+    for size in sizes:
+        stream.offer(size, 0.0, size)
+
+
+def put_all(stream: Queue[int], *sizes: int) -> None:
+    stream.offer_all(sizes, 0.0, sum(sizes))
+
+
+each_way = pytest.mark.parametrize("offer", [put, put_all])
+
+
+@each_way
+async def test_bytes_beyond_the_bound_drop_as_many_of_the_oldest_as_needed(offer: Any) -> None:
+    stream = weighed()
+    offer(stream, 1, 2, 3, 4)
+    assert (account(stream), stream.statistics().queued_bytes) == ((4, 0, 0, 4), 10)
+    offer(stream, 5)
+    assert (account(stream), stream.statistics().queued_bytes) == ((5, 0, 3, 2), 9)
+    assert await take(stream, 2) == [4, 5]
+    assert stream.statistics().queued_bytes == 0
+
+
+@each_way
+async def test_bytes_beyond_the_bound_end_the_stream_where_that_was_wanted(offer: Any) -> None:
+    stream = weighed(overflow="error")
+    offer(stream, 4, 6, 1, 1)
+    assert (account(stream), stream.statistics().queued_bytes) == ((3, 0, 1, 2), 10)
+    assert await take(stream, 2) == [4, 6]
+    with pytest.raises(SubscriberOverflowError, match="more than 10 bytes were waiting"):
+        await anext(stream)
+
+
+@each_way
+@pytest.mark.parametrize("overflow", ["drop_oldest", "error"])
+async def test_item_larger_than_the_bound_is_kept_where_no_other_is(
+    offer: Any, overflow: str
+) -> None:
+    stream = weighed(overflow=overflow)
+    for _ in range(2):
+        offer(stream, 11)
+        assert stream.statistics().queued_bytes == 11
+        assert await take(stream, 1) == [11]
+    offer(stream, 3)
+    offer(stream, 11)
+    if overflow == "drop_oldest":
+        assert await take(stream, 1) == [11]
+        assert account(stream) == (4, 3, 1, 0)
+    else:
+        assert await take(stream, 1) == [3]
+        assert account(stream) == (4, 3, 1, 0)
+        assert stream.ended
+
+
+@each_way
+async def test_bytes_of_what_was_taken_are_free_again(offer: Any) -> None:
+    stream = weighed()
+    offer(stream, 2, 3, 4)
+    assert await take(stream, 2) == [2, 3]
+    assert stream.statistics().queued_bytes == 4
+    offer(stream, 6)
+    assert (account(stream), stream.statistics().queued_bytes) == ((4, 2, 0, 2), 10)
+
+
+async def test_bytes_of_errors_count_in_batches_too() -> None:
+    stream = weighed(BatchSubscription)
+    put_all(stream, 1, 2)
+    stream.offer(InterpretationError("no"), 0.0, 7)
+    assert await anext(stream) == [1, 2]
+    assert stream.statistics().queued_bytes == 7
+    put_all(stream, 3, 1)
+    assert (account(stream), stream.statistics().queued_bytes) == ((5, 2, 1, 2), 4)
+    assert await anext(stream) == [3, 1]
+
+
+def test_bytes_are_let_go_with_the_stream() -> None:
+    stream = weighed()
+    put(stream, 4, 4)
+    stream.close()
+    assert (account(stream), stream.statistics().queued_bytes) == ((2, 0, 2, 0), 0)
+
+
+async def test_bytes_counted_do_not_pile_up_behind_a_reader_that_keeps_up() -> None:
+    stream = weighed(max_queue_bytes=1 << 40)
+    for number in range(1, 1000):
+        (put if number % 2 else put_all)(stream, number)
+        assert await take(stream, 1) == [number]
+        assert len(stream._parcels) == 1
+
+
 # ---------------------------------------------------------------------- who is subscribed
 
 
@@ -398,6 +498,11 @@ def test_subscribers_may_go_and_come_while_they_are_offered_something() -> None:
 Item = int | SmartCamError
 
 
+def size(item: Item) -> int:
+    """Return the bytes of an item of the model: 0 to 4."""
+    return int(str(item)) * 7 % 5
+
+
 class AccountMachine(RuleBasedStateMachine):
     """Any order of offers, reads and ends against a plain model."""
 
@@ -408,7 +513,9 @@ class AccountMachine(RuleBasedStateMachine):
         self.model: list[Item] = []
         self.offered = self.taken = self.dropped = 0
         self.ended = False
-        self.choose(kind=Subscription, overflow="drop_oldest", interval=0.0, most=3)
+        self.choose(
+            kind=Subscription, overflow="drop_oldest", interval=0.0, most=3, most_bytes=1000
+        )
 
     @precondition(lambda self: self.offered == 0 and not self.ended)
     @rule(
@@ -416,25 +523,32 @@ class AccountMachine(RuleBasedStateMachine):
         overflow=st.sampled_from(["drop_oldest", "error"]),
         interval=st.sampled_from([0.0, 0.0, 1.0]),
         most=st.integers(1, 6),
+        most_bytes=st.sampled_from([1, 5, 9, 1000]),
     )
-    def choose(self, kind: Any, overflow: str, interval: float, most: int) -> None:
+    def choose(self, kind: Any, overflow: str, interval: float, most: int, most_bytes: int) -> None:
         self.overflow, self.interval, self.most = overflow, interval, most
+        self.most_bytes = most_bytes
         self.stream: Subscription[int] | BatchSubscription[int] = kind(
-            "results", max_queue=most, overflow=overflow, min_interval=interval
+            "results",
+            max_queue=most,
+            overflow=overflow,
+            min_interval=interval,
+            max_queue_bytes=most_bytes,
+            size_of=size,
         )
 
     @rule(step=st.sampled_from([0.0, 0.5, 1.0]), fits=st.booleans())
     def offer(self, step: float, fits: bool) -> None:
         self.now += step
         item: Item = self.offered if fits else InterpretationError(str(self.offered))
-        self.stream.offer(item, self.now)
+        self.stream.offer(item, self.now, size(item))
         self.expect(item)
 
     @rule(step=st.sampled_from([0.0, 0.5, 1.0]), count=st.integers(0, 8))
     def offer_all(self, step: float, count: int) -> None:
         self.now += step
         items = list(range(self.offered, self.offered + count))
-        self.stream.offer_all(items, self.now)
+        self.stream.offer_all(items, self.now, sum(map(size, items)))
         for item in items:
             self.expect(item)
 
@@ -444,15 +558,19 @@ class AccountMachine(RuleBasedStateMachine):
         self.offered += 1
         if self.now - self.last < self.interval:
             self.dropped += 1
-        elif len(self.model) < self.most or self.overflow == "drop_oldest":
+        elif self.has_room_for(item) or self.overflow == "drop_oldest":
             self.last = self.now
-            self.model.append(item)
-            if len(self.model) > self.most:
+            while not self.has_room_for(item):
                 del self.model[0]
                 self.dropped += 1
+            self.model.append(item)
         else:
             self.dropped += 1
             self.ended = True
+
+    def has_room_for(self, item: Item) -> bool:
+        fits = sum(map(size, (*self.model, item))) <= self.most_bytes
+        return not self.model or (len(self.model) < self.most and fits)
 
     @precondition(lambda self: self.model or self.ended)
     @rule()
@@ -480,6 +598,11 @@ class AccountMachine(RuleBasedStateMachine):
         self.taken += count
 
     @rule()
+    def look(self) -> None:
+        assert account(self.stream)[3] == len(self.model)
+        assert self.stream.statistics().queued_bytes == sum(map(size, self.model))
+
+    @rule()
     def end(self) -> None:
         self.stream.end(None)
         self.ended = True
@@ -494,7 +617,8 @@ class AccountMachine(RuleBasedStateMachine):
     @invariant()
     def account_is_the_models(self) -> None:
         expected = (self.offered, self.taken, self.dropped, len(self.model))
-        assert account(self.stream) == expected
+        one = self.stream  # statistics() would count bytes that it puts off to count otherwise
+        assert (one._offered, one._taken, one._dropped, len(one._items)) == expected
         assert self.stream.ended == self.ended
         errors = [item for item in self.model if not isinstance(item, int)]
         assert self.stream._errors == len(errors)  # where none is, a batch is taken at once

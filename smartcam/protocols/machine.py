@@ -144,13 +144,28 @@ class ResultBurst:
 
     The client's machine gives it for containers that came in one delivery, so that a camera that
     runs free costs no object for each. Iterating gives them one by one.
+
+    Attributes:
+        application: whose they are.
+        data: what each has behind the id.
+        size: bytes of all data.
     """
 
     application: int
     data: list[bytes]
+    size: int
 
     def __iter__(self) -> Iterator[m.ResultContainer]:
         return (m.ResultContainer(application=self.application, data=one) for one in self.data)
+
+    def cut(self, count: int) -> tuple[ResultBurst, ResultBurst]:
+        """Return the first ``count`` containers and the others."""
+        data, rest = self.data[:count], self.data[count:]
+        size = sum(map(len, data))
+        return (
+            ResultBurst(application=self.application, data=data, size=size),
+            ResultBurst(application=self.application, data=rest, size=self.size - size),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -553,11 +568,15 @@ class Machine:
     def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
         """Take the result containers of the same application that come next in these bytes."""
         like = begin - self.dialect.header.size
-        more = self._framer.following(self._burst_reader, like, self._burst_size)
+        framer = self._framer
+        before = framer.buffered
+        more = framer.following(self._burst_reader, like, self._burst_size)
         if more:
             self.counters.frames_received += len(more)
+            size = before - framer.buffered - len(more) * (begin - like + self._burst_size)
+            size += len(first.data)
             more.insert(0, first.data)
-            self._events[-1] = ResultBurst(application=first.application, data=more)
+            self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
         """Whether the client shall see it: an answer that nothing asked for is counted only."""

@@ -6,6 +6,7 @@ import asyncio
 import collections
 import gc
 import struct
+from traceback import format_exception
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -26,6 +27,7 @@ from smartcam import (
     TriggerTimeoutError,
 )
 from smartcam.connection import Chunk
+from smartcam.interpreters import Interpreter
 from smartcam.protocols import messages as m
 from smartcam.streams import BatchSubscription
 
@@ -33,6 +35,14 @@ if TYPE_CHECKING:
     from camera_by_hand import HandmadeCamera
 
     from smartcam import SmartCamera, SubscriberStatistics
+    from smartcam.interpreters import Reader
+
+
+class Failing(Interpreter):
+    """Reads nothing."""
+
+    def interpret(self, reader: Reader) -> object:
+        raise KeyError(len(reader))
 
 
 def account(camera: SmartCamera) -> SubscriberStatistics:
@@ -153,7 +163,66 @@ async def test_results_beyond_max_queue_end_where_that_was_wanted() -> None:
         assert (await camera.trigger()).raw == b"found"
 
 
-@pytest.mark.parametrize("options", [{"max_queue": 0}, {"min_interval": -1}, {"overflow": "block"}])
+@pytest.mark.parametrize("batch", [False, True])
+@pytest.mark.parametrize("together", [False, True])
+async def test_results_beyond_max_queue_bytes_drop_the_oldest(
+    *, batch: bool, together: bool
+) -> None:
+    async with by_hand() as (box, camera):
+        subscribe: Any = camera.results
+        results = subscribe(max_queue_bytes=1000, batch=batch)
+        frames = [box.result_frame(bytes([number] * 300)) for number in range(9)]
+        for some in [b"".join(frames)] if together else frames:
+            box.send(some)
+            await camera.get_clock()
+        one = account(camera)
+        assert (one.offered, one.dropped, one.queued, one.queued_bytes) == (9, 6, 3, 900)
+        taken = await anext(results) if batch else [await anext(results) for _ in range(3)]
+        assert [result.raw[0] for result in taken] == [6, 7, 8]
+        assert account(camera).queued_bytes == 0
+
+
+async def test_results_beyond_max_queue_bytes_end_where_that_was_wanted() -> None:
+    async with by_hand() as (box, camera):
+        results = camera.results(max_queue_bytes=5, overflow="error")
+        box.send(box.result_frame(b"three") + box.result_frame(b"more"))
+        await camera.get_clock()
+        assert (await anext(results)).raw == b"three"
+        with pytest.raises(SubscriberOverflowError, match="more than 5 bytes were waiting"):
+            await anext(results)
+
+
+async def test_results_that_nobody_takes_hold_no_more_bytes_than_the_default() -> None:
+    large = bytes((1 << 20) - 4)  # the id is payload, too
+    async with by_hand() as (box, camera):
+        results, batches = camera.results(), camera.results(batch=True)
+        for _ in range(100):
+            box.send(box.result_frame(large))
+        await until(lambda: camera.statistics().received == 100)
+        for one in camera.statistics().subscribers:
+            assert (one.queued, one.dropped, one.queued_bytes) == (64, 36, 64 * len(large))
+        assert (await anext(results)).number == (await anext(batches))[0].number == 37
+
+
+async def test_results_that_do_not_fit_count_their_bytes_and_hold_no_others() -> None:
+    async with by_hand(interpret_as={7: Failing()}, application=7) as (box, camera):
+        results = camera.results()
+        stranger = box.result_frame(b"a stranger's" * 9999, application=3)
+        box.send(stranger + box.result_frame(b"mine") + stranger)
+        await until(lambda: camera.statistics().received == 3)
+        assert account(camera).queued_bytes == len(b"mine")
+        gc.collect()
+        containers = [one for one in gc.get_objects() if isinstance(one, m.ResultContainer)]
+        assert [one for one in containers if one.data.startswith(b"a stranger's")] == []
+        with pytest.raises(InterpretationError) as caught:
+            await anext(results)
+        assert "\nraised in Failing.interpret, " in "".join(format_exception(caught.value))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"max_queue": 0}, {"max_queue_bytes": 0}, {"min_interval": -1}, {"overflow": "block"}],
+)
 async def test_results_with_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
     async with by_hand() as (_, camera):
         with pytest.raises(ConfigurationError, match=r"results\(\)"):

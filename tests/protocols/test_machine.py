@@ -625,10 +625,10 @@ def test_burst_is_of_containers_of_one_application_right_behind_one_another(
     made = client(dialect)
     made.receive_data(b"".join(map(dialect.encode, said)) + dialect.encode(said[0])[:-1])
     assert made.events() == [
-        ResultBurst(application=21, data=[b"a", b"", b"ccc"]),
+        ResultBurst(application=21, data=[b"a", b"", b"ccc"], size=4),
         STATUS_MESSAGE,
         result(b"d"),
-        ResultBurst(application=5, data=[b"e", b"f"]),
+        ResultBurst(application=5, data=[b"e", b"f"], size=2),
         result(b"g"),
     ]
     assert made.counters.frames_received == 1 + len(said)
@@ -653,7 +653,7 @@ def test_burst_in_front_of_what_breaks_the_protocol_comes_before_the_failure(
     long = result(bytes(100), number)  # as long as may be
     made.receive_data(HANDBOOK.encode(long) * 2 + behind + HANDBOOK.encode(long))
     burst, failed = made.events()
-    assert burst == ResultBurst(application=number, data=[bytes(100)] * 2)
+    assert burst == ResultBurst(application=number, data=[bytes(100)] * 2, size=200)
     assert text in str(failure([failed]))
     assert made.counters.frames_received == 1 + 2 + (text.startswith("came"))
 
@@ -662,7 +662,7 @@ def test_burst_ends_at_another_message_of_the_same_application() -> None:
     made = client()
     made.send(m.Query())
     made.receive_data(HANDBOOK.encode(result(b"")) * 2 + QUERY_ANSWER)
-    burst = ResultBurst(application=21, data=[b"", b""])
+    burst = ResultBurst(application=21, data=[b"", b""], size=0)
     assert made.events() == [burst, m.QueryAnswer(application=21)]
 
 
@@ -941,7 +941,7 @@ def test_adopt_bid_has_containers_in_bursts_as_before() -> None:
     feed(made, bytes.fromhex("01000400 0000 0100"))
     made.adopt(BID)
     made.receive_data(BID.encode(result(b"a")) * 2)
-    assert made.events() == [ResultBurst(application=21, data=[b"a", b"a"])]
+    assert made.events() == [ResultBurst(application=21, data=[b"a", b"a"], size=2)]
 
 
 def test_kin_of_the_other_header_are_not_told_apart_by_it() -> None:
