@@ -27,6 +27,7 @@ from smartcam.emulator import Quirks
 from smartcam.handshake import load_protocol
 from smartcam.protocols.base import POLICIES
 from smartcam.protocols.bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
+from smartcam.protocols.framed import MAX_SURPLUS
 from smartcam.protocols.machine import TRANSITIONS, State
 from smartcam.protocols.messages import Request, Sender, Wire
 from smartcam.registry import PROTOCOLS
@@ -62,7 +63,11 @@ LIMITS = (
     "protocols.framing.LARGE",
     "protocols.framing.FIRST_READ",
     "protocols.framing.MOST_READ",
+    "protocols.framed.MAX_SURPLUS",
     "protocols.framed.MAX_KNOWN",
+    "protocols.unfinished.FRAME_TIME",
+    "protocols.unfinished.FRAME_RATE",
+    "protocols.unfinished.HINT_TIME",
     "connection.MAX_CHUNKS",
     "connection.MAX_REST",
     "client.DEFAULT_MAX_QUEUE",
@@ -385,12 +390,13 @@ def _wrap(names: list[str]) -> str:
 
 def policies() -> str:
     """Return what each role does with broken input."""
+    surplus = f"is accepted and counted; by more than {MAX_SURPLUS:,} bytes it is broken"
     rows = [
         (
             role.value,
             transport.value.upper(),
             "ends the link" if policy.fatal else "is dropped and counted",
-            "is broken" if policy.exact_length else "is accepted and counted",
+            "is broken" if policy.exact_length else surplus,
         )
         for (role, transport), policy in POLICIES.items()
     ]

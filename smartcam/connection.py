@@ -275,7 +275,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         """asyncio: bytes of a TCP link."""
         self.heard_at = self._loop.time()
-        if self.machine.filled(nbytes):
+        if self.machine.filled(nbytes, self.heard_at):
             self._hand_on()
         if self._replies and self._loss is None:
             self._flush()

@@ -215,7 +215,7 @@ async def test_bytes_that_come_only_once_are_shown() -> None:
 async def test_bytes_without_end_are_bounded() -> None:
     async def endless(peer: Peer, number: int) -> None:
         await peer.read(4)
-        peer.write(bytes.fromhex("0100 ffff") + bytes(60_000))
+        peer.write(bytes.fromhex("2000 ffff") + bytes(60_000))  # a container
         await peer.rest()
 
     async with scripted(endless) as listener:

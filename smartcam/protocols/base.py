@@ -75,16 +75,21 @@ class Policy:
         exact_length: a known message must have exactly its documented length; otherwise a longer
             body is accepted and counted.
         tells: a known message of the wrong length is an event instead of being dropped.
+        bounded: a frame is broken that announces more than its message may have, or that does not
+            become whole in time.
     """
 
     fatal: tuple[type[RemoteProtocolError], ...]
     exact_length: bool
     tells: bool = False
+    bounded: bool = False
 
 
 POLICIES: Mapping[tuple[Role, Transport], Policy] = {
-    (Role.CLIENT, Transport.TCP): Policy(fatal=(FrameError, MessageError), exact_length=False),
-    (Role.CLIENT, Transport.UDP): Policy(fatal=(), exact_length=False),
+    (Role.CLIENT, Transport.TCP): Policy(
+        fatal=(FrameError, MessageError), exact_length=False, bounded=True
+    ),
+    (Role.CLIENT, Transport.UDP): Policy(fatal=(), exact_length=False, bounded=True),
     # the camera ignores invalid messages silently (SC manual p. 28: published)
     (Role.CAMERA, Transport.TCP): Policy(fatal=(), exact_length=True),
     (Role.CAMERA, Transport.UDP): Policy(fatal=(), exact_length=True),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import struct
+import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -117,6 +118,11 @@ MAX_KNOWN = 256
 """Messages kept of each kind; statuses and answers are few, and a peer could send any."""
 
 
+MAX_SURPLUS = 1 << 12
+"""Bytes that a body may be longer than documented, where that is a matter of a fixed length: newer
+firmware may append fields, which are a few words. More is a length that is wrong."""
+
+
 class Codec:
     """One message of one dialect, compiled.
 
@@ -167,6 +173,12 @@ class Codec:
     def may_be_a_code(self) -> bool:
         """Whether a result code that refuses may come alone."""
         return self._code is not None and self._code.size < self.size
+
+    @property
+    def lengths(self) -> range:
+        """The lengths of a body that are accepted."""
+        least = self.size if self._code is None else min(self._code.size, self.size)
+        return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS + 1)
 
     def fits(self, size: int) -> bool:
         """Whether a body has the documented length."""
@@ -482,6 +494,10 @@ class FramedDialect(Dialect):
             for row in self.table
             if row.type.sender is sender
         }
+
+    def lengths(self, sender: Sender) -> dict[int, range]:
+        """Return the lengths that the bodies of one sender's messages may have, by their ids."""
+        return {number: codec.lengths for number, codec in self.decoders(sender).items()}
 
     def knows(self, sender: Sender, message_id: int) -> bool:
         """Whether there is a message with this id from this sender."""

@@ -1,8 +1,9 @@
 """Cutting frames out of bytes, by the length field only.
 
 A frame is a header (a magic number in some dialects, a length, a message id) and a payload. What
-the header looks like is data: :class:`HeaderLayout`. A length above the limit is refused as soon as
-the header is there, so no more than one header and one payload of the permitted size is ever kept.
+the header looks like is data: :class:`HeaderLayout`. A length above the limit, or above what its
+message may have, is refused as soon as the header is there, so no more than one header and one
+payload of the permitted size is ever kept.
 
 A chunk is not copied: frames are cut out of it by place. The rest of a large frame has a buffer of
 its own, into which the transport may write.
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 from smartcam.exceptions import FrameError, hex_excerpt
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
 __all__ = ["DEFAULT_MAX_LENGTH", "Frame", "Framer", "HeaderLayout"]
 
@@ -115,13 +116,15 @@ class Framer:
     """
 
     __slots__ = (
-        *("_buffer", "_filled", "_header", "_large", "_max_length", "_most", "_read"),
-        *("_start", "_store", "_window"),
+        *("_always", "_buffer", "_filled", "_header", "_large", "_lengths", "_max_length"),
+        *("_most", "_read", "_start", "_store", "_window"),
     )
 
     def __init__(self, header: HeaderLayout, max_length: int = DEFAULT_MAX_LENGTH) -> None:
         self._header = header
         self._max_length = max_length
+        self._lengths: Mapping[int, range] = {}
+        self._always = max_length  # a length that every message may have
         self._read = header.reader()
         # A chunk as it came, or one large frame.
         self._buffer: Buffer = b""
@@ -131,6 +134,16 @@ class Framer:
         self._store = memoryview(b"")  # where a transport writes; large frames stay there
         self._window = self._store  # what of it the next read may take
         self._most = MOST_READ  # what it may be in the end
+
+    def expect(self, lengths: Mapping[int, range]) -> None:
+        """Refuse a payload that is longer than its message may have, even if it is not too long.
+
+        Args:
+            lengths: bytes that the payload of a message may have, by its id. One that is not among
+                them may have any number.
+        """
+        self._lengths = lengths
+        self._always = min((self._max_length, *(one.stop - 1 for one in lengths.values())))
 
     @property
     def buffered(self) -> int:
@@ -233,13 +246,8 @@ class Framer:
         if not header.id_first:
             message_id, length = length, message_id
         size = length - header.length_includes
-        if not 0 <= size <= self._max_length:
-            raise FrameError(
-                f"a frame of message {message_id:#04x} announces {size} bytes of payload; "
-                f"0 to {self._max_length} are accepted",
-                offset=len(header.magic),
-                data=bytes(buffer[start : start + header.size]),
-            )
+        if not 0 <= size <= self._always:
+            self._check_length(message_id, size)
         begin = start + header.size
         end = begin + size
         if end > len(buffer):
@@ -295,6 +303,44 @@ class Framer:
             start = end
         self._start = start
         return found
+
+    def unfinished(self) -> tuple[int, int] | None:
+        """Return message id and size, header included, of a frame of which only a part is there.
+
+        None where not even the header is there. To be asked when :meth:`cut` has returned None.
+        """
+        header = self._header
+        buffer, start = (self._buffer, self._start) if self._large is None else (self._large, 0)
+        if self.buffered < header.size:
+            return None
+        _, message_id, length = self._read(buffer, start)
+        if not header.id_first:
+            message_id, length = length, message_id
+        return message_id, header.size + length - header.length_includes
+
+    def header_within(self, begin: int) -> int | None:
+        """Return the place of another header in what is there of a frame, None for none.
+
+        It has the magic number, the id of a message that is expected, and a length that this may
+        have. Dialects without a magic number have none.
+
+        Args:
+            begin: of the frame's bytes, where to begin.
+        """
+        header = self._header
+        buffer, start = (self._buffer, self._start) if self._large is None else (self._large, 0)
+        begin = max(begin, header.size)
+        data = bytes(buffer[start + begin : start + self.buffered])
+        at = data.find(header.magic) if header.magic else -1
+        while 0 <= at <= len(data) - header.size:
+            _, message_id, length = self._read(data, at)
+            if not header.id_first:
+                message_id, length = length, message_id
+            size = length - header.length_includes
+            if size in self._lengths.get(message_id, ()) and size <= self._max_length:
+                return begin + at
+            at = data.find(header.magic, at + 1)
+        return None
 
     def next_frame(self) -> Frame | None:
         """Return the next whole frame, or None for "more bytes"; raises as :meth:`cut`."""
@@ -357,6 +403,19 @@ class Framer:
             self._store[: len(begun)] = begun
         self._large, self._filled = self._store[:size], len(begun)
         self._buffer, self._start = b"", 0
+
+    def _check_length(self, message_id: int, size: int) -> None:
+        longest = self._max_length
+        if message_id in self._lengths:
+            longest = min(longest, self._lengths[message_id].stop - 1)
+        if not 0 <= size <= longest:
+            header, start = self._header, self._start
+            raise FrameError(
+                f"a frame of message {message_id:#04x} announces {size} bytes of payload; "
+                f"0 to {longest} are accepted",
+                offset=len(header.magic),
+                data=bytes(self._buffer[start : start + header.size]),
+            )
 
     def _check_magic(self, start: int, available: int) -> None:
         magic = self._header.magic

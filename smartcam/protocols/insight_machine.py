@@ -192,7 +192,7 @@ class InSightMachine:
         """Return where the next bytes may be written; call :meth:`filled` next."""
         return self._store
 
-    def filled(self, count: int) -> bool:
+    def filled(self, count: int, now: float = 0.0) -> bool:
         """Take ``count`` bytes that were written into :meth:`room`."""
         self.receive_data(bytes(self._store[:count]))
         return True

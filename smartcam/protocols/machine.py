@@ -12,8 +12,15 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from smartcam.exceptions import LocalProtocolError, MessageError, RemoteProtocolError, hex_excerpt
+from smartcam.exceptions import (
+    FrameError,
+    LocalProtocolError,
+    MessageError,
+    RemoteProtocolError,
+    hex_excerpt,
+)
 from smartcam.protocols import messages as m
+from smartcam.protocols import unfinished
 from smartcam.protocols.base import POLICIES, Policy, Role, Transport
 from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer
 
@@ -236,8 +243,11 @@ class LinkMachine(Protocol):
         """Return where a stream's next bytes may be written; call :meth:`filled` next."""
         ...
 
-    def filled(self, count: int) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`; False for no events yet."""
+    def filled(self, count: int, now: float) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`; False for no events yet.
+
+        ``now`` is for who bounds the time that a frame may take: seconds since any beginning.
+        """
         ...
 
     def receive_data(self, data: bytes) -> None:
@@ -318,7 +328,10 @@ class Machine:
         self.error: RemoteProtocolError | None = None
         self.counters: Counters = Counters()
         self._policy = policy or POLICIES[role, transport]
+        self._bounded = self._policy.bounded
         self._framer = Framer(dialect.header, max_length)
+        self._begun, self._begun_at = -1, 0.0  # number of the unfinished frame, when it was seen
+        self._unfinished = unfinished.Unfinished()
         self._trace = trace
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
@@ -343,6 +356,8 @@ class Machine:
     def _take_up(self, dialect: FramedDialect) -> None:
         self.dialect = dialect
         self._decoders = dialect.decoders(self._sender)
+        if self._bounded:
+            self._framer.expect(dialect.lengths(self._sender))
         result = dialect.encoder(m.ResultContainer)
         self._burst_size = result.size
         self._burst_reader = dialect.header.reader(result.size)
@@ -391,8 +406,14 @@ class Machine:
         """Return where a stream's next bytes may be written; call :meth:`filled` next."""
         return self._framer.room()
 
-    def filled(self, count: int) -> bool:
+    def filled(self, count: int, now: float = 0.0) -> bool:
         """Take ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
+
+        A frame that does not become whole in time is broken, as the policy says.
+
+        Args:
+            count: of the bytes.
+            now: when they came, in seconds since any beginning.
 
         Returns:
             False where a large frame goes on, so that there are no events yet.
@@ -405,6 +426,12 @@ class Machine:
             self._receive_frames()
             if len(self._events) > MANY_EVENTS:
                 self._framer.read_less()
+        if self._bounded and self._framer.buffered:
+            number = self.counters.frames_received
+            if number != self._begun:
+                self._begun, self._begun_at = number, now
+            else:
+                return self._is_overdue(now) or cut
         return cut
 
     def receive_eof(self) -> None:
@@ -487,6 +514,27 @@ class Machine:
             self._receive_frame(*found)
             if self._deaf:
                 return
+
+    def _is_overdue(self, now: float) -> bool:
+        """Whether the frame that is begun will not become whole; then it is rejected."""
+        framer, begun = self._framer, self._unfinished
+        age = begun.age(self._begun, self._begun_at, now)
+        if age < unfinished.HINT_TIME:
+            return False
+        header = self.dialect.header
+        message_id, size = framer.unfinished() or (None, header.size)
+        which = "a header" if message_id is None else f"a frame of message {message_id:#04x}"
+        there = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
+        other = framer.header_within(begun.searched)
+        if other is not None:
+            text = f"{which} holds another header at byte {other}; {there}"
+        elif age > unfinished.FRAME_TIME + size / unfinished.FRAME_RATE:
+            text = f"{which} does not become whole: {there}"
+        else:
+            begun.searched = max(framer.buffered - header.size + 1, 0)
+            return False
+        self._reject(FrameError(text, offset=other or 0, data=framer.pending[: header.size]))
+        return True
 
     def _receive_datagram(self) -> None:
         framer = self._framer

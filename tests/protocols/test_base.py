@@ -46,8 +46,10 @@ def test_role_sends_as_itself_and_receives_from_the_other() -> None:
 
 def test_policies_only_a_client_on_tcp_fails_and_only_a_camera_wants_exact_lengths() -> None:
     assert dict(POLICIES) == {
-        (Role.CLIENT, TCP): Policy(fatal=(FrameError, MessageError), exact_length=False),
-        (Role.CLIENT, UDP): Policy(fatal=(), exact_length=False),
+        (Role.CLIENT, TCP): Policy(
+            fatal=(FrameError, MessageError), exact_length=False, bounded=True
+        ),
+        (Role.CLIENT, UDP): Policy(fatal=(), exact_length=False, bounded=True),
         (Role.CAMERA, TCP): Policy(fatal=(), exact_length=True),
         (Role.CAMERA, UDP): Policy(fatal=(), exact_length=True),
     }

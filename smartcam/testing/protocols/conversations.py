@@ -180,7 +180,7 @@ class Player:
             count = min(len(place), len(chunk))
             place[:count] = chunk[:count]
             chunk = chunk[count:]
-            if self.machine.filled(count):
+            if self.machine.filled(count, 0.0):
                 events += told(self.machine.events())
         return events + told(self.machine.events())
 
