@@ -62,9 +62,9 @@ __all__ = [
 logger: logging.Logger = logging.getLogger("smartcam.handshake")
 
 DETECTION_SHARE = 0.5
-"""Seconds that a dialect gets in the first round while others are still untried. A camera answers
-in milliseconds, one that speaks another dialect is silent; later rounds have the rest of the time,
-for slow links."""
+"""Seconds for the answer to Connect in the first round while other dialects are still untried. A
+camera answers in milliseconds, one that speaks another dialect is silent; later rounds have the
+rest of the time, for slow links."""
 
 TELLING_ROUNDS = 3
 """Questions for the status that a camera must have answered, each, to be one that answers them."""
@@ -112,6 +112,7 @@ class Try:
         outcome: what came of it.
         received: bytes that came.
         hung_up: the other side ended the link without a byte.
+        on_step: called with each new step.
     """
 
     dialect: str
@@ -120,6 +121,13 @@ class Try:
     outcome: str = ""
     received: int = 0
     hung_up: bool = False
+    on_step: Callable[[str], None] | None = None
+
+    def reach(self, step: str) -> None:
+        """Note that this is what is waited for now."""
+        self.step = step
+        if self.on_step is not None:
+            self.on_step(step)
 
     def end(self, error: Exception, waited: float) -> None:
         """Note what it ended with; ``UnicodeError`` stands for what is no host name."""
@@ -293,20 +301,20 @@ async def attempt(
     collector = _Collector(link, MAX_EARLY + max_length)
     try:
         link.send(*([Disconnect()] if disconnect_first else []), Connect())
-        progress.step = CONNECTING
+        progress.reach(CONNECTING)
         while collector.version is None:
             await collector.take()
         if len(link.machine.kin) > 1:
-            progress.step = "finding out the dialect"
+            progress.reach("finding out the dialect")
             await collector.tell_apart()
         dialect = link.machine.dialect
         progress.dialect = dialect.label
-        progress.step = "waiting for the first status"
+        progress.reach("waiting for the first status")
         if not collector.statuses and not dialect.capabilities.status_by_itself:
             link.send(GetStatus(), answered=False)
         while not collector.statuses:
             await collector.take()
-        progress.step = "waiting for the answer to Query"
+        progress.reach("waiting for the answer to Query")
         await collector.ask()
         while collector.application is None:
             await asyncio.sleep(BUSY_PAUSE)
@@ -355,14 +363,15 @@ async def establish(
     cause: BaseException | None = None
     disconnect_first = True
     for left in range(settings.connect_attempts, 0, -1):
+        end = loop.time() + (deadline - loop.time()) / left
+        hurried = len(groups) > 1 and left == settings.connect_attempts > 1
         for position, dialects in enumerate(groups):
-            share = (deadline - loop.time()) / (left * len(groups) - position)
-            if len(groups) > 1 and left == settings.connect_attempts:
-                share = min(share, DETECTION_SHARE)
+            begin, untried = loop.time(), len(groups) - position
             progress = Try(names_of(dialects), transport.value)
             tries.append(progress)
             try:
-                async with asyncio.timeout(share):
+                async with asyncio.timeout_at(end) as limit:
+                    progress.on_step = _sharer(limit, end, untried, hurried=hurried)
                     return await attempt(
                         address,
                         dialects,
@@ -375,7 +384,7 @@ async def establish(
                         liveness_timeout=settings.liveness_timeout,
                     )
             except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
-                progress.end(exc, share)
+                progress.end(exc, loop.time() - begin)
                 cause = exc
             if progress.hung_up:
                 # perhaps at the Disconnect: then the next link does without, and so by turns
@@ -395,6 +404,26 @@ async def establish(
         port=address.port,
         attempts=tuple(f"attempt {number}: {one}" for number, one in enumerate(tries, 1)),
     ) from cause
+
+
+def _sharer(
+    limit: asyncio.Timeout, end: float, untried: int, *, hurried: bool
+) -> Callable[[str], None]:
+    """Return what gives each step of an attempt its time, in a round that is over at ``end``.
+
+    Only the answer to Connect has to leave time for the dialects that are untried, this one
+    included: no link is none for any of them, and who answered speaks this one.
+    """
+    loop = asyncio.get_running_loop()
+
+    def on_step(step: str) -> None:
+        when = end
+        if step == CONNECTING:
+            share = (end - loop.time()) / untried
+            when = loop.time() + (min(share, DETECTION_SHARE) if hurried else share)
+        limit.reschedule(when)
+
+    return on_step
 
 
 def _folded(tries: list[Try]) -> str:
