@@ -215,7 +215,7 @@ def weight(event: Event) -> int:
 
 @pytest.mark.parametrize(
     ("took", "frames"),
-    [(0.0, 256), (connection.TURN, 64), (connection.TURN * 1.5, 42), (60.0, 32)],
+    [(0.0, 86), (connection.TURN, 64), (connection.TURN * 1.5, 42), (60.0, 32)],
 )
 async def test_chunk_is_as_large_as_a_turn_takes(
     server: Listener, took: float, frames: int, monkeypatch: pytest.MonkeyPatch
@@ -223,7 +223,7 @@ async def test_chunk_is_as_large_as_a_turn_takes(
     now = [0.0]
     monkeypatch.setattr(connection.time, "perf_counter", lambda: now[0])
     link, peer = await session(server)
-    await deliver(link, peer, RESULT * 400)
+    await deliver(link, peer, RESULT * 150)
     assert (await link.receive()).frames == connection.FIRST_CHUNK
     now[0] += took
     assert (await link.receive()).frames == frames
