@@ -17,7 +17,7 @@
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── CameraFaultError                       the camera reports System Error
     ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
-    ├── RecordingError (OSError)               a recording that could not be written
+    ├── RecordingError (OSError)               a recording that could not be written, or read
     ├── SubscriberOverflowError                a stream's reader was too slow, and wanted to know
     ├── TriggerError                           a trigger that gave no result, and why
     │   ├── OvertriggeredError
@@ -239,7 +239,8 @@ class CalibrationError(SmartCamError, ValueError):
 class RecordingError(SmartCamError, OSError):
     """A recording could not be written: the disk is full, or too slow; it ends there.
 
-    What was written before stays and can be read.
+    What was written before stays and can be read. Or one could not be read, since it unpacks to
+    more than any recording.
     """
 
 

@@ -10,17 +10,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import sys
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.store import sync_folder
 from smartcam.exceptions import CalibrationError
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
+from smartcam.locks import try_lock
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -109,13 +104,11 @@ class Journal:
         self._stream.close()
 
     def _lock(self) -> None:
-        try:
-            _lock(self._stream.fileno())
-        except (BlockingIOError, PermissionError) as exc:  # POSIX, Windows
+        if not try_lock(self._stream.fileno()):
             raise CalibrationError(
                 f"{self.path}: another sequence writes it; expected one at a time",
                 code=Code.IN_USE,
-            ) from exc
+            )
 
     def _load(self) -> None:
         if os.fstat(self._stream.fileno()).st_size > _MAX_FILE:
@@ -172,14 +165,3 @@ class Journal:
         return CalibrationError(
             f"{self.path}: {why}; expected the journal of a sequence", code=Code.BROKEN_FILE
         )
-
-
-def _lock(descriptor: int) -> None:
-    """Lock an open file, which must stand at its start, or raise OSError where it is locked."""
-    if sys.platform == "win32":
-        # Windows keeps others from what is locked: a byte behind all that a journal may hold
-        os.lseek(descriptor, _MAX_FILE, os.SEEK_SET)
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        os.lseek(descriptor, 0, os.SEEK_SET)
-    else:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

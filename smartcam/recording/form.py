@@ -9,8 +9,10 @@ keep to the types that Foxglove reads (``type`` is one word everywhere).
 from __future__ import annotations
 
 import importlib
+import json
+import math
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 from smartcam.connection import TraceEntry
 from smartcam.exceptions import MissingExtraError
@@ -34,11 +36,17 @@ __all__ = [
     "FILE_METADATA",
     "FORMAT",
     "KINDS",
+    "MAX_CAMERAS",
+    "MAX_MESSAGE",
+    "MAX_NAME",
+    "MAX_VALUES",
     "PROFILE",
     "Item",
     "Kind",
     "RecordedError",
+    "count_values",
     "load_extra",
+    "message_fields",
     "nanoseconds",
     "status_of",
     "topic_of",
@@ -56,6 +64,20 @@ FILE_METADATA = "smartcam"
 CAMERA_METADATA = "smartcam.camera"
 """Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and what else was
 told; a later one goes before an earlier one."""
+
+MAX_MESSAGE = 1 << 26
+"""Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
+room for an image of 16 MiB; the largest frame of a BVS camera takes 4 MiB."""
+
+MAX_VALUES = 3_000_000
+"""Commas and opening brackets of a message, written or read: each may become an object that takes
+a hundred times its room. A container of 1 MiB with a field a byte has two million."""
+
+MAX_CAMERAS = 10_000
+"""Cameras in a file: their facts are kept while it is read."""
+
+MAX_NAME = 1000
+"""Characters of a camera's name: a client takes 200, and HOST:PORT has fewer than 300."""
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 
@@ -136,6 +158,32 @@ def nanoseconds(at: datetime) -> int:
     return max(0, (at - EPOCH) // timedelta(microseconds=1) * 1000)
 
 
+def count_values(data: bytes) -> int:
+    """Return how many values a message has, roughly, and hold it against the bounds.
+
+    Raises:
+        ValueError: it goes beyond one.
+    """
+    if len(data) > MAX_MESSAGE:
+        raise ValueError(f"a message of {len(data)} bytes, expected {MAX_MESSAGE} at most")
+    values = data.count(b",") + data.count(b"{") + data.count(b"[")
+    if values > MAX_VALUES:
+        raise ValueError(f"a message of {values} values, expected {MAX_VALUES} at most")
+    return values
+
+
+def message_fields(data: bytes) -> dict[str, Any]:
+    """Return the object that a message is.
+
+    Raises:
+        ValueError: it is none.
+    """
+    parsed: Any = json.loads(data)
+    if not isinstance(parsed, dict):
+        raise ValueError(f"a message is a {type(parsed).__name__}, expected an object")  # noqa: TRY004
+    return cast("dict[str, Any]", parsed)
+
+
 def topic_of(camera: str, kind: str) -> str:
     """Return the topic of a camera's messages of one kind."""
     return f"/{camera}/{KINDS[kind].topic}"
@@ -162,71 +210,137 @@ def _event_object(event: CameraEvent) -> dict[str, Any]:
 # ---------------------------------------------------------------------- from JSON
 
 
+T = TypeVar("T")
+
+
+def _get(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """Return a field that must be there.
+
+    Raises:
+        ValueError: it is not there, or something else.
+    """
+    value = _optional(fields, name, kind)
+    if value is None:
+        raise ValueError(f"{name}: nothing is there, expected {kind.__name__}")
+    return value
+
+
+def _optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
+    """Return a field that may be missing."""
+    value: object = fields.get(name)
+    if value is None:
+        return None
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{name}: {value!r:.60} came, expected {kind.__name__}")
+    return value
+
+
+def _camera_name(fields: Mapping[str, Any]) -> str:
+    name = _get(fields, "camera", str)
+    if len(name) > MAX_NAME:
+        raise ValueError(f"camera: a name of {len(name)} characters, expected {MAX_NAME} at most")
+    return name
+
+
 def _time(text: str) -> datetime:
-    return datetime.fromisoformat(text)
+    at = datetime.fromisoformat(text)
+    if at.tzinfo is None:
+        raise ValueError(f"the time {text!r:.60} has no time zone")
+    return at.astimezone(UTC)
 
 
-def _optional_time(fields: Mapping[str, Any], name: str) -> datetime | None:
-    return _time(fields[name]) if name in fields else None
+def _when_of(fields: Mapping[str, Any], name: str) -> datetime:
+    return _time(_get(fields, name, str))
 
 
-def status_of(names: list[str]) -> Status:
-    """Return the status of its bits' names; a bit without a name stands there as ``0x40``."""
-    bits = [int(name, 16) if name.startswith("0x") else Status[name].value for name in names]
-    return Status(sum(bits))
+def _optional_when(fields: Mapping[str, Any], name: str) -> datetime | None:
+    text = _optional(fields, name, str)
+    return None if text is None else _time(text)
+
+
+def status_of(names: object) -> Status:
+    """Return the status of its bits' names; a bit without a name stands there as ``0x40``.
+
+    Raises:
+        ValueError: they are no names of bits.
+    """
+    bits = 0
+    for name in cast("list[object]", names) if isinstance(names, list) else [names]:
+        if not isinstance(name, str):
+            raise ValueError(f"status: {names!r:.60} came, expected names of bits")  # noqa: TRY004
+        if name.startswith("0x") and len(name) <= _BIT_DIGITS:
+            bits |= int(name, 16)
+        elif name in Status.__members__:
+            bits |= Status[name].value
+        else:
+            raise ValueError(f"status: {name!r:.60} is the name of no bit")
+    return Status(bits)
+
+
+_BIT_DIGITS = len("0x") + 16  # 64 bits: the vendor's 32 and 32 of ours
 
 
 def _frame(fields: dict[str, Any]) -> TraceEntry:
+    direction, data = _get(fields, "direction", str), _get(fields, "hex", str)
+    if direction not in {">", "<", "!"}:
+        raise ValueError(f"direction: {direction!r:.60} came, expected >, < or !")
+    bytes.fromhex(data)
     return TraceEntry(
-        _time(fields["at"]),
-        str(fields["camera"]),
-        str(fields["direction"]),
-        fields.get("message_id"),
-        str(fields["message"]),
-        fields.get("fields"),
-        str(fields["hex"]),
+        _when_of(fields, "at"),
+        _camera_name(fields),
+        direction,
+        _optional(fields, "message_id", int),
+        _get(fields, "message", str),
+        cast("dict[str, Any] | None", _optional(fields, "fields", dict)),
+        data,
     )
 
 
 def _result(fields: dict[str, Any]) -> Result:
+    latency = fields.get("latency")
+    if latency is not None and not (type(latency) in {int, float} and math.isfinite(latency)):
+        raise ValueError(f"latency: {latency!r:.60} came, expected seconds")
     return Result(
-        str(fields["camera"]),
-        int(fields["application"]),
-        fields.get("sequence"),
-        int(fields["number"]),
-        _optional_time(fields, "triggered_at"),
-        _time(fields["received_at"]),
-        fields.get("latency"),
-        bytes.fromhex(fields["raw"]),
+        _camera_name(fields),
+        _get(fields, "application", int),
+        _optional(fields, "sequence", int),
+        _get(fields, "number", int),
+        _optional_when(fields, "triggered_at"),
+        _when_of(fields, "received_at"),
+        latency,
+        bytes.fromhex(_get(fields, "raw", str)),
         fields.get("value"),
     )
 
 
 def _event(fields: dict[str, Any]) -> CameraEvent:
-    camera, at = str(fields["camera"]), _time(fields["at"])
-    match fields["event"]:
+    camera, at = _camera_name(fields), _when_of(fields, "at")
+    match _get(fields, "event", str):
         case "Connected":
-            return Connected(camera=camera, at=at, url=fields["url"])
+            return Connected(camera=camera, at=at, url=_get(fields, "url", str))
         case "Reconnected":
-            return Reconnected(camera=camera, at=at, url=fields["url"])
+            return Reconnected(camera=camera, at=at, url=_get(fields, "url", str))
         case "Disconnected":
             return Disconnected(
-                camera=camera, at=at, reason=fields["reason"], expected=fields["expected"]
+                camera=camera,
+                at=at,
+                reason=_get(fields, "reason", str),
+                expected=_get(fields, "expected", bool),
             )
         case "StatusChanged":
             before = fields.get("previous_status")
             return StatusChanged(
                 camera=camera,
                 at=at,
-                status=status_of(fields["status"]),
+                status=status_of(_get(fields, "status", list)),
                 previous=None if before is None else status_of(before),
             )
         case "ApplicationChanged":
             return ApplicationChanged(
                 camera=camera,
                 at=at,
-                application=fields["application"],
-                previous=fields.get("previous_application"),
+                application=_get(fields, "application", int),
+                previous=_optional(fields, "previous_application", int),
             )
         case _:
             return CameraEvent(camera=camera, at=at)
@@ -234,11 +348,11 @@ def _event(fields: dict[str, Any]) -> CameraEvent:
 
 def _error(fields: dict[str, Any]) -> RecordedError:
     return RecordedError(
-        str(fields["camera"]),
-        _time(fields["at"]),
-        str(fields["error"]),
-        str(fields["text"]),
-        _optional_time(fields, "triggered_at"),
+        _camera_name(fields),
+        _when_of(fields, "at"),
+        _get(fields, "error", str),
+        _get(fields, "text", str),
+        _optional_when(fields, "triggered_at"),
     )
 
 

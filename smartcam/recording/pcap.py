@@ -41,10 +41,18 @@ MAX_PACKET = 1 << 18
 FIRST_PORT, PORTS = 49_152, 16_384
 """The ports that a system gives to clients (RFC 6335); each link takes the next."""
 
+MAX_DATAGRAM = 65_507
+"""Bytes of a UDP datagram over IPv4."""
+
+MAX_TIME = (1 << 32) * 10**9
+"""Nanoseconds since 1970 that a packet's time stays below: pcap counts seconds in 32 bits."""
+
 _ADDRESSES = {4: ("192.0.2.1", "192.0.2.2"), 6: ("2001:db8::1", "2001:db8::2")}
 """Addresses for documents (RFC 5737, RFC 3849): the client's, and that of a camera with a name."""
 
 _CLIENT_MAC, _CAMERA_MAC = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")
+
+_HANDSHAKE = 3000  # nanoseconds before the first frame
 
 _FIN, _SYN, _RST, _PUSH, _ACK = 0x01, 0x02, 0x04, 0x08, 0x10
 
@@ -82,7 +90,8 @@ def write_pcap(
 
     Raises:
         ConfigurationError: no such camera, or the file is there already or cannot be made.
-        RecordingError: it cannot be written to its end.
+        RecordingError: it cannot be written to its end: the disk is full, or a frame fits into no
+            packet.
         MissingExtraError: dpkt is not installed.
     """
     dpkt = load_extra("dpkt")
@@ -105,6 +114,8 @@ def write_pcap(
             for packet in _packets(recording, camera, dpkt):
                 writer.writepkt_time(packet.data, Decimal(packet.time // 1000) / 1_000_000)
                 count += 1
+    except RecordingError as exc:
+        raise RecordingError(f"pcap {path}: {exc}") from exc
     except OSError as exc:
         raise RecordingError(f"pcap {path}: {exc.strerror or exc}") from exc
     return count
@@ -179,13 +190,17 @@ class _Wire:
         data = bytes.fromhex(entry.hex)
         if not data:
             return  # a password, which is not recorded
-        self._now = max(self._now, nanoseconds(entry.at))
+        self._now = max(self._now, nanoseconds(entry.at), _HANDSHAKE)
         if not self._open:
             self._open = True
             yield from self._begin()
         outward = entry.direction == ">"
         sender, receiver = (self._client, self._camera) if outward else (self._camera, self._client)
         if not self._tcp:
+            if len(data) > MAX_DATAGRAM:
+                raise RecordingError(
+                    f"a frame of {len(data)} bytes, expected {MAX_DATAGRAM} at most over UDP"
+                )
             yield self._datagram(sender, receiver, data)
             return
         for begin in range(0, len(data), self._mss):
@@ -204,7 +219,7 @@ class _Wire:
         if not self._tcp:
             return
         client.sequence, camera.sequence = 1000, 2000
-        now, self._now = self._now, self._now - 3000
+        now, self._now = self._now, self._now - _HANDSHAKE
         yield self._segment(client, camera, _SYN)
         client.sequence += 1
         self._now += 1000
@@ -264,6 +279,8 @@ class _Wire:
             ip = dpkt.ip6.IP6(src=sender.ip, dst=receiver.ip, nxt=protocol, hlim=64, data=payload)
             ip.plen = len(payload)
             kind = dpkt.ethernet.ETH_TYPE_IP6
+        if self._now >= MAX_TIME:
+            raise RecordingError("a frame of the year 2106 or later, which pcap cannot tell")
         frame = dpkt.ethernet.Ethernet(src=sender.mac, dst=receiver.mac, type=kind, data=ip)
         return _Packet(self._now, bytes(frame))
 

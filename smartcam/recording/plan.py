@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 from smartcam.connection import TraceEntry
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import Disconnected, Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport, Verdict
@@ -31,6 +31,9 @@ __all__ = ["CONDITIONS", "Change", "ReplayPlan", "Take", "TakeList", "plan_repla
 
 CONDITIONS = (Status.OVERHEAT, Status.SYSTEM_ERROR)
 """What an operator of the emulated camera can set; the other bits follow from what it does."""
+
+MAX_REPLAY = 1 << 30
+"""Bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times a second."""
 
 
 @dataclass(slots=True)
@@ -117,6 +120,7 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
 
     Raises:
         ConfigurationError: no such camera, it had no session, or it is none that can be emulated.
+        RecordingError: its containers are more than :data:`MAX_REPLAY`.
     """
     known = recording.camera(camera)
     dialect, transport = _spoken(recording, known)
@@ -226,8 +230,9 @@ def _steps(items: Iterable[Item], dialect: FramedDialect) -> Iterator[_Step]:
 
     Raises:
         ConfigurationError: a frame has not the fields of its message.
+        RecordingError: there is too much of them.
     """
-    at, active = 0.0, m.UNNAMED_APPLICATION
+    at, active, size = 0.0, m.UNNAMED_APPLICATION, 0
     for item in items:
         if isinstance(item, Disconnected):
             yield _Step(at, _What.LOST)
@@ -236,12 +241,18 @@ def _steps(items: Iterable[Item], dialect: FramedDialect) -> Iterator[_Step]:
         at = max(at, item.at.timestamp())
         try:
             step = _step(at, item, dialect)
-        except (KeyError, TypeError, ValueError) as exc:
+        except (KeyError, TypeError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
                 f"recording: a {item.message} has not the fields of one: {item.fields!r:.80}"
             ) from exc
         if step is None:
             continue
+        size += len(step.data)
+        if size > MAX_REPLAY:
+            raise RecordingError(
+                f"recording: {size} bytes of containers until {item.at}, expected {MAX_REPLAY} at "
+                "most for a replay"
+            )
         if step.what is _What.CONTAINER and step.number == m.UNNAMED_APPLICATION:
             step = step._replace(number=active)  # a quirk: it does not say whose it is
         elif step.what in {_What.SWITCHED, _What.NAMED}:

@@ -2,34 +2,48 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from smartcam.connection import TraceEntry
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Result
 from smartcam.recording.form import (
     CAMERA_METADATA,
     FILE_METADATA,
     FORMAT,
     KINDS,
+    MAX_CAMERAS,
     RecordedError,
-    load_extra,
+    count_values,
+    message_fields,
 )
 from smartcam.recording.recorder import Counts
+from smartcam.recording.records import (
+    Channel,
+    CutOffError,
+    Message,
+    Metadata,
+    RecordReader,
+    Schema,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sized
     from datetime import datetime
 
     from smartcam.recording.form import Item, Kind
+    from smartcam.recording.records import Record
 
 __all__ = ["RecordedCamera", "Recording", "load_recording"]
 
-MAX_RECORD = 1 << 28
-"""Bytes of one record of a file: ours have about 1 MiB, a damaged length says anything."""
+MIN_VALUES = 10_000_000
+"""Values in the messages of a file that every file may have: ten seconds of work."""
+
+VALUES_PER_BYTE = 100
+"""Values for each byte of a larger file. Real recordings have less than one, since each message
+takes 16 bytes of index; tables that are nearly all zeros have ten."""
 
 T = TypeVar("T")
 
@@ -138,7 +152,8 @@ def load_recording(path: str | Path) -> Recording:
 
     Raises:
         ConfigurationError: the file cannot be read, is no MCAP, or is another program's.
-        MissingExtraError: the mcap library is not installed.
+        RecordingError: it goes beyond a bound that no recording comes near, or the disk fails.
+        MissingExtraError: what inflates its chunks is not installed.
     """
     scan = _Scan(Path(path))
     counts = dict.fromkeys(KINDS, 0)
@@ -147,6 +162,7 @@ def load_recording(path: str | Path) -> Recording:
     names: dict[str, None] = {}
     for item in scan.items():
         names[item.camera] = None
+        _check_cameras(scan.path, names)
         counts[_kind(item)] += 1
         at = item.received_at if isinstance(item, Result) else item.at
         began = at if began is None else min(began, at)
@@ -160,6 +176,13 @@ def load_recording(path: str | Path) -> Recording:
         ended=ended,
         remark=scan.remark,
     )
+
+
+def _check_cameras(path: Path, names: Sized) -> None:
+    if len(names) > MAX_CAMERAS:
+        raise RecordingError(
+            f"recording {path}: {len(names)} cameras, expected {MAX_CAMERAS} at most"
+        )
 
 
 def _kind(item: Item) -> str:
@@ -195,21 +218,22 @@ class _Scan:
         file_facts: what it says about itself; filled during the pass, as the next two.
         camera_facts: what it says about cameras, by their names.
         remark: where it stops being readable, and why.
+        values: in its messages so far.
     """
 
     path: Path
     file_facts: dict[str, str] = field(default_factory=dict[str, str])
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     remark: str = ""
+    values: int = 0
 
     def items(self) -> Iterator[Item]:
         """Yield everything that can be read.
 
         Raises:
             ConfigurationError: it is no recording of ours.
+            RecordingError: it goes beyond a bound, or the disk fails.
         """
-        mcap = load_extra("mcap.stream_reader")
-        exceptions = load_extra("mcap.exceptions")
         try:
             stream = self.path.open("rb")
         except (OSError, ValueError) as exc:
@@ -218,47 +242,61 @@ class _Scan:
         with stream:
             self._check_magic(stream.read(8))
             stream.seek(0)
-            reader = mcap.StreamReader(stream, validate_crcs=True, record_size_limit=MAX_RECORD)
             count = 0
             kinds: dict[int, Kind] = {}
             schemas: dict[int, str] = {}
-            records: Iterator[Any] = iter(reader.records)
+            reader = RecordReader(stream, self.path)
+            records = reader.records()
             while True:
                 try:
                     record = next(records)
-                    item = self._take(record, schemas, kinds)
+                    item = self._take(record, schemas, kinds, reader.place)
                 except StopIteration:
                     break
-                except ConfigurationError:
+                except SmartCamError:
                     raise
-                except Exception as exc:  # noqa: BLE001 - the library checks little of what it reads
-                    cut = isinstance(exc, exceptions.EndOfFile) or not stream.read(1)
-                    self.remark = _remark(count, cut=cut, cause=exc)
+                except OSError as exc:
+                    raise RecordingError(f"recording {self.path}: {exc.strerror or exc}") from exc
+                except (CutOffError, ValueError, OverflowError, RecursionError) as exc:
+                    self.remark = _remark(count, exc)
                     break
                 if item is not None:
                     count += 1
                     yield item
             self._check_ours(schemas)
 
-    def _take(self, record: Any, schemas: dict[int, str], kinds: dict[int, Kind]) -> Item | None:
-        match type(record).__name__:
-            case "Schema":
-                schemas[record.id] = record.name
-            case "Channel":
-                name = schemas.get(record.schema_id, "")
+    def _take(
+        self, record: Record, schemas: dict[int, str], kinds: dict[int, Kind], place: int
+    ) -> Item | None:
+        match record:
+            case Schema(number, name):
+                schemas[number] = name
+            case Channel(number, schema):
+                name = schemas.get(schema, "")
                 kind = next((one for one in KINDS.values() if one.schema == name), None)
                 if kind is not None:
-                    kinds[record.id] = kind
-            case "Message" if record.channel_id in kinds:
-                return kinds[record.channel_id].from_json(json.loads(record.data))
-            case "Metadata" if record.name == FILE_METADATA:
-                self.file_facts = dict(record.metadata)
+                    kinds[number] = kind
+            case Message(channel, data) if channel in kinds:
+                body = bytes(data)
+                self._count_values(count_values(body), place)
+                return kinds[channel].from_json(message_fields(body))
+            case Metadata(name, facts) if name == FILE_METADATA:
+                self.file_facts = facts
                 self._check_format()
-            case "Metadata" if record.name == CAMERA_METADATA:
-                self.camera_facts[record.metadata["camera"]] = dict(record.metadata)
+            case Metadata(name, facts) if name == CAMERA_METADATA:
+                self.camera_facts[facts.get("camera", "")] = facts
+                _check_cameras(self.path, self.camera_facts)
             case _:
                 pass
         return None
+
+    def _count_values(self, count: int, place: int) -> None:
+        self.values += count
+        if self.values > max(MIN_VALUES, VALUES_PER_BYTE * place):
+            raise RecordingError(
+                f"recording {self.path}: {self.values} values in the messages of the first {place} "
+                f"bytes of the file, expected {VALUES_PER_BYTE} a byte at most, or {MIN_VALUES}"
+            )
 
     def _check_magic(self, begin: bytes) -> None:
         if not begin.startswith(b"\x89MCAP"):
@@ -282,7 +320,7 @@ class _Scan:
             )
 
 
-def _remark(count: int, *, cut: bool, cause: Exception) -> str:
-    if cut:
+def _remark(count: int, cause: Exception) -> str:
+    if isinstance(cause, CutOffError):
         return f"the file has no end: the recording was cut off; {count} messages were read"
-    return f"the file is damaged behind message {count}: {cause!r:.120}; the rest cannot be read"
+    return f"the file is damaged behind message {count}: {cause!s:.200}; the rest cannot be read"

@@ -22,6 +22,7 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 import smartcam
 from smartcam.connection import TraceEntry
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
+from smartcam.locks import try_lock
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
 from smartcam.observers import Observer
 from smartcam.recording.form import (
@@ -31,6 +32,7 @@ from smartcam.recording.form import (
     KINDS,
     PROFILE,
     RecordedError,
+    count_values,
     load_extra,
     nanoseconds,
     topic_of,
@@ -124,19 +126,22 @@ class Recorder(Observer):
         """Make the file and start the thread that writes it.
 
         Raises:
-            ConfigurationError: the file is there already, or cannot be made.
+            ConfigurationError: the file is there already, another recorder writes it, or it cannot
+                be made.
             MissingExtraError: the mcap library is not installed.
         """
         if self._thread is not None:
             raise ConfigurationError(f"recording {self.path}: opened before; make a new recorder")
         writer = load_extra("mcap.writer")
         try:
-            stream = self.path.open("wb" if self._overwrite else "xb")
+            stream = _opened(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
             raise ConfigurationError(
                 f"recording {self.path}: the file is there already; overwrite (--force) takes its "
                 "place"
             ) from exc
+        except ConfigurationError:
+            raise
         except (OSError, ValueError) as exc:
             reason = exc.strerror if isinstance(exc, OSError) else exc
             raise ConfigurationError(f"recording {self.path}: {reason}") from exc
@@ -269,6 +274,8 @@ class Recorder(Observer):
                 file.finish()
         except OSError as exc:
             self._fail(exc.strerror or str(exc), exc)
+        except ValueError as exc:  # a message that nobody could read back
+            self._fail(str(exc), exc)
         except Exception as exc:  # noqa: BLE001 - a thread that ends silently would be worse
             self._fail(f"unexpected {exc!r}", exc)
 
@@ -283,6 +290,30 @@ class Recorder(Observer):
             file.add(item)
         file.flush()
         return over
+
+
+def _opened(path: Path, *, overwrite: bool) -> IO[bytes]:
+    """Open a file for one recorder; what was in it is gone when it is ours, not before.
+
+    Raises:
+        ConfigurationError: another recorder writes it.
+        FileExistsError: it is there already.
+        OSError: it cannot be made.
+    """
+    stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
+    try:
+        if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):  # a pipe may have many writers
+            if not try_lock(stream.fileno()):
+                raise ConfigurationError(f"recording {path}: another recorder is writing this file")
+            stream.truncate()
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _open_whole(path: str, flags: int) -> int:
+    return os.open(path, flags & ~os.O_TRUNC, 0o666)
 
 
 class _File:
@@ -347,6 +378,7 @@ class _File:
         when = nanoseconds(at)
         self._numbers[channel] = number = self._numbers[channel] + 1
         data = json.dumps(KINDS[kind].to_json(item), separators=(",", ":")).encode()
+        count_values(data)
         self._writer.add_message(channel, when, data, when, number & 0xFFFFFFFF)
 
     def _channel(self, camera: str, kind: str) -> int:
