@@ -132,6 +132,7 @@ LIMITS = (
     "testing.threads.CALL_TIMEOUT",
     "calibration.fitting.MOST_STEPS",
     "calibration.folder.MAX_NAME",
+    "calibration.store.LOCK_TIMEOUT",
     "calibration.formats.MAX_FILE",
     "calibration.formats.MAX_TEXT",
     "calibration.formats.MAX_YAML",

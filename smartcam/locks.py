@@ -22,10 +22,11 @@ PLACE = 1 << 62
 _HELD = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES, errno.EDEADLK})
 
 
-def try_lock(descriptor: int) -> bool:
-    """Lock an open file, whose place does not change; return False where another one has it.
+def try_lock(descriptor: int) -> bool | None:
+    """Lock an open file, whose place does not change.
 
-    Where the file system knows no locks, every file counts as free.
+    Returns:
+        Whether it is ours now, not another one's; None where the file system knows no locks.
     """
     try:
         if sys.platform == "win32":
@@ -38,5 +39,5 @@ def try_lock(descriptor: int) -> bool:
         else:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as exc:
-        return exc.errno not in _HELD
+        return False if exc.errno in _HELD else None
     return True

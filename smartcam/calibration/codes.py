@@ -113,7 +113,7 @@ class Code(enum.StrEnum):
     WRONG_JOURNAL = "WRONG_JOURNAL"
     """A journal that another wizard wrote, or another version of it."""
     IN_USE = "IN_USE"
-    """Another process, or another sequence of this one, writes the journal."""
+    """Another process, or another sequence of this one, writes the journal or in the folder."""
     BAD_NAME = "BAD_NAME"
     """A name that no file may have, or that leads out of the folder."""
     NOT_FOUND = "NOT_FOUND"
@@ -126,6 +126,8 @@ class Code(enum.StrEnum):
     """A file of a newer smartcam, whose meaning this one does not know."""
     NOT_STORABLE = "NOT_STORABLE"
     """A value that JSON cannot hold exactly: NaN, infinity, an object."""
+    NOT_WRITTEN = "NOT_WRITTEN"
+    """A file that could not be written: the disk is full, or nobody may write there."""
 
     # formats of other programs
     UNKNOWN_FORMAT = "UNKNOWN_FORMAT"

@@ -104,7 +104,7 @@ class Journal:
         self._stream.close()
 
     def _lock(self) -> None:
-        if not try_lock(self._stream.fileno()):
+        if try_lock(self._stream.fileno()) is False:
             raise CalibrationError(
                 f"{self.path}: another sequence writes it; expected one at a time",
                 code=Code.IN_USE,

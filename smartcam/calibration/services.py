@@ -167,8 +167,8 @@ class CalibrationService:
         Raises:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read. ``UNKNOWN_FORMAT``;
                 ``WRONG_KIND``: a matrix is wanted of what is no plane's; ``NOT_SIMILAR``: it has no
-                frame; see :func:`~smartcam.calibration.formats.plane_frame`.
-            OSError: it cannot be written.
+                frame; see :func:`~smartcam.calibration.formats.plane_frame`;
+                ``NOT_WRITTEN``: it cannot be written.
         """
         from smartcam.calibration.formats import PlaneMatrix, compose
         from smartcam.calibration.formats.opencv import compose_matrix
@@ -256,7 +256,7 @@ def _put_aside(path: Path) -> None:
         if exc.code != Code.BROKEN_FILE:
             raise
     keep_backup(path, JOURNALS)
-    path.unlink()
+    path.unlink(missing_ok=True)
 
 
 def _of_kind(document: Document, kind: str, name: str) -> dict[str, Any]:

@@ -6,18 +6,22 @@ digits as it takes to read the same bits again; NaN and infinity, which JSON lac
 
 Writing: a temporary file in the same folder is written and synced, the present file is kept under
 ``NAME.1`` (the one before as ``NAME.2``, ...), the new one takes its place in one step, the folder
-is synced. Whenever that is cut off, the name leads to the old file or the new one, whole.
+is synced. Whenever that is cut off, the name leads to the old file or the new one, whole; the next
+writer clears away what was left. One writes in a folder at a time, as long as it has its lock.
 """
 
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import hashlib
+import itertools
 import json
 import os
 import platform
-import shutil
+import re
 import tempfile
+import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -26,12 +30,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 from smartcam.calibration.codes import Code
 from smartcam.exceptions import CalibrationError
+from smartcam.locks import try_lock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
 __all__ = [
     "BACKUPS",
+    "LOCK_TIMEOUT",
     "MAX_FILE",
     "MIGRATIONS",
     "SCHEMA",
@@ -60,6 +66,12 @@ BACKUPS = 3
 
 MAX_FILE = 1 << 24
 """Bytes of a file at most: a calibration of 10,000 touches has a quarter of it."""
+
+LOCK_TIMEOUT = 30.0
+"""Seconds that a writer waits for others in the same folder, each of which takes milliseconds."""
+
+_LOOK_AGAIN = 0.002
+_ATTEMPTS = 5
 
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
 """By major version: what makes the content of the next major version of a file's content."""
@@ -108,8 +120,8 @@ def write(
         backups: earlier versions to keep.
 
     Raises:
-        CalibrationError: ``NOT_STORABLE``, the data are no JSON or too large.
-        OSError: it cannot be written; what was there is there.
+        CalibrationError: ``NOT_STORABLE``, the data are no JSON or too large; ``NOT_WRITTEN`` or
+            ``IN_USE``, it cannot be written: what was there is there.
     """
     content = {
         "schema": SCHEMA,
@@ -244,28 +256,25 @@ def _software() -> dict[str, str]:
 def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
     """Put a file in the place of another, whole or not at all.
 
+    Any number of processes and threads may do so at once; the last one's file stays. What a crash
+    left behind is cleared away.
+
     Args:
         path: the file; a symbolic link is replaced, not followed.
         body: its bytes.
         backups: earlier versions to keep.
 
     Raises:
-        OSError: it cannot be written; what was there is there.
+        CalibrationError: ``NOT_WRITTEN``, it cannot be written, or ``IN_USE``, another one writes
+            in the folder and does not end; what was there is there.
     """
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(body)
-            stream.flush()
-            os.fsync(stream.fileno())
-        if backups > 0:
-            keep_backup(path, backups)
-        Path(temporary).replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            Path(temporary).unlink()
-        raise
-    sync_folder(path.parent)
+    with _writing(path) as alone:
+        if alone:
+            _clear(path)
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(FileNotFoundError, FileExistsError):
+                return _replace(path, body, backups)
+        return _replace(path, body, backups)
 
 
 def keep_backup(path: Path, count: int) -> None:
@@ -276,18 +285,10 @@ def keep_backup(path: Path, count: int) -> None:
         count: how many are kept.
 
     Raises:
-        OSError: it cannot be done.
+        CalibrationError: as :func:`replace_file`.
     """
-    if not path.is_file() or path.is_symlink():
-        return
-    rows = [path.with_name(f"{path.name}.{number}") for number in range(1, count + 1)]
-    for older, newer in zip(reversed(rows), reversed(rows[:-1]), strict=False):
-        if newer.exists():
-            newer.replace(older)
-    try:
-        os.link(path, rows[0])  # a second name: no moment without the file
-    except (OSError, NotImplementedError):
-        shutil.copy2(path, rows[0])
+    with _writing(path):
+        _rotate(path, count)
 
 
 def sync_folder(folder: Path) -> None:
@@ -300,3 +301,96 @@ def sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[bool]:
+    """Be the only one that writes in a file's folder; what the disk refuses is told as ours.
+
+    Yields whether it is so: there are file systems without locks.
+    """
+    try:
+        handle = _open_lock(path.parent)
+        try:
+            deadline = time.monotonic() + LOCK_TIMEOUT
+            while (alone := try_lock(handle)) is False:
+                if time.monotonic() > deadline:
+                    raise CalibrationError(
+                        f"{path}: another process has written in its folder for "
+                        f"{LOCK_TIMEOUT:g} s; expected it to end",
+                        code=Code.IN_USE,
+                    )
+                time.sleep(_LOOK_AGAIN)
+            yield alone is True
+        finally:
+            os.close(handle)  # and with it the lock
+    except OSError as exc:
+        raise CalibrationError(
+            f"{path}: cannot be written: {exc.strerror or exc}",
+            code=Code.NOT_WRITTEN,
+            got=exc.errno,
+        ) from exc
+
+
+def _open_lock(folder: Path) -> int:
+    """Return what is locked: the folder itself; on Windows, where it cannot be, a file in it."""
+    flags = getattr(os, "O_DIRECTORY", None)
+    if flags is None:
+        return os.open(folder / ".smartcam.lock", os.O_RDWR | os.O_CREAT)
+    return os.open(folder, os.O_RDONLY | flags)
+
+
+def _replace(path: Path, body: bytes, backups: int) -> None:
+    """Replace a file; where there are no locks, another one may be at the backups, too."""
+    temporary = _temporary(path, body)
+    try:
+        if backups > 0:
+            _rotate(path, backups)
+        temporary.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    sync_folder(path.parent)
+
+
+def _clear(path: Path) -> None:
+    """Take away what was to become this file when its writer was killed."""
+    stale = re.compile(re.escape(f".{path.name}.") + r"[a-z0-9_]{8}\.tmp")
+    with os.scandir(path.parent) as found:
+        names = [one.name for one in found if stale.fullmatch(one.name)]
+    for name in names:
+        path.with_name(name).unlink(missing_ok=True)
+
+
+def _temporary(path: Path, body: bytes) -> Path:
+    """Write a file beside another one, to take its place."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(body)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except BaseException:
+        with contextlib.suppress(OSError):
+            Path(name).unlink()
+        raise
+    return Path(name)
+
+
+def _rotate(path: Path, count: int) -> None:
+    if not path.is_file() or path.is_symlink():
+        return
+    rows = [path.with_name(f"{path.name}.{number}") for number in range(1, count + 1)]
+    if rows[0].is_file() and filecmp.cmp(path, rows[0], shallow=False):
+        return  # a crash came between backup and new file
+    filled = list(itertools.takewhile(Path.exists, rows[:-1]))  # a gap takes what comes before it
+    for newer, older in reversed(list(zip(filled, rows[1:], strict=False))):
+        if older.exists() and newer.samefile(older):
+            newer.unlink()  # to rename one name of a file to another does nothing
+        else:
+            newer.replace(older)
+    try:
+        os.link(path, rows[0])  # a second name: no moment without the file
+    except (OSError, NotImplementedError):
+        _temporary(path, path.read_bytes()).replace(rows[0])

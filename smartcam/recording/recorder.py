@@ -303,7 +303,7 @@ def _opened(path: Path, *, overwrite: bool) -> IO[bytes]:
     stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
     try:
         if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):  # a pipe may have many writers
-            if not try_lock(stream.fileno()):
+            if try_lock(stream.fileno()) is False:
                 raise ConfigurationError(f"recording {path}: another recorder is writing this file")
             stream.truncate()
     except BaseException:

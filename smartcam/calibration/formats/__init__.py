@@ -253,8 +253,8 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``; ``BAD_NAME``: a frame's name that the format cannot
-            hold.
-        OSError: it cannot be written.
+            hold;
+            ``NOT_WRITTEN``: it cannot be written.
     """
     _write(path, _known(TRANSFORMS, form), transform)
 
@@ -273,8 +273,8 @@ def write_samples(path: str | os.PathLike[str], form: str, values: Sequence[Samp
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``; ``WRONG_FRAME``: they are not all between the same
-            frames, whose names the file cannot tell.
-        OSError: it cannot be written.
+            frames, whose names the file cannot tell;
+            ``NOT_WRITTEN``: it cannot be written.
     """
     _write(path, _known(SAMPLES, form), values)
 
@@ -294,8 +294,8 @@ def write_trajectory(path: str | os.PathLike[str], form: str, values: Sequence[T
     """Write poses over time; the file is whole, or what was there before.
 
     Raises:
-        CalibrationError: ``UNKNOWN_FORMAT``, ``WRONG_FRAME``; ``BAD_TIME``: one has none.
-        OSError: it cannot be written.
+        CalibrationError: ``UNKNOWN_FORMAT``, ``WRONG_FRAME``; ``BAD_TIME``: one has none;
+            ``NOT_WRITTEN``: it cannot be written.
     """
     _write(path, _known(TRAJECTORIES, form), values)
 

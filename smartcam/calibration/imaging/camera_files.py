@@ -175,8 +175,8 @@ def write_cameras(path: str | os.PathLike[str], form: CameraForm, chain: CameraC
 
     Raises:
         CalibrationError: ``SHAPE``: the format cannot hold so many cameras, or such a lens;
-            ``UNKNOWN_FORMAT``.
-        OSError: it cannot be written.
+            ``UNKNOWN_FORMAT``;
+            ``NOT_WRITTEN``: it cannot be written.
     """
     replace_file(Path(path), _known(form).compose(chain).encode())
 
@@ -200,7 +200,7 @@ def write_camera_info(
             without its distortion.
 
     Raises:
-        OSError: it cannot be written.
+        CalibrationError: ``NOT_WRITTEN``: it cannot be written.
     """
     text = compose_camera_info(camera, name, rectification, projection)
     replace_file(Path(path), text.encode())
