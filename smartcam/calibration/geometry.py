@@ -19,8 +19,10 @@ __all__ = [
     "Array",
     "as_points",
     "as_vector",
+    "check_finite",
     "frame_from_axes",
     "matrix_from_quaternion",
+    "not_finite",
     "quaternion_about_z",
     "quaternion_conjugate",
     "quaternion_from_matrix",
@@ -91,6 +93,28 @@ def as_vector(values: ArrayLike, length: int, what: str) -> Array:
     """
     vector: Array = as_points(np.expand_dims(np.asarray(values), 0), length, what)[0]
     return vector
+
+
+def check_finite(values: Array, what: str) -> None:
+    """Raise where a calibration gives what is no number.
+
+    Raises:
+        CalibrationError: NOT_FINITE; ``what`` says what it was to give.
+    """
+    if not np.isfinite(values).all():
+        row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
+        raise not_finite(what, np.atleast_1d(values[row]).tolist())
+
+
+def not_finite(what: str, got: object) -> CalibrationError:
+    """Return the error that says that a calibration gives what is no number."""
+    return CalibrationError(
+        f"{what}: expected finite numbers, the calibration gives {got}: it is damaged, or this is "
+        "far outside of what it was made for",
+        code=Code.NOT_FINITE,
+        expected="finite numbers",
+        got=got,
+    )
 
 
 def wrap_angle(angle: ArrayLike) -> Array:

@@ -14,7 +14,13 @@ import numpy as np
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.extra import load
-from smartcam.calibration.geometry import as_points, quaternion_from_matrix
+from smartcam.calibration.geometry import (
+    LARGEST,
+    as_points,
+    check_finite,
+    not_finite,
+    quaternion_from_matrix,
+)
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
@@ -44,13 +50,25 @@ class PlaneMap:
     Args:
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres.
         centre: (2,), a point that the camera sees; ``w`` is positive there.
+
+    Raises:
+        CalibrationError: NOT_FINITE: the matrix maps the centre nowhere, or all points to a line.
     """
 
     def __init__(self, matrix: Array, centre: Array) -> None:
         self.matrix: Array = matrix
         """As given."""
+        self._depth: tuple[float, float, float] = tuple(matrix[3].tolist())
+        self._most = 3.0 * float(np.abs(matrix).max())
         self.projective: bool = bool(matrix[3, :2].any())
         """Whether parallel lines may meet: a homography."""
+        with np.errstate(all="ignore"):
+            self._prepare(matrix, centre)
+        known = [self.origin, self.frame, self._flat, self._back]
+        if not (all(np.isfinite(one).all() for one in known) and 0 < self.scale < math.inf):
+            raise not_finite("plane's matrix", matrix.tolist())
+
+    def _prepare(self, matrix: Array, centre: Array) -> None:
         origin, derivative = self._at(centre)
         self.origin: Array = origin
         """Where the centre lies (3,), metres."""
@@ -62,7 +80,10 @@ class PlaneMap:
         self._flat = np.vstack(
             [inside @ matrix[:3] - np.outer(inside @ self.origin, matrix[3]), matrix[3]]
         )
-        self._back = np.asarray(np.linalg.inv(self._flat), dtype=np.float64)
+        try:
+            self._back = np.asarray(np.linalg.inv(self._flat), dtype=np.float64)
+        except np.linalg.LinAlgError as exc:
+            raise not_finite("plane's matrix", matrix.tolist()) from exc
         self._turn = Quaternion(*quaternion_from_matrix(self.frame).tolist())
 
     def _at(self, point: Array) -> tuple[Array, Array]:
@@ -80,14 +101,36 @@ class PlaneMap:
         result = np.empty((len(given), 3)) if out is None else _checked(out, len(given))
         if len(given) <= FEW:
             self._check_horizon(given)
-            mapped = given[:, :2] @ self.matrix[:, :2].T + self.matrix[:, 2]
-            np.divide(mapped[:, :3], mapped[:, 3:], out=result)
+            with np.errstate(all="ignore"):
+                mapped = given[:, :2] @ self.matrix[:, :2].T + self.matrix[:, 2]
+                np.divide(mapped[:, :3], mapped[:, 3:], out=result)
+            if not np.isfinite(result).all():
+                _check_mapped(given, result)
             return result
         source = _Homogeneous(given)
         for begin in range(0, len(given), BLOCK):
-            self._check_horizon(given[begin : begin + BLOCK])
+            block = given[begin : begin + BLOCK]
+            farthest = self._farthest(block)
+            least = self._least_depth(farthest)
+            if not least > 0:
+                self._check_horizon(block)
             self._fill(source.block(begin), result[begin : begin + BLOCK])
+            if not (least > 0 and self._most * max(farthest, 1.0) / least < LARGEST):
+                _check_mapped(block, result[begin : begin + BLOCK])
         return result
+
+    def _farthest(self, points: Array) -> float:
+        """Return the largest coordinate; NaN where there is one that must not pass for 0."""
+        if self.projective:  # OpenCV divides by NaN, and gives 0
+            return max(float(points.max()), -float(points.min()))
+        cv2 = load("cv2")
+        size: float = cv2.norm(points.reshape(-1, 1), cv2.NORM_INF)
+        return size
+
+    def _least_depth(self, farthest: float) -> float:
+        """Return what ``w`` is at least, of points whose coordinates are no larger."""
+        u, v, one = self._depth
+        return one - (abs(u) + abs(v)) * farthest
 
     def _fill(self, homogeneous: Array, result: Array) -> None:
         """Map contiguous points (n, 3) whose third component is 1."""
@@ -104,12 +147,7 @@ class PlaneMap:
         """Raise where a point lies behind the plane's horizon; NaN passes."""
         if not self.projective or not len(points):
             return
-        u, v, one = self.matrix[3]
-        if len(points) > FEW:  # before all of them, what the farthest of any plane would have
-            farthest = load("cv2").norm(points.reshape(-1, 1), load("cv2").NORM_INF)
-            if one - (abs(u) + abs(v)) * farthest > 0:
-                return
-        w = points[:, :2] @ self.matrix[3, :2] + one
+        w = points[:, :2] @ self.matrix[3, :2] + self.matrix[3, 2]
         if (w <= 0).any():
             raise _behind_horizon(points[int(np.argmin(w)), :2].tolist())
 
@@ -120,7 +158,9 @@ class PlaneMap:
         seen = inside @ self._back[:, :2].T + self._back[:, 2]
         if (seen[:, 2] <= 0).any():
             raise _behind_horizon(given[int(np.argmin(seen[:, 2]))].tolist())
-        image: Array = seen[:, :2] / seen[:, 2:]
+        with np.errstate(all="ignore"):
+            image: Array = seen[:, :2] / seen[:, 2:]
+        check_finite(image, "inverse")
         return image
 
     def poses(
@@ -137,7 +177,7 @@ class PlaneMap:
         (xx, yx, _), (xy, yy, _), (xz, yz, _) = self.frame.tolist()
         ox, oy, oz = self.origin.tolist()
         tx, ty, tz, tw = self._turn
-        projective = self.projective
+        projective, isfinite = self.projective, math.isfinite
         last: Header | None = None
         header: Header | None = None
         found: list[Localization] = []
@@ -166,6 +206,8 @@ class PlaneMap:
             m, r = tz * k + tw * s, tw * k - tz * s
             orientation = (r, m, -j, -i) if flip else (i, j, m, r)
             position = (ox + xx * x + yx * y, oy + xy * x + yy * y, oz + xz * x + yz * y)
+            if not isfinite(sum(position) + (i + j + m + r)):  # the sum of numbers is one
+                raise not_finite(f"pose of {feature_id!r:.60}", (*position, *orientation))
             result = new(Pose, (header, new(Position, position), new(Quaternion, orientation)))
             found.append(new(Localization, (feature_id, quality, photo_index, result)))
         return found
@@ -197,6 +239,16 @@ class _Homogeneous:
         pairs = self._pairs[begin : begin + BLOCK]
         self._places[: len(pairs)] = pairs
         return self._buffer[: len(pairs)]
+
+
+def _check_mapped(given: Array, result: Array) -> None:
+    """Raise where a point came out as no number that was one; of NaN comes NaN."""
+    known = np.isfinite(given).all(axis=1)
+    result[~known] = np.nan
+    wrong = known & ~np.isfinite(result).all(axis=1)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise not_finite(f"point {given[row].tolist()}", result[row].tolist())
 
 
 def _frame(derivative: Array) -> Array:

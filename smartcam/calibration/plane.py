@@ -212,7 +212,8 @@ class PlaneCalibration:
             (N, 3), metres. NaN gives NaN.
 
         Raises:
-            CalibrationError: SHAPE; OUT_OF_FIELD: a point behind the plane's horizon.
+            CalibrationError: SHAPE; OUT_OF_FIELD: a point behind the plane's horizon; NOT_FINITE:
+                one comes out as no number.
         """
         return self._map.transform(points, out)
 
@@ -252,7 +253,7 @@ class PlaneCalibration:
         Raises:
             CalibrationError: WRONG_FRAME: they come in another frame than ``camera_frame``;
                 OUT_OF_PLANE: one is not in the camera's plane; OUT_OF_FIELD: one is behind the
-                plane's horizon.
+                plane's horizon; NOT_FINITE: a pose would hold what is no number.
         """
         if isinstance(localizations, Localization):
             return self._poses((localizations,), tool_flip)[0]

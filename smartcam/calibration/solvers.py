@@ -21,6 +21,7 @@ from smartcam.calibration.frames import Transform
 from smartcam.calibration.geometry import (
     as_points,
     as_vector,
+    check_finite,
     frame_from_axes,
     matrix_from_quaternion,
     quaternion_about_z,
@@ -386,9 +387,16 @@ class Chain:
         )
 
     def solve(self, poses: Poses) -> Poses:
-        """Return the poses behind the last solver."""
-        for solver in self.solvers:
-            poses = solver.solve(poses)
+        """Return the poses behind the last solver.
+
+        Raises:
+            CalibrationError: ``NOT_FINITE``: they are no numbers; and what the solvers raise.
+        """
+        with np.errstate(all="ignore"):
+            for solver in self.solvers:
+                poses = solver.solve(poses)
+        check_finite(poses.points, "chain: positions")
+        check_finite(poses.quaternions, "chain: orientations")
         return poses
 
     def transform(self, points: ArrayLike) -> Array:

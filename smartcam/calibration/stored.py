@@ -6,10 +6,20 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictBool, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    StrictBool,
+    ValidationError,
+)
 
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.fitting import Frame, ModelName
+from smartcam.calibration.geometry import LARGEST
+from smartcam.calibration.mapping import PlaneMap
 from smartcam.calibration.plane import PlaneCalibration
 from smartcam.exceptions import CalibrationError
 
@@ -18,12 +28,22 @@ if TYPE_CHECKING:
 
     from smartcam.calibration.geometry import Array
 
-__all__ = ["PlaceData", "PlaneData", "RemarkData", "from_data", "to_data"]
+__all__ = ["Number", "PlaceData", "PlaneData", "RemarkData", "from_data", "to_data"]
 
-Pair = tuple[FiniteFloat, FiniteFloat]
-Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-NonNegative = Annotated[FiniteFloat, Field(ge=0)]
-Open = tuple[FiniteFloat | None, FiniteFloat | None, FiniteFloat | None]
+
+def _bounded(value: float) -> float:
+    if abs(value) > LARGEST:
+        raise ValueError(f"expected a number up to {LARGEST:g}")
+    return value
+
+
+Number = Annotated[FiniteFloat, AfterValidator(_bounded)]
+"""A number that may stand in a file: what is calculated of a few of them is finite, too."""
+
+Pair = tuple[Number, Number]
+Triple = tuple[Number, Number, Number]
+NonNegative = Annotated[Number, Field(ge=0)]
+Open = tuple[Number | None, Number | None, Number | None]
 
 
 class _Stored(BaseModel):
@@ -36,9 +56,9 @@ class PlaceData(_Stored):
     """Centre and size of the points in both spaces."""
 
     camera: Pair = Field(description="centre, in the camera's unit")
-    camera_size: FiniteFloat = Field(gt=0, description="rms distance from it")
+    camera_size: Number = Field(gt=0, description="rms distance from it")
     robot: Triple = Field(description="centre, m")
-    robot_size: FiniteFloat = Field(gt=0, description="rms distance from it, m")
+    robot_size: Number = Field(gt=0, description="rms distance from it, m")
 
 
 class RemarkData(_Stored):
@@ -59,16 +79,16 @@ class PlaneData(_Stored):
         description="w (x, y, z, 1) = matrix (u, v, 1), m"
     )
     place: PlaceData
-    unit_covariance: list[list[FiniteFloat]] = Field(min_length=12, max_length=12)
+    unit_covariance: list[list[Number]] = Field(min_length=12, max_length=12)
     residuals: list[Triple] = Field(min_length=3, description="m")
     leave_one_out: list[Open] = Field(min_length=3, description="m; null: none")
     freedom: int = Field(ge=0)
-    touch_sigma: FiniteFloat | None = Field(ge=0, description="m")
+    touch_sigma: Number | None = Field(ge=0, description="m")
     sigma_given: bool
-    candidates: dict[str, FiniteFloat | None] = Field(description="rms held-out error, m")
-    nominal_scale: FiniteFloat | None = Field(gt=0, description="m for each unit of the camera")
+    candidates: dict[str, Number | None] = Field(description="rms held-out error, m")
+    nominal_scale: Number | None = Field(gt=0, description="m for each unit of the camera")
     tool_z: Triple | None = None
-    height: FiniteFloat = Field(0.0, description="over the touched plane, m")
+    height: Number = Field(0.0, description="over the touched plane, m")
     robot_frame: str
     camera_frame: str | None = None
     y_down: StrictBool | None = Field(None, description="y was turned up; null: not known")
@@ -115,7 +135,8 @@ def from_data(data: Mapping[str, Any]) -> PlaneCalibration:
     """Return the calibration that data were made of.
 
     Raises:
-        CalibrationError: SHAPE: the data are no plane calibration.
+        CalibrationError: SHAPE: the data are no plane calibration; NOT_FINITE: its matrix maps
+            nothing anywhere.
     """
     try:
         stored = PlaneData.model_validate(data)
@@ -125,6 +146,7 @@ def from_data(data: Mapping[str, Any]) -> PlaneCalibration:
         where = ".".join(map(str, first["loc"]))
         raise _no_calibration(f"{where}: {first['msg']}", first["input"]) from exc
     place = stored.place
+    PlaneMap(_array(stored.matrix), _array(place.camera))  # refused here, not with the first part
     return PlaneCalibration(
         model=stored.model,
         camera_points=_array(stored.camera_points),

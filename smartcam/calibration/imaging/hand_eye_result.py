@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.frames import Transform
-from smartcam.calibration.geometry import as_points
+from smartcam.calibration.geometry import as_points, check_finite
 from smartcam.calibration.imaging.hand_eye_choice import on_plane, point_errors
 from smartcam.calibration.imaging.hand_eye_fit import Rigid
 from smartcam.calibration.imaging.poses import check_view
@@ -164,7 +164,9 @@ class HandEyeCalibration:
         """
         lens, seen = self._lens("to_plane"), as_points(pixels, 2, "pixels")
         found = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
-        return plane.apply(found)
+        places = plane.apply(found)
+        check_finite(places, "to_plane: points")
+        return places
 
     def point_errors(
         self,

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.frames import Transform
@@ -22,6 +22,7 @@ from smartcam.calibration.imaging.stored_cameras import (
 )
 from smartcam.calibration.imaging.targets import target_from_data, target_to_data
 from smartcam.calibration.imaging.views import TargetView
+from smartcam.calibration.stored import Number
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -52,15 +53,15 @@ class HandEyeData(BaseModel):
     target_pose: MotionData
     camera: CameraData | None
     target: dict[str, Any] | None
-    target_scale: FiniteFloat = Field(gt=0)
+    target_scale: Number = Field(gt=0)
     method: str
-    candidates: dict[str, FiniteFloat | None] = Field(description="rms held-out error, m")
-    errors: list[FiniteFloat | None] = Field(min_length=3, description="m; null: none")
-    mean_error: FiniteFloat = Field(ge=0, description="m")
-    leave_one_out: list[FiniteFloat | None] = Field(min_length=3, description="m; null: none")
-    held_out_error: FiniteFloat | None = Field(description="m")
-    covariance: list[list[FiniteFloat]] | None = Field(description="rad and m; null: none")
-    robot_sigmas: tuple[FiniteFloat, FiniteFloat] | None = Field(description="rad, m")
+    candidates: dict[str, Number | None] = Field(description="rms held-out error, m")
+    errors: list[Number | None] = Field(min_length=3, description="m; null: none")
+    mean_error: Number = Field(ge=0, description="m")
+    leave_one_out: list[Number | None] = Field(min_length=3, description="m; null: none")
+    held_out_error: Number | None = Field(description="m")
+    covariance: list[list[Number]] | None = Field(description="rad and m; null: none")
+    robot_sigmas: tuple[Number, Number] | None = Field(description="rad, m")
     robot_poses: list[MotionData] = Field(min_length=3, description="T_base_flange")
     used: list[bool] = Field(min_length=3)
     target_poses: list[MotionData] = Field(min_length=3, description="T_camera_target")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.geometry import as_points, quaternion_about_z
+from smartcam.calibration.geometry import as_points, check_finite, not_finite, quaternion_about_z
 from smartcam.calibration.imaging.homography import apply_homography, fit_homography, local_steps
 from smartcam.calibration.imaging.poses import check_view, locate
 from smartcam.calibration.imaging.projection import excess, whitening
@@ -51,6 +51,9 @@ class SheetPlane:
             lens, to directions (x/z, y/z) of the camera's frame; ``w`` is positive in its field.
         covariance: (9, 9), of the matrix' elements, row by row.
         camera: the lens; None: pixels are taken as they are.
+
+    Raises:
+        CalibrationError: NOT_FINITE: a matrix that cannot be inverted.
     """
 
     def __init__(
@@ -64,7 +67,7 @@ class SheetPlane:
         self.matrix: Array = np.array(matrix, dtype=np.float64).reshape(3, 3)
         self.covariance: Array = np.array(covariance, dtype=np.float64).reshape(9, 9)
         self.camera: CameraModel | None = camera
-        self._back = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
+        self._back = _inverse(self.matrix)
 
     def on_sheet(self, pixels: ArrayLike) -> Array:
         """Return where pixels (N, 2), v down, lie on the sheet, (N, 2), metres.
@@ -159,8 +162,19 @@ class SheetPlane:
                 code=Code.OUT_OF_FIELD,
                 got=at,
             )
-        flat: Array = mapped[:, :2] / mapped[:, 2:]
+        with np.errstate(all="ignore"):
+            flat: Array = mapped[:, :2] / mapped[:, 2:]
+        check_finite(flat, "sheet: points")
         return flat
+
+
+def _inverse(matrix: Array) -> Array:
+    try:
+        back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    except np.linalg.LinAlgError as exc:
+        raise not_finite("sheet's matrix", matrix.tolist()) from exc
+    check_finite(back, "sheet's matrix")
+    return back
 
 
 class PlaneView(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.imaging.hand_eye_stored import view_from_data, view_to_data
@@ -19,6 +19,7 @@ from smartcam.calibration.imaging.stored_cameras import (
     camera_to_data,
 )
 from smartcam.calibration.imaging.targets import target_from_data, target_to_data
+from smartcam.calibration.stored import Number
 from smartcam.calibration.stored import from_data as plane_from_data
 from smartcam.exceptions import CalibrationError
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SheetData", "from_data", "to_data"]
 
-Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Triple = tuple[Number, Number, Number]
 
 
 class SheetData(BaseModel):
@@ -41,8 +42,8 @@ class SheetData(BaseModel):
     matrix: tuple[Triple, Triple, Triple] = Field(
         description="w (p, 1) = matrix (x, y, 1): from the sheet, m, to pixels or directions"
     )
-    covariance: list[list[FiniteFloat]] = Field(min_length=9, max_length=9)
-    rms: FiniteFloat = Field(ge=0, description="pixels")
+    covariance: list[list[Number]] = Field(min_length=9, max_length=9)
+    rms: Number = Field(ge=0, description="pixels")
     plane: dict[str, Any] = Field(description="from the sheet to the robot, a plane's data")
     camera_frame: str | None
     warnings: list[RemarkData] = Field(description="of the view; the touches' are the plane's")

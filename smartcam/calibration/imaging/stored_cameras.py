@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from smartcam.calibration.codes import Code, Remark
 from smartcam.calibration.frames import Transform
@@ -17,6 +17,7 @@ from smartcam.calibration.imaging.poses import CAMERA, TARGET
 from smartcam.calibration.imaging.stereo import LEFT, RIGHT, PairFit, StereoCalibration
 from smartcam.calibration.imaging.targets import target_from_data, target_to_data
 from smartcam.calibration.imaging.views import TargetView
+from smartcam.calibration.stored import Number
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -42,10 +43,10 @@ __all__ = [
     "stereo_to_data",
 ]
 
-Pair = tuple[FiniteFloat, FiniteFloat]
-Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Open = FiniteFloat | None
-Bar = Annotated[FiniteFloat, Field(ge=0, le=1)]
+Pair = tuple[Number, Number]
+Triple = tuple[Number, Number, Number]
+Open = Number | None
+Bar = Annotated[Number, Field(ge=0, le=1)]
 
 
 class _Stored(BaseModel):
@@ -59,7 +60,7 @@ class CameraData(_Stored):
 
     size: tuple[int, int] = Field(description="width and height, pixels")
     matrix: tuple[Triple, Triple, Triple] = Field(description="pixels")
-    distortion: list[FiniteFloat]
+    distortion: list[Number]
     distortion_model: DistortionModel
 
 
@@ -77,7 +78,7 @@ class ViewData(_Stored):
     ids: list[Annotated[int, Field(ge=0)]]
     points: list[Pair] = Field(description="pixels")
     covariance: list[tuple[Pair, Pair]] = Field(description="pixels^2")
-    margin: FiniteFloat | None = None
+    margin: Number | None = None
     name: str = ""
 
 
@@ -95,7 +96,7 @@ class ViewFitData(_Stored):
     used: bool
     pose: MotionData = Field(description="T_camera_target")
     residuals: list[Pair] = Field(description="pixels")
-    rms: FiniteFloat = Field(ge=0, description="pixels")
+    rms: Number = Field(ge=0, description="pixels")
     held_out: Open = Field(description="pixels; null: none")
 
 
@@ -104,10 +105,10 @@ class IntrinsicData(_Stored):
 
     target: dict[str, Any]
     camera: CameraData
-    covariance: list[list[FiniteFloat]]
+    covariance: list[list[Number]]
     views: list[ViewFitData] = Field(min_length=1)
-    rms: FiniteFloat = Field(ge=0, description="pixels")
-    sigma: FiniteFloat = Field(ge=0, description="pixels")
+    rms: Number = Field(ge=0, description="pixels")
+    sigma: Number = Field(ge=0, description="pixels")
     held_out: Open = Field(description="pixels; null: none")
     coverage: tuple[Bar, Bar, Bar, Bar] = Field(description="x, y, size, skew")
     sheet: list[Triple] | None = Field(description="m; null: as meant")
@@ -133,11 +134,11 @@ class StereoData(_Stored):
     left: CameraData
     right: CameraData
     transform: MotionData = Field(description="T_right_left")
-    covariance: list[list[FiniteFloat]] = Field(min_length=6, max_length=6)
+    covariance: list[list[Number]] = Field(min_length=6, max_length=6)
     pairs: list[PairData] = Field(min_length=1)
-    rms: FiniteFloat = Field(ge=0, description="pixels")
-    sigma: FiniteFloat = Field(ge=0, description="pixels")
-    epipolar: FiniteFloat = Field(ge=0, description="pixels")
+    rms: Number = Field(ge=0, description="pixels")
+    sigma: Number = Field(ge=0, description="pixels")
+    epipolar: Number = Field(ge=0, description="pixels")
     held_out: Open = Field(description="m; null: none")
     held_out_epipolar: Open = Field(description="pixels; null: none")
     sheet: list[Triple] | None = Field(description="m; null: as meant")

@@ -68,6 +68,7 @@ def triangulate(
             break
     behind = ~((points[:, 2] > 0) & (transform.apply(points)[:, 2] > 0))
     points[behind] = np.nan
+    points[~np.isfinite(points).all(axis=1)] = np.nan  # none of them is infinite
     inverse = np.full_like(normal, np.nan)
     inverse[~behind] = np.linalg.pinv(normal[~behind], hermitian=True)
     return Triangulated(points, inverse)
