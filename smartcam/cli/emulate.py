@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import importlib
 import json
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,8 +16,8 @@ from smartcam.cli.page import Page, page_options
 from smartcam.cli.running import run
 from smartcam.emulator import EmulatedCamera, Scenario, load_scenarios, scenario_schema
 from smartcam.emulator.insight import BUILTIN_JOBS, EmulatedInSight
-from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.layout.files import YAML_ALSO_RAISES
+from smartcam.exceptions import ConfigurationError
+from smartcam.layout.yamls import BadYamlError, load
 from smartcam.protocols.bvs import BVS
 from smartcam.protocols.insight import INSIGHT
 
@@ -194,15 +193,9 @@ def _quirk(text: str) -> tuple[str, Any]:
     if not equals:
         return name, True
     try:
-        yaml: Any = importlib.import_module("yaml")
-    except ImportError as exc:
-        raise MissingExtraError(
-            '--quirk NAME=VALUE needs PyYAML: pip install "smartcam[yaml]"', extra="yaml"
-        ) from exc
-    try:
-        return name, yaml.safe_load(value)
-    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
-        raise ConfigurationError(f"--quirk {text}: {exc}") from exc
+        return name, load(value, what="--quirk NAME=VALUE")
+    except BadYamlError as exc:
+        raise ConfigurationError(f"--quirk {text:.200}: {exc}") from exc
 
 
 def _refuse_what_does_not_fit(context: click.Context) -> None:

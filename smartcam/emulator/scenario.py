@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -13,10 +13,18 @@ from smartcam.emulator.timeline import Cue
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols.bvs import BVS
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
 __all__ = ["MAX_CUES", "Scenario", "ScenarioFile"]
 
 MAX_CUES = 1000
 """Cues of a timeline; every state that a camera enters is compared with those that wait for one."""
+
+
+T = TypeVar("T")
+
+_SHOWN = 20  # ids that an error names
 
 
 class Scenario(BaseModel):
@@ -57,7 +65,7 @@ class Scenario(BaseModel):
     @model_validator(mode="after")
     def _check(self) -> Scenario:
         ids = [application.id for application in self.applications]
-        twice = next((number for number in ids if ids.count(number) > 1), None)
+        twice = _first_double(ids)
         if twice is not None:
             raise ValueError(f"application id {twice} is there twice")
         return self
@@ -92,8 +100,10 @@ class Scenario(BaseModel):
                 )
                 return ("applications", number, "id"), text
         if self.active is not None and self.active not in known:
-            there = ", ".join(str(number) for number in known)
-            return ("active",), f"no application has the id {self.active}; there are {there}"
+            there = ", ".join(str(number) for number in known[:_SHOWN])
+            more = ", ..." if len(known) > _SHOWN else ""
+            asked = f"the id {self.active}" if self.active.bit_length() < 64 else "such an id"
+            return ("active",), f"no application has {asked}; there are {there}{more}"
         try:
             spoken = dialect.with_quirks(self.quirks.of_the_wire)
         except ConfigurationError as exc:
@@ -123,7 +133,7 @@ class ScenarioFile(Scenario):
         if self.cameras and "port" in self.model_fields_set:
             raise ValueError("port: with several cameras each has its own")
         names = [camera.name for camera in self.each()]
-        twice = next((name for name in names if names.count(name) > 1), None)
+        twice = _first_double(names)
         if twice is not None:
             raise ValueError(f"two cameras are called {twice!r}")
         return self
@@ -168,3 +178,13 @@ class ScenarioFile(Scenario):
             own = rest[0] - len(camera.applications)
             return ("cameras", index, *place) if own < 0 else (name, own, *rest[1:])
         return ("cameras", index, *place) if name in camera.model_fields_set else place
+
+
+def _first_double(values: Iterable[T]) -> T | None:
+    """Return the first value that was there before; None where there is none."""
+    seen: set[T] = set()
+    for value in values:
+        if value in seen:
+            return value
+        seen.add(value)
+    return None

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import ValidationError
 
 from smartcam.emulator.scenario import Scenario, ScenarioFile
-from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.layout.files import YAML_ALSO_RAISES
+from smartcam.exceptions import ConfigurationError
+from smartcam.layout.yamls import MAX_YAML_TEXT, BadYamlError, compose, construct
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 __all__ = ["load_scenario", "load_scenarios", "scenario_schema"]
+
+_SHOWN = 20  # mistakes that are told at once
 
 
 def load_scenario(path: str | Path, *, dialect: str | None = None) -> Scenario:
@@ -51,25 +53,18 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
         MissingExtraError: PyYAML is not installed.
     """
     try:
-        yaml: Any = importlib.import_module("yaml")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'scenario files need PyYAML: pip install "smartcam[yaml]"', extra="yaml"
-        ) from exc
-    try:
-        text = Path(path).read_text(encoding="utf-8")
+        with Path(path).open(encoding="utf-8") as stream:
+            text = stream.read(MAX_YAML_TEXT + 1)
     except (OSError, UnicodeDecodeError) as exc:
         raise ConfigurationError(f"scenario {path}: {exc}") from exc
     try:
-        root = yaml.compose(text, yaml.SafeLoader)
-        data = yaml.safe_load(text)
-    except yaml.MarkedYAMLError as exc:
-        line = f", line {exc.problem_mark.line + 1}" if exc.problem_mark is not None else ""
-        raise ConfigurationError(f"scenario {path}{line}: {exc.problem or exc}") from exc
-    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
-        raise ConfigurationError(f"scenario {path}: {exc}") from exc
-    if root is not None:
-        _refuse_twice(root, path)
+        root = compose(text, what="a scenario file")
+        if root is not None:
+            _refuse_twice(root, path)
+        data = None if root is None else construct(root)
+    except BadYamlError as exc:
+        line = "" if exc.line is None else f", line {exc.line}"
+        raise ConfigurationError(f"scenario {path}{line}: {exc}") from exc
     if not isinstance(data, dict):
         raise ConfigurationError(f"scenario {path}: expected fields such as 'applications:'")
     try:
@@ -101,7 +96,8 @@ def scenario_schema() -> dict[str, Any]:
 
 def _texts(path: str | Path, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]) -> str:
     texts = [
-        ": ".join([f"line {_line(root, place)}", *_field(place), text]) for place, text in findings
+        ": ".join([f"line {_line(root, place)}", *_field(place), text])
+        for place, text in itertools.islice(findings, _SHOWN)
     ]
     return f"scenario {path}, {'; '.join(texts)}"
 

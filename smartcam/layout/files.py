@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, RootModel, ValidationError, create_model
 from pydantic import Field as ModelField
 
-from smartcam.exceptions import ConfigurationError, LayoutError, MissingExtraError
+from smartcam.exceptions import ConfigurationError, LayoutError
 from smartcam.layout.text import TYPES, UNITS, LayoutSpec, parse_text, to_text
 from smartcam.layout.text import Field as LayoutField
+from smartcam.layout.yamls import BadYamlError, load, yaml_module
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import ModuleType
 
 __all__ = ["dump_yaml", "from_data", "load_yaml", "make_model", "to_data"]
 
 _Name = Annotated[str, ModelField(pattern=r"^[^\W\d]\w*$", max_length=200)]
 _Count = Annotated[int, ModelField(ge=1, le=65_535, strict=True)]
-
-YAML_ALSO_RAISES = (ValueError, LookupError, AttributeError, OverflowError, RecursionError)
-"""What PyYAML lets through beside its own errors, for a tag such as ``!!int`` without a value."""
 
 
 class _FieldData(BaseModel):
@@ -118,7 +114,7 @@ def _checked_field(data: _FieldData) -> LayoutField:
 
 def dump_yaml(data: dict[str, Any]) -> str:
     """Return plain data as YAML."""
-    text: str = _yaml().safe_dump(data, sort_keys=False, allow_unicode=True)
+    text: str = yaml_module("layout: YAML").safe_dump(data, sort_keys=False, allow_unicode=True)
     return text
 
 
@@ -128,16 +124,17 @@ def load_yaml(text: str) -> dict[str, Any] | str:
     Raises:
         LayoutError: neither the one nor the other.
     """
-    yaml = _yaml()
     try:
-        loaded: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
+        loaded: Any = load(text, what="layout: YAML")
+    except BadYamlError as exc:
         # "x: int32, y: int32" is no YAML; a broken document is no layout text either
         try:
             return _checked_text(text)
         except LayoutError as error:
             raise LayoutError(
-                f"{error}\nnor is it YAML: {exc}", text=error.text, position=error.position
+                f"{error}\nnor is it YAML: {_place(exc)}{exc}",
+                text=error.text,
+                position=error.position,
             ) from exc
     given: Any = loaded
     if isinstance(loaded, str):
@@ -152,14 +149,8 @@ def _checked_text(text: str) -> str:
     return text
 
 
-def _yaml() -> ModuleType:
-    try:
-        return importlib.import_module("yaml")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'layout: YAML needs PyYAML, which is not installed: pip install "smartcam[yaml]"',
-            extra="yaml",
-        ) from exc
+def _place(exc: BadYamlError) -> str:
+    return "" if exc.line is None else f"line {exc.line}: "
 
 
 def make_model(spec: LayoutSpec) -> type[BaseModel]:

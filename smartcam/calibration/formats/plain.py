@@ -7,7 +7,6 @@ a number to the base 60, ``1e-05`` as a string), and programs differ in which of
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import re
@@ -17,8 +16,8 @@ import numpy as np
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.frames import Transform
-from smartcam.exceptions import CalibrationError, MissingExtraError
-from smartcam.layout.files import YAML_ALSO_RAISES
+from smartcam.exceptions import CalibrationError
+from smartcam.layout.yamls import BadYamlError, compose
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -115,20 +114,12 @@ def load_yaml(text: str) -> Plain:
         CalibrationError: ``MALFORMED``: it is none, it has aliases or a key twice, or is too deep.
         MissingExtraError: PyYAML is not installed.
     """
-    try:
-        yaml: Any = importlib.import_module("yaml")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'reading YAML needs PyYAML: pip install "smartcam[yaml]"', extra="yaml"
-        ) from exc
     if text.startswith("%YAML:"):  # OpenCV's spelling of a directive
         text = text.partition("\n")[2]
     try:
-        root = yaml.compose(text, yaml.SafeLoader)
+        root = compose(text, what="reading YAML")
         return None if root is None else _plain(root, set(), 0)
-    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
-        if isinstance(exc, CalibrationError):
-            raise
+    except BadYamlError as exc:
         raise malformed("file", f"YAML ({_cut(str(exc))})") from exc
 
 

@@ -1,0 +1,184 @@
+"""YAML that others wrote, read within bounds: a few lines may stand for millions of values."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from typing import Any
+
+from smartcam.exceptions import ConfigurationError, MissingExtraError
+
+__all__ = [
+    "MAX_NODES",
+    "MAX_YAML_TEXT",
+    "YAML_ALSO_RAISES",
+    "BadYamlError",
+    "compose",
+    "construct",
+    "load",
+    "yaml_module",
+]
+
+MAX_YAML_TEXT = 1 << 23
+"""Characters of a YAML document: a container of 1 MiB as hex takes a quarter."""
+
+MAX_NODES = 500_000
+"""Values of a YAML document, each alias and each merged mapping counted with all that it stands
+for: 50,000 applications of a scenario. PyYAML reads this many in about 15 seconds."""
+
+MAX_BITS = 64
+"""Of a number without a point: the largest that a container can hold; Python takes seconds for the
+digits of much larger ones, or refuses."""
+
+YAML_ALSO_RAISES = (ValueError, LookupError, AttributeError, OverflowError, RecursionError)
+"""What PyYAML lets through beside its own errors, for a tag such as ``!!int`` without a value."""
+
+
+class BadYamlError(ConfigurationError):
+    """A document is no YAML, or goes beyond a bound.
+
+    Attributes:
+        line: where, from 1; None where that is not known.
+    """
+
+    def __init__(self, message: str, *, line: int | None = None) -> None:
+        super().__init__(message)
+        self.line = line
+
+
+def load(text: str, *, what: str = "YAML", extra: str = "yaml") -> Any:
+    """Return the data of a document; None for an empty one.
+
+    Args:
+        text: the document.
+        what: what needs PyYAML, for the error.
+        extra: the extra that brings it.
+
+    Raises:
+        BadYamlError: it is no YAML, or goes beyond a bound.
+        MissingExtraError: PyYAML is not installed.
+    """
+    root = compose(text, what=what, extra=extra)
+    return None if root is None else construct(root)
+
+
+def compose(text: str, *, what: str = "YAML", extra: str = "yaml") -> Any:
+    """Return the node that a document is, which :func:`construct` makes data of; None: empty.
+
+    Raises:
+        BadYamlError: it is no YAML, or goes beyond a bound.
+        MissingExtraError: PyYAML is not installed.
+    """
+    yaml = yaml_module(what, extra)
+    if len(text) > MAX_YAML_TEXT:
+        raise BadYamlError(f"{len(text)} characters, expected {MAX_YAML_TEXT} at most")
+    try:
+        return yaml.compose(text, _loader(yaml))
+    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
+        raise _told(exc) from exc
+
+
+def construct(root: Any) -> Any:
+    """Return the data of a node that :func:`compose` gave.
+
+    Raises:
+        BadYamlError: its aliases stand for too much, or a value cannot be what its tag says.
+    """
+    yaml = yaml_module("YAML", "yaml")
+    loader = _loader(yaml)("")
+    try:
+        _count(root, {})
+        return loader.construct_document(root)
+    except (yaml.YAMLError, *YAML_ALSO_RAISES) as exc:
+        raise _told(exc) from exc
+    finally:
+        loader.dispose()
+
+
+def yaml_module(what: str, extra: str = "yaml") -> Any:
+    """Return PyYAML.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return importlib.import_module("yaml")
+    except ImportError as exc:
+        raise MissingExtraError(
+            f'{what} needs PyYAML, which is not installed: pip install "smartcam[{extra}]"',
+            extra=extra,
+        ) from exc
+
+
+def _told(exc: Exception) -> BadYamlError:
+    if isinstance(exc, BadYamlError):
+        return exc
+    mark = getattr(exc, "problem_mark", None)
+    text = getattr(exc, "problem", None) or (
+        "nested too deep" if isinstance(exc, RecursionError) else str(exc)
+    )
+    return BadYamlError(text, line=None if mark is None else mark.line + 1)
+
+
+def _too_much(node: Any) -> BadYamlError:
+    return BadYamlError(
+        f"expected {MAX_NODES} values at most, aliases counted with all that they stand for",
+        line=node.start_mark.line + 1,
+    )
+
+
+def _count(node: Any, known: dict[int, int]) -> int:
+    """Return how many values a node stands for, the aliases in it written out.
+
+    Raises:
+        BadYamlError: too many, or it contains itself.
+    """
+    if node.id == "scalar":
+        return 1
+    found = known.get(id(node))
+    if found == 0:
+        raise BadYamlError("an alias of what it stands in", line=node.start_mark.line + 1)
+    if found is None:
+        known[id(node)] = 0  # under way
+        children = (
+            node.value if node.id == "sequence" else [one for row in node.value for one in row]
+        )
+        found = 1
+        for child in children:
+            found += _count(child, known)
+            if found > MAX_NODES:
+                raise _too_much(child)
+        known[id(node)] = found
+    return found
+
+
+@functools.cache
+def _loader(yaml: Any) -> Any:
+    """Return PyYAML's safe loader with bounds."""
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        nodes = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            self.nodes += 1
+            if self.nodes > MAX_NODES:
+                mark = self.peek_event().start_mark
+                raise BadYamlError(f"expected {MAX_NODES} values at most", line=mark.line + 1)
+            return super().compose_node(parent, index)
+
+        def construct_yaml_int(self, node: Any) -> int:
+            text = self.construct_scalar(node)
+            number = super().construct_yaml_int(node) if len(text) <= _MAX_DIGITS else None
+            if number is None or number.bit_length() > MAX_BITS:
+                raise BadYamlError(
+                    f"the number {text[:20]}... of {len(text)} characters, expected {MAX_BITS} "
+                    "bits at most",
+                    line=node.start_mark.line + 1,
+                )
+            return int(number)
+
+    Loader.add_constructor("tag:yaml.org,2002:int", Loader.construct_yaml_int)
+    return Loader
+
+
+_MAX_DIGITS = 200  # with underscores between them
