@@ -44,6 +44,8 @@ _QUANTITIES = {
 
 _POSE = ("x", "y", "z", "theta")
 
+BEST = 1.0 + 1e-6
+"""Largest quality: 1, as a float of 32 bits may be rounded."""
 
 # half the time of the NamedTuples' own; the cast because a bare tuple is generic
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
@@ -104,11 +106,12 @@ class Localizations(PlainInterpreter):
         published): it is skipped and counted in ``context.empty_slots``.
 
         Raises:
-            InterpretationError: the bytes do not fit the layout, or a pose has NaN or infinity.
+            InterpretationError: the bytes do not fit the layout, a pose has NaN or infinity, or a
+                quality is not between 0 and 1.
         """
         header = _new_tuple(Header, (context.number, context.received_at, context.camera))
         sin, cos, new = math.sin, math.cos, _new_tuple
-        scales, y_down = self._scales, context.y_down
+        scales, y_down, best = self._scales, context.y_down, BEST
         rows: Iterable[Any] = self.layout.wire_records(data, context.byte_order)
         if self._missing is not None:
             rows = map(operator.concat, rows, self._missing)
@@ -126,6 +129,8 @@ class Localizations(PlainInterpreter):
                     continue
                 if scales is not None:
                     quality, x, y, theta, z = _scaled((quality, x, y, theta, z), scales)
+                if not 0.0 <= quality <= best:
+                    self._check_numbers(data, context)
                 if y_down:
                     y, theta = 0.0 - y, 0.0 - theta  # and no minus zero
                 total += x + y + theta + z
@@ -135,10 +140,10 @@ class Localizations(PlainInterpreter):
                 feature_id = text.partition(b"\0")[0].decode()
                 found.append(new(Localization, (feature_id, quality, photo_index, pose)))
         except ValueError:  # a text that is not UTF-8, the sine of infinity
-            self._check_finite(data, context)
+            self._check_numbers(data, context)
             raise
         if not math.isfinite(total):  # large numbers may sum up to infinity
-            self._check_finite(data, context)
+            self._check_numbers(data, context)
         elif self._checks:
             self.layout.parse_records(data, context.byte_order)
         if skipped:
@@ -154,20 +159,34 @@ class Localizations(PlainInterpreter):
         begin = self.layout.head_size + number * self.layout.size
         return data[begin : begin + self.layout.size] == self._empty
 
-    def _check_finite(self, data: bytes, context: Context) -> None:
-        """Raise for the first NaN or infinity of a pose; for a bad text or bool before that."""
+    def _check_numbers(self, data: bytes, context: Context) -> None:
+        """Raise for the first number that cannot be; for a bad text or bool before that.
+
+        In a pose that is NaN and infinity, as a quality what is not between 0 and 1.
+        """
         offset = self.layout.head_size
-        for record in self.layout.parse_records(data, context.byte_order):
+        for number, record in enumerate(self.layout.parse_records(data, context.byte_order)):
             for field, value in zip(self.layout.fields, record, strict=True):
-                if field.name in _POSE and not math.isfinite(value):
+                wrong = _wrong(field, value)
+                if wrong and not self._is_empty(data, number):
                     raise InterpretationError(
-                        f"{field.label} at offset {offset}: expected a finite number, got {value}",
+                        f"{field.label} at offset {offset}: expected {wrong}, got {value}",
                         field=field.name,
                         offset=offset,
-                        expected="a finite number",
+                        expected=wrong,
                         got=value,
                     )
                 offset += field.size
+
+
+def _wrong(field: Field, value: float) -> str:
+    """Return what was expected where a number cannot be; "" where it can."""
+    if field.name in _POSE and not math.isfinite(value):
+        return "a finite number"
+    if field.name == "quality" and not 0.0 <= value <= BEST:
+        percent = field.unit is None and 1.0 < value <= 100.0
+        return "0 to 1" + (" (its unit may be percent)" if percent else "")
+    return ""
 
 
 class _Scales(NamedTuple):

@@ -136,12 +136,43 @@ def test_pose_that_is_not_finite_names_field_and_offset(
     assert f"expected a finite number, got {bad}" in str(error)
 
 
-def test_quality_may_be_nan_and_large_poses_may_sum_to_infinity() -> None:
+def test_large_poses_may_sum_to_infinity() -> None:
     (part,) = interpret(
-        struct.pack("<fdd", math.nan, 1e308, 1e308), "quality: real32, x: real64, y: real64"
+        struct.pack("<fdd", 1.0, 1e308, 1e308), "quality: real32, x: real64, y: real64"
     )
-    assert math.isnan(part.quality)
     assert part.pose.position.x == 1e308
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -1.0, 7.0, 1.00001, -0.001])
+def test_quality_that_is_none_names_field_and_offset(bad: float) -> None:
+    good = PART.pack(b"a", 1, 0, 1, 2, 3)
+    with pytest.raises(InterpretationError) as caught:
+        interpret(good + bytes(70) + PART.pack(b"b", bad, 0, 1, 2, 3))
+    error = caught.value
+    assert (error.field, error.offset) == ("quality", 140 + 50)
+    assert "field 'quality' (real32) at offset 190: expected 0 to 1" in str(error)
+    assert ("percent" in str(error)) == (1 < bad <= 100)
+
+
+@pytest.mark.parametrize("good", [0.0, -0.0, 1.0, 1.0000001])
+def test_quality_may_be_rounded(good: float) -> None:
+    (part,) = interpret(PART.pack(b"a", good, 0, 1, 2, 3))
+    assert part.quality == pytest.approx(good, abs=1e-7)
+
+
+@pytest.mark.parametrize(("sent", "quality"), [(0.0, 0.0), (98.0, 0.98), (100.0, 1.0)])
+def test_quality_in_percent_is_judged_as_a_ratio(sent: float, quality: float) -> None:
+    layout = "(quality: real32 percent, x: real32, y: real32)*"
+    (part,) = interpret(struct.pack("<fff", sent, 1, 2), layout)
+    assert part.quality == quality
+    with pytest.raises(InterpretationError, match=r"expected 0 to 1, got 1\.01"):
+        interpret(struct.pack("<fff", 101, 1, 2), layout)
+
+
+def test_quality_as_an_integer_without_a_unit_is_0_or_1() -> None:
+    assert interpret(b"\1\1\2", "(quality: int8, x: int8, y: int8)*")[0].quality == 1.0
+    with pytest.raises(InterpretationError, match=r"expected 0 to 1 \(its unit may be percent\)"):
+        interpret(b"\x62\1\2", "(quality: int8, x: int8, y: int8)*")
 
 
 def test_container_that_does_not_fit_raises() -> None:
