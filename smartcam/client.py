@@ -136,6 +136,7 @@ class SmartCamera:
             ConnectFailedError: no session; names each attempt and what came.
             CommandRejectedError: the camera does not have the application.
             ResponseTimeoutError: it did not become ready within ``switch_timeout``.
+            ConnectionLostError: the session was lost again before the application was ready.
 
         Cancellation: the link is dropped.
         """

@@ -1,21 +1,26 @@
 """Finding plug-ins by name: built-ins and entry points in one place.
 
 Names are listed without importing anything, a plug-in is loaded when it is first asked for, and a
-broken one costs only its own name.
+broken one costs only its own name. A distribution whose metadata cannot be read costs only its own
+plug-ins; the log names it.
 """
 
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import entry_points
+import logging
+from importlib.metadata import distributions
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.exceptions import PluginError
 
 if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
+    from collections.abc import Iterator
+    from importlib.metadata import Distribution, EntryPoint
 
 __all__ = ["INTERPRETERS", "PROTOCOLS", "PluginInfo", "Registry"]
+
+_log = logging.getLogger(__name__)
 
 
 class PluginInfo(NamedTuple):
@@ -83,7 +88,7 @@ class Registry:
     def _entry_points(self) -> dict[str, list[EntryPoint]]:
         if self._found is None:
             self._found = {}
-            for point in entry_points(group=self.group):
+            for point in _points(self.group):
                 self._found.setdefault(point.name, []).append(point)
         return self._found
 
@@ -109,7 +114,7 @@ class Registry:
             )
         try:
             loaded: object = points[0].load()
-        except Exception as exc:
+        except (Exception, SystemExit) as exc:  # which ends programs, and is not theirs to end
             raise PluginError(
                 f"{self.group}: {name!r} of {providers[0]} failed to load: {exc!r}", name=name
             ) from exc
@@ -117,7 +122,48 @@ class Registry:
 
 
 def _distribution(point: EntryPoint) -> str:
-    return point.dist.name if point.dist is not None else point.value
+    return point.value if point.dist is None else _name_of(point.dist) or point.value
+
+
+def _points(group: str) -> Iterator[EntryPoint]:
+    """Yield the entry points of a group; of a distribution that is there twice, the first's."""
+    seen: set[str] = set()
+    for found in _distributions():
+        try:
+            name = _key(found)
+            points = [] if name in seen else list(found.entry_points.select(group=group))
+            seen.add(name or str(id(found)))
+        except Exception as exc:  # noqa: BLE001 - anything may stand in other people's files
+            _log.warning(
+                "%s: the entry points of %s cannot be read, they are left out: %r",
+                group,
+                getattr(found, "_path", None) or "a distribution",
+                exc,
+            )
+        else:
+            yield from points
+
+
+def _distributions() -> Iterator[Distribution]:
+    try:
+        yield from distributions()
+    except Exception as exc:  # noqa: BLE001 - so may what other people put on sys.meta_path
+        _log.warning("installed distributions cannot be listed to their end: %r", exc)
+
+
+def _key(found: Distribution) -> str:
+    """Return what tells distributions apart; its file's name, where that says it, is fastest."""
+    known: str | None = getattr(found, "_normalized_name", None)
+    return known or _name_of(found).lower()
+
+
+def _name_of(found: Distribution) -> str:
+    """Return a distribution's name; "" where its metadata cannot be read."""
+    try:
+        name: str | None = found.metadata["Name"]
+    except Exception:  # noqa: BLE001 - anything may stand in other people's files
+        return ""
+    return name or ""
 
 
 INTERPRETERS = Registry(

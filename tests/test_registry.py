@@ -122,3 +122,119 @@ def test_registry_without_aliases() -> None:
     registry = Registry("smartcam.nothing", {"raw": "smartcam.interpreters.raw:Raw"})
     assert registry.load("raw") is Raw
     assert [info.name for info in registry.available()] == ["raw"]
+
+
+@pytest.mark.parametrize("code", ["import sys\nsys.exit(3)", "raise SystemExit", "1 +", "raise 7"])
+def test_plugin_that_ends_programs_is_a_plugin_error(install: Install, code: str) -> None:
+    install("first", code, mine="first_module:f")
+    with pytest.raises(PluginError, match="'mine' of first failed to load") as caught:
+        resolve("mine")
+    assert caught.value.__cause__ is not None
+    assert INTERPRETERS.load("raw") is Raw
+
+
+def test_plugin_that_ends_programs_when_it_is_made_is_a_plugin_error(install: Install) -> None:
+    code = (
+        "import sys\nfrom smartcam.interpreters import Interpreter\n"
+        "class F(Interpreter):\n    def __init__(self, layout=None):\n        sys.exit(3)\n"
+        "    def interpret(self, reader):\n        return 1\n"
+    )
+    install("first", code, mine="first_module:F")
+    with pytest.raises(PluginError, match="interpreter mine: cannot be made") as caught:
+        resolve("mine")
+    assert isinstance(caught.value.__cause__, SystemExit)
+
+
+def test_plugin_interrupted_by_the_user_is_not_kept_back(install: Install) -> None:
+    install("first", "raise KeyboardInterrupt", mine="first_module:f")
+    with pytest.raises(KeyboardInterrupt):
+        INTERPRETERS.load("mine")
+
+
+@pytest.mark.parametrize(
+    "target", ["no such thing", "first_module", "first_module:g.h", ":", "1:2"]
+)
+def test_plugin_of_nonsense_is_a_plugin_error(install: Install, target: str) -> None:
+    install("first", "f = 5\n", mine=target)
+    assert "mine" in INTERPRETERS
+    with pytest.raises(PluginError):
+        resolve("mine")
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("METADATA", b"\xff\xfe\x00"),
+        ("METADATA", None),
+        ("entry_points.txt", b"\xff\xfe\x00"),
+        ("entry_points.txt", b"no section = here\n"),
+        ("entry_points.txt", b"[smartcam.interpreters]\nnonsense\n"),
+        ("entry_points.txt", b"[smartcam.interpreters\nx=y:z"),
+    ],
+)
+def test_broken_metadata_of_another_distribution_costs_only_its_own(
+    install: Install, tmp_path: Path, file: str, content: bytes | None
+) -> None:
+    install("second", "", other="second_module:f")
+    install("first", "def f(reader):\n    return 7\n", mine="first_module:f")
+    broken = tmp_path / "second-0.1.dist-info" / file
+    if content is None:
+        broken.unlink()
+    else:
+        broken.write_bytes(content)
+    INTERPRETERS.refresh()
+    assert {*BUILT_IN, "mine"} <= {info.name for info in INTERPRETERS.available()}
+    assert run(resolve("mine"), Reader(b"")) == 7
+
+
+class _RaisingFinder:
+    """Finds one distribution that cannot be asked, and then fails itself."""
+
+    def find_distributions(self, _context: object = None) -> Iterator[object]:
+        yield _Raising()
+        raise OSError("the disk")
+
+    def find_spec(self, *_: object) -> None:
+        return None
+
+
+class _Raising:
+    @property
+    def _path(self) -> str:
+        return "elsewhere/hurt-1.0.dist-info"
+
+    @property
+    def entry_points(self) -> object:
+        raise PermissionError("not yours")
+
+    @property
+    def metadata(self) -> object:
+        raise PermissionError("not yours")
+
+
+def test_metadata_that_raise_are_named_in_the_log(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, _RaisingFinder()])
+    INTERPRETERS.refresh()
+    try:
+        assert {*BUILT_IN} <= {info.name for info in INTERPRETERS.available()}
+    finally:
+        INTERPRETERS.refresh()
+    assert "hurt-1.0.dist-info cannot be read, they are left out: PermissionError" in caplog.text
+    assert "cannot be listed to their end: OSError('the disk')" in caplog.text
+
+
+def test_second_version_of_a_distribution_is_left_alone(
+    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install("first", "def f(reader):\n    return 7\n", mine="first_module:f")
+    old = tmp_path / "old"
+    old.mkdir()
+    (tmp_path / "first-0.1.dist-info").rename(old / "first-0.0.dist-info")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    install("first", "def f(reader):\n    return 7\n", mine="first_module:f")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(old)])
+    INTERPRETERS.refresh()
+    (info,) = [info for info in INTERPRETERS.available() if info.name == "mine"]
+    assert info.origin == "first"

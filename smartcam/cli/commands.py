@@ -32,14 +32,23 @@ from smartcam.cli.options import (
 from smartcam.cli.running import run
 from smartcam.cli.texts import application_text, result_text, table_text
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
-from smartcam.exceptions import NotRunningError, TriggerTimeoutError, UnsupportedError
+from smartcam.exceptions import (
+    NotRunningError,
+    PluginError,
+    SmartCamError,
+    TriggerTimeoutError,
+    UnsupportedError,
+)
 from smartcam.handshake import load_protocol
+from smartcam.interpreters import resolve
 from smartcam.models import Status
 from smartcam.protocols.bvs import BVS
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
+
+    from smartcam.registry import PluginInfo
 
 __all__ = ["command"]
 
@@ -256,27 +265,43 @@ def protocols(**shared: Any) -> None:
 
     async def main() -> None:
         for info in PROTOCOLS.available():
-            protocol = load_protocol(info.name)
-            value = {
-                "name": protocol.name,
-                "origin": info.origin,
-                "schemes": list(protocol.schemes),
-                "default_port": protocol.default_port,
-                "models": list(protocol.models),
-                "dialects": [
-                    {"name": d.name, "about": d.about, "source": d.source}
-                    for d in protocol.dialects.values()
-                ],
-                "parameters": protocol.parameters,
-            }
-            rows = [(d.name, d.about) for d in protocol.dialects.values()]
-            head = (
-                f"{info.name} ({info.origin}): {', '.join(f'{s}://' for s in protocol.schemes)}, "
-                f"port {protocol.default_port}, models {', '.join(protocol.models)}\n"
-            )
-            options.show(value, head + table_text(("dialect", ""), rows))
+            try:
+                value, text = _protocol(info)
+            except Exception as exc:  # noqa: BLE001 - a broken plug-in costs only its own line
+                value, text = _broken(info, exc)
+            options.show(value, text)
 
     run(main(), program="smartcam", debug=options.debug)
+
+
+def _protocol(info: PluginInfo) -> tuple[object, str]:
+    """Return what is shown of a protocol, as JSON and as text."""
+    protocol = load_protocol(info.name)
+    value = {
+        "name": protocol.name,
+        "origin": info.origin,
+        "schemes": list(protocol.schemes),
+        "default_port": protocol.default_port,
+        "models": list(protocol.models),
+        "dialects": [
+            {"name": d.name, "about": d.about, "source": d.source}
+            for d in protocol.dialects.values()
+        ],
+        "parameters": protocol.parameters,
+    }
+    rows = [(d.name, d.about) for d in protocol.dialects.values()]
+    head = (
+        f"{info.name} ({info.origin}): {', '.join(f'{s}://' for s in protocol.schemes)}, "
+        f"port {protocol.default_port}, models {', '.join(protocol.models)}\n"
+    )
+    return value, head + table_text(("dialect", ""), rows)
+
+
+def _broken(info: PluginInfo, exc: Exception) -> tuple[object, str]:
+    """Return what is shown of a plug-in that cannot be used."""
+    reason = str(exc) if isinstance(exc, SmartCamError) else repr(exc)
+    value = {**info._asdict(), "error": reason}
+    return value, f"{info.name}  ({info.origin}: {info.target}) cannot be used: {reason}"
 
 
 @command.command()
@@ -287,7 +312,15 @@ def interpreters(**shared: Any) -> None:
 
     async def main() -> None:
         for info in INTERPRETERS.available():
-            options.show(info, f"{info.name}  ({info.origin}: {info.target})")
+            value: object = info
+            text = f"{info.name}  ({info.origin}: {info.target})"
+            try:
+                resolve(info.name)
+            except PluginError as exc:
+                value, text = _broken(info, exc)
+            except SmartCamError:
+                pass  # it has need of a layout
+            options.show(value, text)
 
     run(main(), program="smartcam", debug=options.debug)
 

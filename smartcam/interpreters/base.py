@@ -469,7 +469,7 @@ def _make(name: str, loaded: object, layout: Layout | None, *, lenient: bool) ->
             return loaded(layout)
         except SmartCamError:
             raise
-        except Exception as exc:
+        except (Exception, SystemExit) as exc:
             raise PluginError(f"interpreter {name}: cannot be made: {exc!r}", name=name) from exc
     if not isinstance(loaded, type) and callable(loaded):
         return _FunctionInterpreter(loaded, layout)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
 from commandline import Process, run, run_emulator
 
 import smartcam
+from smartcam.registry import INTERPRETERS, PROTOCOLS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 CONNECTING = ("probe", "status", "trigger", "watch", "switch", "start", "stop")
@@ -35,6 +38,39 @@ def test_interpreters_lists_the_built_in_ones() -> None:
     assert {line["name"] for line in lines if line["origin"] == "built-in"} == names
     out = run("interpreters").done().out
     assert {line.split()[0] for line in out.splitlines()} >= names
+
+
+@pytest.fixture
+def broken_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Install plug-ins that end the program, or are none."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "hurt_module.py").write_text("import sys\nsys.exit(3)\n")
+    (tmp_path / "dull_module.py").write_text("f = 5\n")
+    for name in ("hurt", "dull"):
+        info = tmp_path / f"{name}-0.1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+        points = f"{name} = {name}_module:f\n"
+        (info / "entry_points.txt").write_text(
+            f"[smartcam.interpreters]\n{points}[smartcam.protocols]\n{points}"
+        )
+    for registry in (PROTOCOLS, INTERPRETERS):
+        registry.refresh()
+    yield
+    for registry in (PROTOCOLS, INTERPRETERS):
+        registry.refresh()
+    sys.modules.pop("dull_module", None)
+
+
+@pytest.mark.usefixtures("broken_plugins")
+@pytest.mark.parametrize(("command", "good"), [("protocols", "bvs"), ("interpreters", "raw")])
+def test_broken_plugins_are_listed_with_their_reasons(command: str, good: str) -> None:
+    lines = {one["name"]: one for one in run(command, "--json").done().lines}
+    assert lines["hurt"]["error"].endswith("'hurt' of hurt failed to load: SystemExit(3)")
+    assert (lines["dull"]["origin"], "5" in lines["dull"]["error"]) == ("dull", True)
+    assert "error" not in lines[good]
+    out = run(command).done().out
+    assert "hurt  (hurt: hurt_module:f) cannot be used: smartcam." in out
 
 
 def test_demo_tells_its_story() -> None:
