@@ -184,7 +184,6 @@ LIMITS = (
     "recording.recorder.CHUNK",
     "recording.recorder.MAX_WAITING",
     "recording.recorder.CLOSE_TIMEOUT",
-    "recording.reader.MAX_RECORD",
     "testing.clients.tasks.MAX_OUTPUT",
     "testing.clients.runs.MAX_LINES",
     "testing.conformance.wire.MAX_BODY",

@@ -67,7 +67,7 @@ told; a later one goes before an earlier one."""
 
 MAX_MESSAGE = 1 << 26
 """Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
-room for an image of 16 MiB; the largest frame of a BVS camera takes 4 MiB."""
+room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
 
 MAX_VALUES = 3_000_000
 """Commas and opening brackets of a message, written or read: each may become an object that takes

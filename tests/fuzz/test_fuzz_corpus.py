@@ -143,7 +143,7 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "messages": (FramedDialect, "surplus", lambda *_: 0),
     "machine": (Machine, "_wanted", lambda *_, **__: True),
     "layout": (Layout, "sequence", lambda *_: None),
-    "interpreters": (Localizations, "_check_finite", lambda *_: None),
+    "interpreters": (Localizations, "_check_numbers", lambda *_: None),
     "scenario": (scenario_module, "_line", divide_by_zero),
     "camera": (Device, "_report", lambda *_: None),
     "layout_file": (Layout, "to_yaml", lambda _: "x: bool"),
