@@ -167,6 +167,7 @@ def load_recording(path: str | Path) -> Recording:
         at = item.received_at if isinstance(item, Result) else item.at
         began = at if began is None else min(began, at)
         ended = at if ended is None else max(ended, at)
+        del item  # the next one may be large, too
     return Recording(
         path=scan.path,
         version=scan.file_facts.get("version", ""),
@@ -263,6 +264,7 @@ class _Scan:
                 if item is not None:
                     count += 1
                     yield item
+                    item = None  # the next one may be large, too
             self._check_ours(schemas)
 
     def _take(
