@@ -62,7 +62,7 @@ class Chunk(NamedTuple):
         received_at: loop time when it came.
         events: what it gave, in order.
         size: bytes that came since the chunk before; 0 for the rest of one.
-        frames: in how many frames the events came.
+        frames: in how many frames the events came; an event may be made of many (In-Sight).
     """
 
     received_at: float
@@ -190,7 +190,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         chunk = self._chunks.popleft()
         if chunk.frames > self._most:
             chunk, rest = split(chunk, self._most)
-            self._chunks.appendleft(rest)
+            if rest.events:
+                self._chunks.appendleft(rest)
         if chunk.frames >= CHUNK_FRAMES[0]:
             self._busy_since, self._busy_with = time.perf_counter(), chunk.frames
         if self._paused and not self._chunks:
