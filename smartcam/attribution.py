@@ -11,7 +11,8 @@ trigger's, whoever began it.
 
 Where the layout of the trigger has an ``@sequence`` field, the number decides as well: it was set
 with Set sequence number right before the trigger, and only the container that carries it is its
-result. A wide number of our own needs no fence.
+result. A wide number of our own needs neither fence nor drop; one that somebody else's run may
+carry, since it is narrow or the user's own, does.
 
 A trigger that was given up leaves a *debt*; the next trigger settles it first
 (:meth:`~smartcam.triggering.Triggers.trigger`). Only what comes behind the fence of the trigger
@@ -82,6 +83,7 @@ class PendingTrigger:
         triggered_at: wall clock, UTC.
         wanted: how many results it is to have.
         number: sequence number set for it, None where its layout has none.
+        certain: nobody else's run may carry that number.
         application: the one that is believed to be active, None where any will do.
         run: how far the camera is with it.
         results: those that came.
@@ -96,6 +98,7 @@ class PendingTrigger:
     triggered_at: datetime
     wanted: int = 1
     number: int | None = None
+    certain: bool = False
     application: int | None = None
     run: Run = field(default_factory=Run)
     results: list[Result] = field(default_factory=list[Result])
@@ -320,7 +323,10 @@ class Attribution:
                 pending.early += 1
             elif len(pending.results) == pending.wanted:
                 pass  # all are there, and are still to be confirmed
-            elif pending.number is None or number is None:
+            elif pending.certain and number is not None:
+                if number == pending.number:
+                    return OURS
+            elif number is None or pending.number is None or number == pending.number:
                 run = pending.run
                 if (
                     run.begun
@@ -330,8 +336,6 @@ class Attribution:
                     return OURS
                 if self._drops_waiting is None and not run.shown:
                     return HELD
-            elif number == pending.number:
-                return OURS
         elif pending is not None and pending.outcome.cancelled():
             self.give_up(pending)  # its caller was not woken yet
         return self.judge_other(number)

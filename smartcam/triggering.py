@@ -190,6 +190,7 @@ class Triggers:
             datetime.now(UTC),
             request.results,
             number,
+            certain,
             # where each application has its own interpreter none is read with another's layout
             None if interpretation.by_application else self.inbox.active,
             Run(reached=not fenced, confirmed=not talk.confirms),
