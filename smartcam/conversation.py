@@ -615,9 +615,8 @@ class Conversation:
         Raises:
             ResponseTimeoutError: it did not come; the link is given up if its own time is over too.
         """
-        if self.owes(key) and key not in self.inbox.answers:
-            self.inbox.next_answer(key)  # to the Query in front of a trigger
-        while (owed := self.inbox.answers.get(key)) is not None:
+        while self.owes(key):  # a trigger may have sent the next Query before this goes on
+            owed = self.inbox.answers.get(key) or self.inbox.next_answer(key)
             try:
                 await self._take_answer(owed, deadline)
             except TimeoutError as exc:
