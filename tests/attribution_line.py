@@ -10,6 +10,7 @@ from smartcam.attribution import (
     Attribution,
     Debt,
     PendingTrigger,
+    Run,
     Verdict,
 )
 from smartcam.interpretation import Interpretation
@@ -26,43 +27,68 @@ NO_LOOP.close()  # the futures here are never awaited
 
 
 class Line:
-    """An attribution with what the inbox and the conversation do around it."""
+    """An attribution with what the inbox and the conversation do around it.
 
-    def __init__(self, *, ordered: bool = True) -> None:
+    Args:
+        ordered: every status comes, and in order.
+        fences: a trigger has a Query in front of it; default where it is ordered.
+    """
+
+    def __init__(self, *, ordered: bool = True, fences: bool | None = None) -> None:
         self.is_ordered = ordered
-        self.at = Attribution()
+        self.fences = ordered if fences is None else fences
+        self.at = Attribution(chance=0.5)
         self.at.begin_session(ordered=ordered)
         self.status: Status | None = None
+        self.fence_open = False
+        self.wants_query = False  # a container is held: have a Query answered
+        self.held: list[tuple[int | None, object]] = []
+        self.judged: list[tuple[object, Verdict]] = []  # each container's fate, in order
+        self.others = 0  # inspections that somebody else has triggered
 
     @property
     def pending(self) -> PendingTrigger | None:
         return self.at.pending
 
-    def trigger(self, number: int | None = None, wanted: int = 1) -> PendingTrigger:
+    # -- what the client does
+
+    def send(
+        self,
+        number: int | None = None,
+        wanted: int = 1,
+        *,
+        fenced: bool | None = None,
+        certain: bool = False,
+        confirms: bool = False,
+    ) -> PendingTrigger:
+        """Send a trigger; the fence in front of it is not answered yet."""
+        self.fence_open = self.fences if fenced is None else fenced
         outcome: asyncio.Future[list[Result]] = asyncio.Future(loop=NO_LOOP)
-        pending = PendingTrigger(outcome, RAW, False, 0.0, NOW, wanted=wanted, number=number)
+        run = Run(reached=not self.fence_open, confirmed=not confirms)
+        pending = PendingTrigger(
+            outcome,
+            RAW,
+            False,
+            0.0,
+            NOW,
+            wanted=wanted,
+            number=number,
+            certain=certain,
+            run=run,
+        )
         self.at.send(pending)
         return pending
 
-    def hear(self, *statuses: Status) -> None:
-        for status in statuses:
-            self.at.on_status(self.status, status)
-            self.status = status
-
-    def result(self, number: int | None = None) -> Verdict:
-        verdict = self.at.judge(number)
-        pending = self.pending
-        if verdict.fate == "triggered":
-            assert pending is not None
-            pending.results.append(SOME)
-            if len(pending.results) == pending.wanted:
-                self.at.done(pending)
-                pending.outcome.set_result(pending.results)
-        return verdict
+    def trigger(self, number: int | None = None, wanted: int = 1) -> PendingTrigger:
+        """Send a trigger whose fence is answered at once."""
+        pending = self.send(number, wanted)
+        self.answer()
+        return pending
 
     def leave(self) -> None:
         """The caller of the trigger has been woken."""
         self.at.pending = None
+        self.release()
 
     def give_up(self, debt: Debt = "late") -> None:
         assert self.pending is not None
@@ -70,20 +96,84 @@ class Line:
         self.leave()
 
     def reconnect(self) -> None:
-        if self.pending is not None and not self.pending.outcome.done():
-            self.give_up()
+        pending, self.fence_open = self.pending, False
+        if pending is not None and not pending.outcome.done():
+            self.at.give_up(pending)
+            pending.outcome.cancel()
+        self.release()
         self.leave()
         self.at.begin_session(ordered=self.is_ordered)
         self.status = None
 
+    # -- what comes
+
+    def answer(self) -> None:
+        """A Query is answered: the fence, or another one."""
+        if self.fence_open:
+            self.fence_open = False
+            self.at.on_fence(int(self.status or 0))
+        elif self.held:
+            self.at.on_answer_to_query()
+            self.release()
+
+    def hear(self, *statuses: Status) -> None:
+        for status in statuses:
+            before, self.status = self.status, status
+            self.others += self.at.on_status(None if before is None else int(before), int(status))
+            if self.held:
+                self.release()
+            self._complete()
+
+    def release(self) -> None:
+        held, self.held = self.held, []
+        pending = self.pending
+        older = pending is None or pending.outcome.done() or pending.run.begun
+        for number, container in held:
+            self.result(number, container, older=older)
+
+    def result(
+        self, number: int | None = None, container: object = None, *, older: bool = False
+    ) -> Verdict:
+        """A container comes; what is held gets its fate later."""
+        pending = self.pending
+        verdict = self.at.judge_other(number) if older else self.at.judge(number)
+        if verdict.fate == "held":
+            assert pending is not None
+            if len(self.held) < pending.wanted:
+                self.held.append((number, container))
+                self.wants_query = True
+                return verdict
+            verdict = self.at.judge_other(number)
+        self.judged.append((container, verdict))
+        if verdict.fate == "triggered":
+            assert pending is not None
+            pending.results.append(SOME)
+            self._complete()
+        return verdict
+
+    def _complete(self) -> None:
+        pending = self.pending
+        if pending is None or pending.outcome.done() or not pending.run.confirmed:
+            return
+        if len(pending.results) == pending.wanted:
+            self.at.done(pending)
+            pending.outcome.set_result(pending.results)
+
+
+def ready(*, ordered: bool = True) -> Line:
+    """A camera that waits for a trigger; whether it shows one is not known."""
+    line = Line(ordered=ordered)
+    line.hear(READY)
+    return line
+
 
 def shown(*, ordered: bool = True) -> Line:
     """A camera that was seen to drop Waiting for Trigger at a trigger, and waits again."""
-    line = Line(ordered=ordered)
-    line.hear(READY)
+    line = ready(ordered=ordered)
     line.trigger()
     line.hear(WORKING)
     line.result()
     line.leave()
     line.hear(READY)
+    line.judged.clear()
     return line
