@@ -98,11 +98,12 @@ class Conversation:
         if not by_itself:
             self.poll = StatusPoll(link, self.inbox, self._patience)
             self.inbox.on_status_wanted = self.poll.wanted
+            self.inbox.on_unconfirmed = self.poll.ask
             self.poll.wanted()
 
     def end_polling(self) -> None:
         """The session is over, or none has begun."""
-        self.inbox.on_status_wanted = None
+        self.inbox.on_status_wanted = self.inbox.on_unconfirmed = None
         if self.poll is not None:
             self.poll.stop()
             self.poll = None

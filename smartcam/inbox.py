@@ -104,6 +104,7 @@ class Inbox:
         self.fence_open: bool = False  # the Query in front of the last trigger is not answered
         self.statuses_heard: int = 0
         self.on_status_wanted: Callable[[], None] | None = None  # where it has to be asked for
+        self.on_unconfirmed: Callable[[], None] | None = None  # have the status told behind this
         self.on_held: Callable[[], None] | None = None  # have a Query answered
         # containers of which it is not known yet whether they are the trigger's
         self._held: list[tuple[m.ResultContainer, float, datetime]] = []
@@ -290,6 +291,9 @@ class Inbox:
 
     def _on_trigger_answer(self, answer: m.TriggerAnswer, now: float, at: datetime) -> None:
         self.attribution.on_answer()
+        pending = self.attribution.pending
+        if pending is not None and not pending.run.confirmed and self.on_unconfirmed is not None:
+            self.on_unconfirmed()
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         before, status = self.status, report.status

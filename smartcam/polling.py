@@ -9,6 +9,7 @@ question does not say what it should, and the link is given up.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ResponseTimeoutError, SmartCamError
@@ -57,6 +58,11 @@ class StatusPoll:
             return
         self.stop()
         self._timer = self._loop.call_later(0.0, self._tick)
+
+    def ask(self) -> None:
+        """Ask now, whatever is open: what was asked before may tell of what was before."""
+        with contextlib.suppress(SmartCamError):  # the link is over: its reader knows
+            self._link.send(GetStatus(), answered=False)
 
     def stop(self) -> None:
         """Ask no more."""
