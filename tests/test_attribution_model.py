@@ -154,13 +154,16 @@ class CameraAndClient(RuleBasedStateMachine):
 
     @initialize(data=st.data())
     def connect(self, data: st.DataObject) -> None:
-        """The camera may be at work for the client before."""
+        """The camera may be at work for the client before; perhaps we trigger at once."""
         if self.sensors and data.draw(st.booleans(), "at work"):
             self.camera.begin(SENSOR, self.draw_left(data), numbers=self.draw_numbers(data))
             for _ in range(data.draw(st.integers(0, 3), "said")):
                 self.camera.say()
         self.camera.said.clear()
         self.camera.said.append(self.camera.status)
+        if data.draw(st.booleans(), "trigger at once"):
+            self.move("deliver", data)
+            self.trigger(data)
 
     def draw_left(self, data: st.DataObject) -> list[Status | None]:
         """What a run will say, in which order."""
@@ -292,6 +295,8 @@ class CameraAndClient(RuleBasedStateMachine):
             return
         if not self.idle:
             self.given_up.add(self.sent)
+        else:
+            self.wake()  # the next session takes longer than that
         camera = self.camera
         camera.heard.clear()
         camera.said.clear()
