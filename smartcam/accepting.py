@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import logging
-    import socket
     from collections.abc import Callable
 
 __all__ = ["ACCEPT_PAUSE", "Acceptor"]
@@ -107,6 +107,9 @@ class Acceptor:
     def _adopt(self, connection: socket.socket) -> None:
         """Give an accepted connection its protocol; one that is too late is closed by that."""
         self._scarce = False
+        with contextlib.suppress(OSError):  # it is gone again
+            # asyncio does so only where the listening socket was made with the protocol's number
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         loop = asyncio.get_running_loop()
         task = loop.create_task(
             loop.connect_accepted_socket(self._make, connection), name=f"{self._name}.adopt"
