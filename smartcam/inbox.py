@@ -324,7 +324,7 @@ class Inbox:
             try:
                 if waiter.predicate(status):
                     waiter.outcome.set_result(status)
-            except Exception as exc:  # noqa: BLE001 - the user's predicate: its caller gets it
+            except (Exception, asyncio.CancelledError) as exc:  # noqa: BLE001 - the user's own
                 waiter.outcome.set_exception(exc)
 
     @property

@@ -8,6 +8,7 @@ stands no value passes that it has not turned into poses of the robot.
 from __future__ import annotations
 
 import inspect
+from asyncio import CancelledError
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from smartcam.exceptions import (
@@ -229,7 +230,7 @@ class Interpretation:
             if self._calibrations is not None:
                 # each by itself, so that it has the same bits whichever way it came
                 values = [self._calibrations.apply(value, application) for value in values]
-        except Exception:  # noqa: BLE001 - one by one it shows, with its place
+        except (Exception, CancelledError):  # noqa: BLE001 - one by one it shows, with its place
             return None
         return (values, context.empty_slots) if complete else None
 
@@ -313,7 +314,7 @@ class _Calibrations:
             raise InterpretationError(
                 f"calibration: {exc}", expected=exc.expected, got=exc.got
             ) from exc
-        except Exception as exc:
+        except (Exception, CancelledError) as exc:
             raise InterpretationError(
                 f"the calibration failed with {type(exc).__name__}: {exc}", got=repr(exc)
             ) from exc

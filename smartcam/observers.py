@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from asyncio import CancelledError
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -98,5 +99,5 @@ class Observers:
     def _call(self, hook: Callable[..., None], *arguments: Any) -> None:
         try:
             hook(*arguments)
-        except Exception:
+        except (Exception, CancelledError):  # neither is to end the receive task
             logger.exception("! an observer failed: %r", hook)

@@ -13,6 +13,7 @@ import functools
 import re
 import struct
 from abc import ABC, abstractmethod
+from asyncio import CancelledError
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -342,7 +343,7 @@ def run(interpreter: Interpreter, reader: Reader) -> object:
         return interpreter.interpret(reader)
     except InterpretationError:
         raise
-    except Exception as exc:
+    except (Exception, CancelledError) as exc:
         raise _failed(exc, reader.data) from exc
 
 
@@ -352,7 +353,7 @@ def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
         return interpreter.sequence(reader)
     except InterpretationError:
         raise
-    except Exception as exc:
+    except (Exception, CancelledError) as exc:
         raise _failed(exc, reader.data) from exc
 
 
@@ -370,11 +371,11 @@ def run_plain(interpreter: PlainInterpreter, data: bytes, context: Context) -> o
         return interpreter.read(data, context)
     except InterpretationError:
         raise
-    except Exception as exc:
+    except (Exception, CancelledError) as exc:
         raise _failed(exc, data) from exc
 
 
-def _failed(exc: Exception, data: bytes) -> InterpretationError:
+def _failed(exc: BaseException, data: bytes) -> InterpretationError:
     return InterpretationError(
         f"the interpreter failed with {type(exc).__name__}: {exc} "
         f"(the container has {len(data)} bytes)",
