@@ -61,13 +61,11 @@ class Chunk(NamedTuple):
     Attributes:
         received_at: loop time when it came.
         events: what it gave, in order.
-        size: bytes that came since the chunk before; 0 for the rest of one.
         frames: in how many frames the events came; an event may be made of many (In-Sight).
     """
 
     received_at: float
     events: list[Event]
-    size: int = 0
     frames: int = 1
 
 
@@ -129,7 +127,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._replies = machine.replies
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
-        self._bytes = self._frames = 0  # that came until the last chunk
+        self._frames = 0  # that came until the last chunk
         self._most = FIRST_CHUNK  # frames of the next chunk
         self._busy_since: float | None = None  # with the last chunk, where it was a large one
         self._busy_with = 0
@@ -338,10 +336,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         events = self.machine.events()
         if not events or self._closing:
             return
-        counters = self.machine.counters
-        size, self._bytes = counters.bytes_received - self._bytes, counters.bytes_received
-        frames, self._frames = counters.frames_received - self._frames, counters.frames_received
-        self._chunks.append(Chunk(self.heard_at, events, size, frames))
+        received = self.machine.counters.frames_received
+        frames, self._frames = received - self._frames, received
+        self._chunks.append(Chunk(self.heard_at, events, frames))
         last = events[-1]
         if isinstance(last, LinkFailed):
             self._lose(last.error)
@@ -396,7 +393,7 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
         some.append(event)
     taken = frames - left
     first = chunk._replace(events=some, frames=taken)
-    return first, chunk._replace(events=list(rest), size=0, frames=chunk.frames - taken)
+    return first, chunk._replace(events=list(rest), frames=chunk.frames - taken)
 
 
 async def open_link(

@@ -157,7 +157,6 @@ class _Collector:
 
     link: Link
     most: int
-    size: int = 0
     early: list[Chunk] = field(default_factory=list[Chunk])
     version: int | None = None
     statuses: int = 0
@@ -166,10 +165,10 @@ class _Collector:
 
     async def take(self) -> None:
         chunk = await self.link.receive()
-        self.size += chunk.size
-        if self.size > self.most:
+        received = self.link.machine.counters.bytes_received
+        if received > self.most:
             raise RemoteProtocolError(
-                f"{self.size} bytes came before there was a session; {self.most} are accepted"
+                f"{received} bytes came before there was a session; {self.most} are accepted"
             )
         self.early.append(chunk)
         dialect = self.link.machine.dialect

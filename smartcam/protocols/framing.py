@@ -116,7 +116,7 @@ class Framer:
     """
 
     __slots__ = (
-        *("_always", "_buffer", "_filled", "_header", "_large", "_lengths", "_max_length"),
+        *("buffer", "_always", "_filled", "_header", "_large", "_lengths", "_max_length"),
         *("_most", "_read", "_start", "_store", "_window"),
     )
 
@@ -126,8 +126,9 @@ class Framer:
         self._lengths: Mapping[int, range] = {}
         self._always = max_length  # a length that every message may have
         self._read = header.reader()
-        # A chunk as it came, or one large frame.
-        self._buffer: Buffer = b""
+        self.buffer: Buffer = (
+            b""  # a chunk as it came, or one large frame: of it cut() tells places
+        )
         self._start = 0
         self._large: memoryview | None = None  # an unfinished large frame, as long as it will be
         self._filled = 0
@@ -148,34 +149,29 @@ class Framer:
     @property
     def buffered(self) -> int:
         """Bytes kept for the next frame."""
-        return self._filled if self._large is not None else len(self._buffer) - self._start
+        return self._filled if self._large is not None else len(self.buffer) - self._start
 
     @property
     def pending(self) -> bytes:
         """Copy of the bytes kept, for traces and error texts."""
         if self._large is not None:
             return bytes(self._large[: self._filled])
-        return bytes(self._buffer[self._start :])
-
-    @property
-    def buffer(self) -> Buffer:
-        """The bytes that :meth:`cut` tells places of."""
-        return self._buffer
+        return bytes(self.buffer[self._start :])
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
         """Take bytes; call :meth:`cut` or :meth:`next_frame` until it returns None."""
         large = self._large
         if large is None:
-            buffer, start = self._buffer, self._start
+            buffer, start = self.buffer, self._start
             rest = bytes(buffer[start:]) if start < len(buffer) else b""
-            self._buffer, self._start = rest + data if rest else bytes(data), 0
+            self.buffer, self._start = rest + data if rest else bytes(data), 0
             return
         filled, missing = self._filled, len(large) - self._filled
         if len(data) <= missing:
             large[filled : filled + len(data)] = data
             self._fill(len(data))
             return
-        self._buffer, self._start, self._large = b"".join((large[:filled], data)), 0, None
+        self.buffer, self._start, self._large = b"".join((large[:filled], data)), 0, None
 
     def room(self) -> memoryview:
         """Return where a transport may write the next bytes; call :meth:`filled` next.
@@ -203,13 +199,13 @@ class Framer:
             self._most = MOST_READ
         elif count < self._most:
             self._window = self._store = memoryview(bytearray(min(2 * count, MOST_READ)))
-        if self._start < len(self._buffer):
+        if self._start < len(self.buffer):
             self.feed(data)
         elif count >= LARGE and self._begins_large(data):
-            self._buffer, self._start = data, 0  # not copied: it is cut before the next bytes come
+            self.buffer, self._start = data, 0  # not copied: it is cut before the next bytes come
             self._window = self._store
         else:
-            self._buffer, self._start = bytes(data), 0
+            self.buffer, self._start = bytes(data), 0
             if len(self._window) > MOST_READ:
                 self._window = self._store[:MOST_READ]
         return True
@@ -233,7 +229,7 @@ class Framer:
         """
         if self._large is not None:
             return None
-        header, buffer, start = self._header, self._buffer, self._start
+        header, buffer, start = self._header, self.buffer, self._start
         available = len(buffer) - start
         if available < header.size:
             if available:
@@ -261,7 +257,7 @@ class Framer:
 
     def take(self, begin: int, end: int) -> bytes:
         """Return the bytes at a place that :meth:`cut` told."""
-        return bytes(self._buffer[begin:end])
+        return bytes(self.buffer[begin:end])
 
     def following(self, read: Read, like: int, size: int) -> list[bytes]:
         """Return what is in the whole frames that come next and are of the same kind.
@@ -274,7 +270,7 @@ class Framer:
             like: where the frame begins that they are compared with.
             size: of what is the same in each of them.
         """
-        header, buffer, start = self._header, self._buffer, self._start
+        header, buffer, start = self._header, self.buffer, self._start
         found: list[bytes] = []
         available, id_first, before = len(buffer), header.id_first, header.size
         least, last = before + size, available - before - size
@@ -310,7 +306,7 @@ class Framer:
         None where not even the header is there. To be asked when :meth:`cut` has returned None.
         """
         header = self._header
-        buffer, start = (self._buffer, self._start) if self._large is None else (self._large, 0)
+        buffer, start = (self.buffer, self._start) if self._large is None else (self._large, 0)
         if self.buffered < header.size:
             return None
         _, message_id, length = self._read(buffer, start)
@@ -328,7 +324,7 @@ class Framer:
             begin: of the frame's bytes, where to begin.
         """
         header = self._header
-        buffer, start = (self._buffer, self._start) if self._large is None else (self._large, 0)
+        buffer, start = (self.buffer, self._start) if self._large is None else (self._large, 0)
         begin = max(begin, header.size)
         data = bytes(buffer[start + begin : start + self.buffered])
         at = data.find(header.magic) if header.magic else -1
@@ -358,27 +354,27 @@ class Framer:
         """
         magic = self._header.magic
         if self._large is not None:
-            self._buffer, self._start, self._large = self.pending, 0, None
+            self.buffer, self._start, self._large = self.pending, 0, None
         begin = self._start
-        found = bytes(self._buffer).find(magic, begin + 1) if magic else -1
+        found = bytes(self.buffer).find(magic, begin + 1) if magic else -1
         if found < 0:
             keep = min(len(magic) - 1, max(self.buffered - 1, 0)) if magic else 0
-            while keep and not magic.startswith(bytes(self._buffer[-keep:])):
+            while keep and not magic.startswith(bytes(self.buffer[-keep:])):
                 keep -= 1
-            found = len(self._buffer) - keep
+            found = len(self.buffer) - keep
         self._start = found
         return found - begin
 
     def clear(self) -> None:
         """Drop everything kept."""
-        self._buffer, self._start, self._large = b"", 0, None
+        self.buffer, self._start, self._large = b"", 0, None
 
     def _fill(self, count: int) -> None:
         """``count`` bytes more of a large frame are there."""
         self._filled += count
         large = self._large
         if large is not None and self._filled == len(large):
-            self._buffer, self._start, self._large = large, 0, None
+            self.buffer, self._start, self._large = large, 0, None
 
     def _begins_large(self, data: memoryview) -> bool:
         """Whether the first frame is a large one."""
@@ -389,12 +385,12 @@ class Framer:
 
     def _keep(self, start: int) -> None:
         """Keep the rest of a chunk that was a view."""
-        if isinstance(self._buffer, memoryview):
-            self._buffer, self._start = bytes(self._buffer[start:]), 0
+        if isinstance(self.buffer, memoryview):
+            self.buffer, self._start = bytes(self.buffer[start:]), 0
 
     def _collect(self, size: int) -> None:
         """Collect the rest of a large frame of ``size`` bytes in all where a transport writes."""
-        begun = self._buffer[self._start :]
+        begun = self.buffer[self._start :]
         in_place = isinstance(begun, memoryview) and begun.obj is self._store.obj
         if len(self._store) < size:
             self._window = self._store = memoryview(bytearray(size))
@@ -402,7 +398,7 @@ class Framer:
         if not in_place or self._start:
             self._store[: len(begun)] = begun
         self._large, self._filled = self._store[:size], len(begun)
-        self._buffer, self._start = b"", 0
+        self.buffer, self._start = b"", 0
 
     def _check_length(self, message_id: int, size: int) -> None:
         longest = self._max_length
@@ -414,16 +410,16 @@ class Framer:
                 f"a frame of message {message_id:#04x} announces {size} bytes of payload; "
                 f"0 to {longest} are accepted",
                 offset=len(header.magic),
-                data=bytes(self._buffer[start : start + header.size]),
+                data=bytes(self.buffer[start : start + header.size]),
             )
 
     def _check_magic(self, start: int, available: int) -> None:
         magic = self._header.magic
         if not magic:
             return
-        seen = bytes(self._buffer[start : start + min(available, len(magic))])
+        seen = bytes(self.buffer[start : start + min(available, len(magic))])
         if not magic.startswith(seen):
             raise FrameError(
                 f"wrong magic number: {hex_excerpt(seen)} came, {magic.hex(' ')} was expected",
-                data=bytes(self._buffer[start : start + 64]),
+                data=bytes(self.buffer[start : start + 64]),
             )

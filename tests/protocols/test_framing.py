@@ -112,7 +112,7 @@ def test_framer_many_frames_in_one_chunk_come_in_order_without_a_copy() -> None:
     framer = fed(chunk)
     frames = iter(framer.next_frame, None)
     assert list(frames) == [STATUS_FRAME, Frame(0x30, b"")] * 50
-    assert framer._buffer is chunk
+    assert framer.buffer is chunk
 
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
