@@ -117,6 +117,7 @@ class SmartCamera:
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
         self.settings = settings
         self._observers = Observers(observers)
+        self._observed = bool(self._observers)
         self._interpretations: dict[str, Interpretation] = {}  # by their text
         self._inbox = Inbox(
             settings.name, self._interpretation(settings.interpret_as), self._observers
@@ -481,7 +482,7 @@ class SmartCamera:
             raise ConfigurationError(f"trigger: results_per_trigger is 1 or more, not {wanted}")
         data = None if input is None else bytes(input)
         request = TriggerRequest(interpretation, data, wanted, when_busy == "wait")
-        called_at = datetime.now(UTC)
+        called_at = datetime.now(UTC) if self._observed else None
         try:
             results = await self._trigger(application, request, timeout)
         except SmartCamError as error:

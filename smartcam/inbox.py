@@ -313,11 +313,13 @@ class Inbox:
         pending = self.attribution.pending
         if pending is not None and pending.results:
             self._complete(now)
-        self._note_loading(was, bits)
-        if status != before and self._is_watched:
+        if bits & _RUNNING_OR_BUSY == _BUSY or (was or 0) & _RUNNING_OR_BUSY == _BUSY:
+            self._note_loading(bits)
+        if status != before and self._is_watched():
             self.publish(StatusChanged(camera=self.name, at=at, status=status, previous=before))
-        for stream in self.status_streams:
-            stream.offer(status, now)
+        if self.status_streams.references:
+            for stream in self.status_streams:
+                stream.offer(status, now)
         for waiter in tuple(self._status_waiters) if self._status_waiters else ():
             if waiter.outcome.done():
                 continue
@@ -327,17 +329,20 @@ class Inbox:
             except (Exception, asyncio.CancelledError) as exc:  # noqa: BLE001 - the user's own
                 waiter.outcome.set_exception(exc)
 
-    @property
     def _is_watched(self) -> bool:
         """Whether anybody would see an event."""
-        watched = bool(self.event_streams) or self._observed
+        watched = self._observed or bool(self.event_streams.references)
         return watched or logger.isEnabledFor(logging.DEBUG)
 
-    def _note_loading(self, was: int | None, bits: int) -> None:
-        """Doubt which application is active when somebody else's switch has ended."""
-        if bits & _RUNNING_OR_BUSY == _BUSY:  # as Status.loading
+    def _note_loading(self, bits: int) -> None:
+        """Doubt which application is active when somebody else's switch has ended.
+
+        Args:
+            bits: the status; it, or the one before, was ``Status.loading``.
+        """
+        if bits & _RUNNING_OR_BUSY == _BUSY:
             self._loaded_by_us = False
-        elif was is not None and was & _RUNNING_OR_BUSY == _BUSY:
+        else:
             by_us = self._loaded_by_us or m.SwitchAnswer in self.answers
             self.active_in_doubt = self.active_in_doubt or not by_us
             self.loads_by_others += not by_us
@@ -542,8 +547,9 @@ class Inbox:
         """Hand a result on; ``current`` where it is not known to be an older trigger's."""
         if self._observed:
             self._observers.result(result)
-        for stream in self.result_streams:
-            stream.offer(result, now, len(result.raw))
+        if self.result_streams.references:
+            for stream in self.result_streams:
+                stream.offer(result, now, len(result.raw))
         if current and self.next_results:
             for future in self._take_next_results():
                 future.set_result(result)

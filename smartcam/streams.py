@@ -325,23 +325,24 @@ class BatchSubscription(Queue[T]):
 class Subscribers(Generic[T]):
     """The queues that are offered something; one that nobody refers to any more is gone."""
 
-    __slots__ = ("_references",)
+    __slots__ = ("references",)
 
     def __init__(self) -> None:
-        self._references: tuple[weakref.ref[Queue[T]], ...] = ()
+        # empty where nobody is subscribed: looked at for every message
+        self.references: tuple[weakref.ref[Queue[T]], ...] = ()
 
     def add(self, queue: Queue[T]) -> None:
         """Offer it what comes from now on."""
-        self._references = (*self._references, weakref.ref(queue, self._discard))
+        self.references = (*self.references, weakref.ref(queue, self._discard))
 
     def _discard(self, reference: weakref.ref[Queue[T]]) -> None:
-        self._references = tuple(one for one in self._references if one is not reference)
+        self.references = tuple(one for one in self.references if one is not reference)
 
     def __bool__(self) -> bool:
-        return bool(self._references)
+        return bool(self.references)
 
     def __iter__(self) -> Iterator[Queue[T]]:
-        for reference in self._references:
+        for reference in self.references:
             queue = reference()
             if queue is not None:
                 yield queue

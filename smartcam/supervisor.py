@@ -272,6 +272,7 @@ class Supervisor:
             except ConnectionLostError as error:
                 return error
             inbox.dispatch(chunk)
+            del chunk  # the next one may take its time
             if inbox.active_in_doubt:
                 self._talk.ask_what_is_active()
 
