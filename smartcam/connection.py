@@ -45,11 +45,14 @@ TURN = 0.00015
 """Seconds that the receive task takes in one turn of the event loop, about: from how long a chunk
 took follows how much the next one holds."""
 
-CHUNK_FRAMES = (8, 256)
-"""Frames that a chunk holds at most, where they take long and where they do not."""
+LEAST_CHUNK = 8
+"""Frames of a chunk that are worth to be cut."""
 
 FIRST_CHUNK = 64
-"""Frames of the first chunk, when it is not known how long they take."""
+"""Frames of a chunk as long as it is not known how long they take."""
+
+LARGEST_CHUNK = 256
+"""Frames of a chunk, however fast they are worked off: the next ones may take longer."""
 
 MAX_REST = 256
 """Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
@@ -190,7 +193,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             chunk, rest = split(chunk, self._most)
             if rest.events:
                 self._chunks.appendleft(rest)
-        if chunk.frames >= CHUNK_FRAMES[0]:
+        if chunk.frames >= LEAST_CHUNK:
             self._busy_since, self._busy_with = time.perf_counter(), chunk.frames
         if self._paused and not self._chunks:
             self._resume()
@@ -353,10 +356,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """Have the next chunks hold as much as one turn takes, by how long the last one took."""
         self._busy_since = None
         took = time.perf_counter() - since
-        least, most = CHUNK_FRAMES
         frames = int(self._busy_with * TURN / max(took, 1e-9))
         frames = max(frames, self._most // 2)  # it may have been another process
-        self._most = max(least, min(most, frames))
+        self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
 
     def _resume(self) -> None:
         if self._paused:

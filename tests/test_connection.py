@@ -196,7 +196,8 @@ async def test_receive_takes_one_chunk_in_a_turn_of_the_loop(
 async def test_delivery_with_many_frames_is_taken_in_several_turns(
     server: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection, "CHUNK_FRAMES", (64, 64))
+    monkeypatch.setattr(connection, "LARGEST_CHUNK", 64)
+    monkeypatch.setattr(connection, "LEAST_CHUNK", 64)
     link, peer = await session(server)
     await deliver(link, peer, RESULT * 120 + BUSY * 10)
     assert not link._transport.is_reading()

@@ -13,6 +13,7 @@ from commandline import (
     CONNECT,
     DISCONNECT,
     HELLO_WORLD,
+    INSPECTING,
     PATIENCE,
     QUERY,
     SESSION,
@@ -26,7 +27,7 @@ from commandline import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-WORKING = {**SESSION, QUERY: ACTIVE_21 + HELLO_WORLD, TRIGGER: HELLO_WORLD + WAITING}
+WORKING = {**SESSION, QUERY: ACTIVE_21 + HELLO_WORLD, TRIGGER: INSPECTING + HELLO_WORLD + WAITING}
 """A camera that sends a result by itself, and one for every trigger."""
 
 
@@ -102,7 +103,7 @@ def test_trigger_into_head_ends_quietly() -> None:
 
 def test_trigger_narrow_encoding_escapes_what_it_lacks() -> None:
     text = "Größe→".encode().ljust(20, b"\0")
-    answers = {**WORKING, TRIGGER: HELLO_WORLD[:-20] + text + WAITING}
+    answers = {**WORKING, TRIGGER: INSPECTING + HELLO_WORLD[:-20] + text + WAITING}
     with (
         Peer(answers) as peer,
         Process(

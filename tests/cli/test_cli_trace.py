@@ -14,6 +14,7 @@ from commandline import (
     CONNECT,
     CONNECTED,
     DISCONNECT,
+    INSPECTING,
     QUERY,
     SESSION,
     START,
@@ -33,7 +34,7 @@ CAMERA = {
     QUERY: ACTIVE_21,
     SWITCH_5: BUSY + STOPPED + SWITCHED_5,
     START: WAITING,
-    TRIGGER: RESULT_5,
+    TRIGGER: INSPECTING + RESULT_5,
 }
 
 CONVERSATION: list[tuple[str, str, dict[str, Any], bytes]] = [
@@ -51,7 +52,10 @@ CONVERSATION: list[tuple[str, str, dict[str, Any], bytes]] = [
     ("<", "SwitchAnswer", {"code": 0, "application": 5}, SWITCHED_5),
     (">", "Start", {}, START),
     ("<", "StatusReport", {"status": ["RUNNING", "WAITING_FOR_TRIGGER"], "endian": 0}, WAITING),
+    (">", "Query", {}, QUERY),  # what comes before its answer is older than the trigger
     (">", "Trigger", {}, TRIGGER),
+    ("<", "QueryAnswer", {"application": 21}, ACTIVE_21),
+    ("<", "StatusReport", {"status": ["RUNNING"], "endian": 0}, INSPECTING),
     ("<", "ResultContainer", {"application": 5, "data": "2a"}, RESULT_5),
     (">", "Disconnect", {}, DISCONNECT),
 ]

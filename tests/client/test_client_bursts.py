@@ -22,7 +22,7 @@ from smartcam import (
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
-from smartcam.connection import CHUNK_FRAMES
+from smartcam.connection import LARGEST_CHUNK
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader
 from smartcam.models import Localization
 from smartcam.protocols.machine import ResultBurst
@@ -442,7 +442,7 @@ async def test_bursts_of_many_reads_all_come_in_order() -> None:
         assert [one.value.n for one in await queued(batch)] == [*range(30_000)]
         assert [one.number for one in await queued(results)] == [*range(1, 30_001)]
         assert fates(camera) == {"streamed": 30_000}
-        assert max(sizes) <= CHUNK_FRAMES[1]
+        assert max(sizes) <= LARGEST_CHUNK
 
 
 # ---------------------------------------------------------------------- a trigger's deadline
