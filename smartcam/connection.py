@@ -13,8 +13,8 @@ import collections
 import contextlib
 import logging
 import socket
-import time
 from datetime import UTC, datetime
+from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.doorbell import Doorbell
@@ -194,7 +194,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             if rest.events:
                 self._chunks.appendleft(rest)
         if chunk.frames >= LEAST_CHUNK:
-            self._busy_since, self._busy_with = time.perf_counter(), chunk.frames
+            self._busy_since, self._busy_with = perf_counter(), chunk.frames
         if self._paused and not self._chunks:
             self._resume()
         return chunk
@@ -355,7 +355,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def _adapt(self, since: float) -> None:
         """Have the next chunks hold as much as one turn takes, by how long the last one took."""
         self._busy_since = None
-        took = time.perf_counter() - since
+        took = perf_counter() - since
         frames = int(self._busy_with * TURN / max(took, 1e-9))
         frames = max(frames, self._most // 2)  # it may have been another process
         self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))

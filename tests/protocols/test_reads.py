@@ -138,7 +138,7 @@ def test_written_bytes_give_the_frames_and_errors_of_fed_ones(
             assert (written.buffered, written.pending) == (fed.buffered, fed.pending)
             assert written.buffered <= header.size + limit
             assert len(written._store) <= most_kept
-            assert len(written._buffer) <= most_kept + LARGE
+            assert len(written.buffer) <= most_kept + LARGE
     for one in all_written:
         assert not isinstance(one, Frame) or type(one.payload) is bytes
 
