@@ -59,6 +59,7 @@ class Run:
         reached: the fence was answered: what came before is older than the trigger. True from the
             beginning where there is no fence.
         begun: Waiting for Trigger has dropped behind it.
+        over: it has dropped once more, for another inspection: what comes is that one's.
         shown: it has to drop: the camera did not wait for a trigger at the fence.
         confirmed: nothing says that it was not taken, where a status behind its answer would.
         answered: that answer has come.
@@ -66,6 +67,7 @@ class Run:
 
     reached: bool = True
     begun: bool = False
+    over: bool = False
     shown: bool = False
     confirmed: bool = True
     answered: bool = False
@@ -307,6 +309,8 @@ class Attribution:
             last.begun = True
             self.doubted = False
             return False
+        if last is not None and last.begun:
+            last.over = self._ordered
         self._satisfied = False
         self._given = None  # that run has it
         return self._ordered and previous is not None
@@ -329,7 +333,7 @@ class Attribution:
             elif number is None or pending.number is None or number == pending.number:
                 run = pending.run
                 if (
-                    run.begun
+                    (run.begun and not run.over)
                     or not self._ordered
                     or (self._drops_waiting is False and not run.shown)
                 ):

@@ -927,3 +927,13 @@ def test_number_of_any_bytes_is_a_number_or_none(data: bytes, endian: int) -> No
     else:
         order: Literal["little", "big"] = "big" if endian else "little"
         assert number == int.from_bytes(data[:2], order, signed=True)
+
+
+def test_container_behind_anothers_inspection_is_not_the_triggers_second() -> None:
+    """An inspection says everything before the next one shows; ours has said one result of two."""
+    line = shown()
+    line.trigger(wanted=2)
+    line.hear(WORKING)
+    assert line.result() == OURS
+    line.hear(READY, WORKING)
+    assert line.result().fate == "nobody"
