@@ -294,6 +294,14 @@ def validation_text(error: ValidationError) -> str:
     """Return pydantic's findings as one line: where, what was expected, what came."""
     return "; ".join(
         f"{'.'.join(str(part) for part in item['loc']) or 'value'}: {item['msg']}"
-        f" (got {item['input']!r:.80})"
+        f" (got {_shown(item['input'])})"
         for item in error.errors()
     )
+
+
+def _shown(value: object) -> str:
+    """Return a value as an error shows it; an integer may have more digits than can be written."""
+    try:
+        return f"{value!r:.80}"
+    except ValueError:
+        return f"{type(value).__name__} that is too long to be shown"

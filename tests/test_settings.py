@@ -413,5 +413,11 @@ def test_validation_text_cuts_long_input_and_names_the_whole_value() -> None:
     assert validation_text(caught.value).startswith("value: ")
 
 
+@pytest.mark.parametrize("option", ["connect_attempts", "connect_timeout", "application"])
+def test_number_with_more_digits_than_can_be_written_is_refused(option: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"{option}: .*too long to be shown"):
+        CameraSettings.make("bvs://127.0.0.1", None, {option: 10**5000})
+
+
 def test_options_are_those_of_the_settings() -> None:
     assert {*CameraOptions.__annotations__} == {*CameraSettings.model_fields} - {"address"}

@@ -148,6 +148,7 @@ _STATUS = {
     Code.STALE_STEP: 409,
     Code.NOT_POSSIBLE: 409,
     Code.IN_USE: 409,
+    Code.NOT_WRITTEN: 500,
 }
 """HTTP status by what a call is refused for; 422 for the rest."""
 
