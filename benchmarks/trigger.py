@@ -1,10 +1,17 @@
 """Trigger round trip: ``await camera.trigger()`` with five localizations, one after the other.
 
-The peer answers as a camera does: a status without Waiting for Trigger, the result, a status with
-it. They come together in one delivery, as in a burst behind a busy network, or apart, each a
-delivery of its own, as from a camera that takes its time. pymodbus reads 32 holding registers, one
-request and one delivery: that is the same work as a trigger whose answers come together. Apart, the
-bare Protocol alone takes three deliveries for its one, so there pymodbus is shown without a goal.
+smartcam sends a Query in front of each Trigger, in the same write; the yardstick's bare Protocol
+sends only the Trigger. The peer answers as a camera does: to the Query, then a status without
+Waiting for Trigger, the result, a status with it. They come together in one delivery, as in a burst
+behind a busy network, or apart, as from a camera that takes its time: the Query's answer with the
+first status, the result and the second status each a delivery of its own. pymodbus reads 32 holding
+registers, one request and one delivery: that is the same work as a trigger whose answers come
+together. Apart, the bare Protocol alone takes three deliveries for its one, so there pymodbus is
+shown without a goal.
+
+The bare Protocol is shown without a goal, too. asyncio's own ``data_received`` takes 256 KiB for
+each read, which a fresh process maps and unmaps every time: with that the yardstick is 20 to 80 us
+too dear, by how the process happens to have laid out its memory, and says little about smartcam.
 """
 
 from __future__ import annotations
@@ -42,8 +49,8 @@ SMARTCAM, BARE, PYMODBUS = "smartcam", "bare Protocol", "pymodbus"
 
 
 GOALS: dict[str, dict[str, Goal | None]] = {
-    "together": {BARE: Goal("at most", 1.7), PYMODBUS: Goal("at most", 1.0)},
-    "apart": {BARE: Goal("at most", 1.7), PYMODBUS: None},
+    "together": {BARE: None, PYMODBUS: Goal("at most", 1.0)},
+    "apart": {BARE: None, PYMODBUS: None},
 }
 
 

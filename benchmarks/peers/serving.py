@@ -11,7 +11,7 @@ from benchmarks.peers import wire
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-__all__ = ["frames", "listen"]
+__all__ = ["frames", "listen", "reads"]
 
 
 def listen(serve: Callable[[socket.socket], None]) -> None:
@@ -26,14 +26,22 @@ def listen(serve: Callable[[socket.socket], None]) -> None:
 
 def frames(client: socket.socket) -> Iterator[tuple[int, bytes]]:
     """Give message id and body of each frame until the client goes."""
+    for found in reads(client):
+        yield from found
+
+
+def reads(client: socket.socket) -> Iterator[list[tuple[int, bytes]]]:
+    """Give message ids and bodies of the frames that each read completes."""
     buffer = b""
     while data := client.recv(4096):
         buffer += data
+        found: list[tuple[int, bytes]] = []
         while len(buffer) >= wire.HEADER.size:
             _, length, message_id = wire.HEADER.unpack_from(buffer)
             end = wire.HEADER.size + length
             if len(buffer) < end:
                 break
             body, buffer = buffer[wire.HEADER.size : end], buffer[end:]
-            yield message_id, body
+            found.append((message_id, body))
+        yield found
     client.close()

@@ -1,17 +1,19 @@
 """A canned camera that answers triggers: status without Waiting, result, status with Waiting.
 
-With ``apart`` they come one by one, as a real camera's do: the next after a moment, each a delivery
-of its own. With ``together`` they are one write.
+With ``together`` all that one read asks for is one write: a Query in front of the trigger is
+answered in it, too. With ``apart`` it is answered with the first status; the result and the second
+status come one by one, as a real camera's do: each after a moment, a delivery of its own.
 """
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 from typing import TYPE_CHECKING
 
 from benchmarks.peers import wire
-from benchmarks.peers.serving import frames, listen
+from benchmarks.peers.serving import listen, reads
 
 if TYPE_CHECKING:
     import socket
@@ -34,11 +36,12 @@ def main() -> None:
         answers = {message_id: [b"".join(parts)] for message_id, parts in ANSWERS.items()}
 
     def serve(client: socket.socket) -> None:
-        for message_id, _ in frames(client):
-            for number, answer in enumerate(answers.get(message_id, ())):
+        for asked in reads(client):
+            parts = [answers.get(message_id, []) for message_id, _ in asked]
+            for number, said in enumerate(itertools.zip_longest(*parts, fillvalue=b"")):
                 if number:
                     time.sleep(PAUSE)
-                client.sendall(answer)
+                client.sendall(b"".join(said))
 
     listen(serve)
 
