@@ -38,7 +38,7 @@ def run(plan: Plan) -> Iterable[Comparison]:
     with peer("stream") as port:
         series = asyncio.run(_measure(plan, port))
     for name, case, least in (
-        (ITEMS, "async for, item by item", 0.35),
+        (ITEMS, "async for, item by item", 0.9),
         (BATCHES, "async for, batch=True", 1.0),
     ):
         subject = series[name]
