@@ -65,6 +65,7 @@ LIMITS = (
     "protocols.framing.MOST_READ",
     "protocols.framing.LEAST_READ",
     "protocols.machine.MANY_EVENTS",
+    "protocols.machine.MANY_FRAMES",
     "protocols.framed.MAX_SURPLUS",
     "protocols.framed.MAX_KNOWN",
     "protocols.unfinished.FRAME_TIME",

@@ -48,6 +48,10 @@ MANY_EVENTS = 64
 """Events of one read beyond which the next one takes fewer bytes: cutting frames, and making
 messages of them, must not hold up other cameras."""
 
+MANY_FRAMES = 256
+"""Frames of one read beyond which it is the same, though they be one burst of results: more than
+the receive task takes in a turn, so that reading would have to pause after each."""
+
 
 class State(enum.Enum):
     """Where a link is."""
@@ -423,8 +427,10 @@ class Machine:
         self.counters.bytes_received += count
         cut = self._framer.filled(count)
         if cut:
+            before = self.counters.frames_received
             self._receive_frames()
-            if len(self._events) > MANY_EVENTS:
+            came = self.counters.frames_received - before
+            if came > MANY_FRAMES or len(self._events) > MANY_EVENTS:
                 self._framer.read_less()
         if self._bounded and self._framer.buffered:
             number = self.counters.frames_received

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from machines import DIALECTS, client, label, one_by_one
 
 from smartcam.exceptions import FrameError, MessageError
-from smartcam.protocols import framing
+from smartcam.models import Status
+from smartcam.protocols import framing, machine
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Policy
 from smartcam.protocols.bvs import HANDBOOK, THESIS
@@ -303,3 +304,28 @@ def test_bursts_are_the_containers_that_come_one_by_one(
     frames = [what for _, what in traced if isinstance(what, Frame)]
     assert len(frames) == looked_at.counters.frames_received - 1  # and the answer to Connect
     assert stream.startswith(b"".join(map(dialect.encode_frame, frames)))
+
+
+SMALL = m.ResultContainer(application=5, data=bytes(40))
+STATUS = m.StatusReport(status=Status.RUNNING)
+
+
+@pytest.mark.parametrize(
+    ("message", "most"),
+    [(SMALL, machine.MANY_FRAMES), (STATUS, machine.MANY_EVENTS)],
+    ids=["results", "statuses"],
+)
+def test_reads_shrink_until_they_have_no_more_frames_than_one_turn_takes(
+    message: m.Message, most: int
+) -> None:
+    made, frame = client(HANDBOOK), HANDBOOK.encode(message)
+    stream, counts = frame * 20_000, list[int]()
+    while stream:
+        before = made.counters.frames_received
+        stream = stream[read_into(made, stream, 1 << 30) :]
+        counts.append(made.counters.frames_received - before)
+        made.events()
+    grown = framing.MOST_READ.bit_length()
+    assert max(counts[:grown]) > most
+    assert most // 4 < max(counts[grown:]) <= most
+    assert len(made.room()) < framing.MOST_READ
