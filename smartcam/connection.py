@@ -14,7 +14,7 @@ import contextlib
 import logging
 import socket
 from datetime import UTC, datetime
-from time import perf_counter
+from time import thread_time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.doorbell import Doorbell
@@ -41,9 +41,9 @@ results can be told has to wait itself."""
 MAX_DATAGRAMS = 256
 """Datagrams that wait for it, where one is normal; beyond this they are dropped and counted."""
 
-TURN = 0.00015
-"""Seconds that the receive task takes in one turn of the event loop, about: from how long a chunk
-took follows how much the next one holds."""
+TURN = 0.0002
+"""Seconds of the processor that the receive task takes in one turn of the event loop, about: from
+how long a chunk took follows how much the next one holds."""
 
 LEAST_CHUNK = 8
 """Frames of a chunk that are worth to be cut."""
@@ -51,7 +51,7 @@ LEAST_CHUNK = 8
 FIRST_CHUNK = 64
 """Frames of a chunk as long as it is not known how long they take."""
 
-LARGEST_CHUNK = 256
+LARGEST_CHUNK = 512
 """Frames of a chunk, however fast they are worked off: the next ones may take longer."""
 
 MAX_REST = 256
@@ -194,7 +194,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             if rest.events:
                 self._chunks.appendleft(rest)
         if chunk.frames >= LEAST_CHUNK:
-            self._busy_since, self._busy_with = perf_counter(), chunk.frames
+            self._busy_since, self._busy_with = thread_time(), chunk.frames
         if self._paused and not self._chunks:
             self._resume()
         return chunk
@@ -355,9 +355,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def _adapt(self, since: float) -> None:
         """Have the next chunks hold as much as one turn takes, by how long the last one took."""
         self._busy_since = None
-        took = perf_counter() - since
+        took = thread_time() - since
         frames = int(self._busy_with * TURN / max(took, 1e-9))
-        frames = max(frames, self._most // 2)  # it may have been another process
+        frames = max(frames, self._most // 2)  # once is no rule
         self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
 
     def _resume(self) -> None:

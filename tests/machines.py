@@ -153,7 +153,7 @@ def one_by_one(events: list[Event]) -> list[Event]:
     spread: list[Event] = []
     for event in events:
         if isinstance(event, ResultBurst):
-            assert len(event.data) > 1
+            assert event.data
             spread += event
         else:
             spread.append(event)

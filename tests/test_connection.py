@@ -221,7 +221,7 @@ async def test_chunk_is_as_large_as_a_turn_takes(
     server: Listener, took: float, frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr(connection, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(connection, "thread_time", lambda: now[0])
     link, peer = await session(server)
     await deliver(link, peer, RESULT * 150)
     assert (await link.receive()).frames == connection.FIRST_CHUNK

@@ -48,7 +48,7 @@ MANY_EVENTS = 64
 """Events of one read beyond which the next one takes fewer bytes: cutting frames, and making
 messages of them, must not hold up other cameras."""
 
-MANY_FRAMES = 256
+MANY_FRAMES = 512
 """Frames of one read beyond which it is the same, though they be one burst of results: more than
 the receive task takes in a turn, so that reading would have to pause after each."""
 
@@ -151,7 +151,7 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultBurst:
-    """Two or more result containers of one application, one right after the other.
+    """Result containers of one application, one right after the other; two at least when it is made.
 
     The client's machine gives it for containers that came in one delivery, so that a camera that
     runs free costs no object for each. Iterating gives them one by one.

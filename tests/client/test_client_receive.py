@@ -12,6 +12,7 @@ from handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scrip
 
 import smartcam
 from smartcam import InterpretationError, Status, handshake
+from smartcam.connection import LARGEST_CHUNK
 from smartcam.observers import Observer
 
 if TYPE_CHECKING:
@@ -206,6 +207,5 @@ async def test_flood_of_statuses_leaves_others_their_turns() -> None:
             while camera.statistics().frames_received < heard + 10_000:  # noqa: ASYNC110
                 await asyncio.sleep(0)
         counting.cancel()
-        # at most 256 frames in a turn, and at most 64 or so in a read once that was noticed
-        assert turns > 10_000 / 256
+        assert turns > 10_000 / LARGEST_CHUNK
         await until(lambda: camera.status == Status(READY))
