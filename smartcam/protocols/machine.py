@@ -151,7 +151,7 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultBurst:
-    """Result containers of one application, one right after the other; two at least when it is made.
+    """Result containers of one application, one right after the other; two or more as they come.
 
     The client's machine gives it for containers that came in one delivery, so that a camera that
     runs free costs no object for each. Iterating gives them one by one.
