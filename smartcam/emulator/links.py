@@ -258,7 +258,7 @@ class _TcpLink(Link, asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self.peer = _peer_text(transport.get_extra_info("peername"))
+        self.peer: str = _peer_text(transport.get_extra_info("peername"))
         if self._listener.down:
             self.close("the camera is down")
             return
@@ -361,6 +361,11 @@ class Listener(ABC):
     def __init__(self) -> None:
         self.crowded_out: int = 0
 
+    def crowd_out(self, link: Link, why: str) -> None:
+        """Close a link to make room for a newcomer."""
+        self.crowded_out += 1
+        link.close(why)
+
     @property
     @abstractmethod
     def all_links(self) -> list[Link]:
@@ -430,9 +435,9 @@ class TcpListener(Listener):
         """Take a new connection; where there are too many, another one makes room."""
         self.links[link] = None
         if len(self.links) > MAX_LINKS:
-            self.crowded_out += 1
             one = next(one for one in self.links if not self._station.serves(one))
-            one.close(f"{MAX_LINKS} others are open, it was without a session for longest")
+            why = f"{MAX_LINKS} others are open, it was without a session for longest"
+            self.crowd_out(one, why)
 
 
 # ---------------------------------------------------------------------- UDP
@@ -533,8 +538,8 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         link = self.links.pop(addr, None) or _UdpLink(self, self._station, addr)
         self.links[addr] = link
         if len(self.links) > MAX_LINKS:
-            self.crowded_out += 1
-            next(old for old in self.all_links if not self._station.serves(old)).close("idle")
+            old = next(old for old in self.all_links if not self._station.serves(old))
+            self.crowd_out(old, "idle")
         link.datagram_received(data)
 
     def error_received(self, exc: Exception) -> None:
