@@ -509,7 +509,9 @@ async def test_establish_first_round_is_short_and_later_ones_share_the_rest(
     monkeypatch.setattr(handshake, "DETECTION_SHARE", 0.02)
     error = await failure_with(silent, query="", connect_timeout=0.7, connect_attempts=2)
     waited = [text.rpartition(" for ")[2] for text in error.attempts]
-    assert waited == ["0.0 s", "0.0 s", "0.0 s", "0.2 s", "0.2 s", "0.2 s"]
+    seconds = [float(text.removesuffix(" s")) for text in waited]
+    assert len(seconds) == 6
+    assert max(seconds[:3]) < min(seconds[3:])  # 0.02 and 0.2, and what a loaded machine adds
 
 
 # ---------------------------------------------------------------------- cancelling
