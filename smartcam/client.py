@@ -432,7 +432,8 @@ class SmartCamera:
         caller waits its turn, within its own ``timeout``. A trigger is never sent twice.
 
         Where the layout has an ``@sequence`` field, the run's number is set right before the
-        trigger, and only the container that carries it is the result. Otherwise, over TCP, an
+        trigger, and only the container that carries it is the result. Otherwise, over TCP, a Query
+        goes out in front of the trigger: what comes before its answer is older. An
         earlier trigger that was given up is settled first: its result is awaited a moment, or made
         impossible (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP without
         ``@sequence`` a late result can pass for the next one's: nothing on the wire tells.
