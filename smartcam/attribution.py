@@ -59,7 +59,7 @@ class Run:
         reached: the fence was answered: what came before is older than the trigger. True from the
             beginning where there is no fence.
         begun: Waiting for Trigger has dropped behind it.
-        over: it has dropped once more, for another inspection: what comes is that one's.
+        over: it has dropped once more, for another inspection: what has no number is that one's.
         shown: it has to drop: the camera did not wait for a trigger at the fence.
         confirmed: nothing says that it was not taken, where a status behind its answer would.
         answered: that answer has come.
@@ -332,8 +332,9 @@ class Attribution:
                     return OURS
             elif number is None or pending.number is None or number == pending.number:
                 run = pending.run
+                known = number is not None and pending.number is not None
                 if (
-                    (run.begun and not run.over)
+                    (run.begun and (known or not run.over))
                     or not self._ordered
                     or (self._drops_waiting is False and not run.shown)
                 ):

@@ -593,6 +593,16 @@ def test_container_with_a_number_that_others_may_have_is_its_own_behind_the_drop
     assert line.result(41) == OURS
 
 
+def test_container_with_a_number_that_others_may_have_is_its_own_behind_a_sensors_run() -> None:
+    """The sensor's began between our Query and our Trigger, and was over by the Trigger."""
+    line = shown()
+    line.trigger(41)
+    line.hear(WORKING, READY)  # the sensor's
+    assert line.result(7) == NOBODY
+    line.hear(WORKING)
+    assert line.result(41) == OURS
+
+
 def test_container_with_a_number_that_others_may_have_is_held_where_nothing_is_known() -> None:
     line = ready()
     line.trigger(41)
