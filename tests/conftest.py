@@ -1,4 +1,4 @@
-"""Hypothesis profiles, and the check that no test leaves a task or an open transport behind."""
+"""Hypothesis' profiles, the event loop of the tests, and the check that none leaves anything open."""
 
 from __future__ import annotations
 
@@ -9,14 +9,35 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
+from timed_loop import TimedLoop
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
 settings.register_profile("quick", deadline=None, max_examples=10)
 settings.register_profile("ci", deadline=None, max_examples=50, derandomize=True)
 settings.register_profile("nightly", deadline=None, max_examples=2000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+def pytest_asyncio_loop_factories(
+    item: pytest.Item,
+) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Give asynchronous tests a loop on a time of its own, those marked ``real_time`` the usual."""
+    if item.get_closest_marker("real_time"):
+        return {"real": asyncio.SelectorEventLoop}
+    return {"timed": TimedLoop}
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Run side by side where there are cores, a single file or test without the workers' start."""
+    single = len(config.args) == 1 and ".py" in config.args[0]
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
+    return 0 if single or cores == 1 else cores
+
 
 GRACE_STEPS = 100
 """Loop steps that what was cancelled or aborted gets to end itself."""

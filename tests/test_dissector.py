@@ -385,6 +385,7 @@ async def use(emulator: EmulatedCamera) -> None:
 
 @needs_tshark
 @pytest.mark.skipif(shutil.which("dumpcap") is None, reason="needs Wireshark's dumpcap")
+@pytest.mark.real_time
 async def test_captured_sessions_are_shown_as_the_camera_saw_them(
     lua: Path, tmp_path: Path
 ) -> None:

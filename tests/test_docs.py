@@ -1,5 +1,7 @@
 """The documents: their examples run, their tables are complete, every page is in the contents.
 
+pytestmark = pytest.mark.long
+
 ``python`` blocks run as scripts of their own. ``console`` blocks run line by line, each block with
 an emulator of its own unless it starts one; what they show must be what is printed, numbers aside.
 A block of any language whose first line is ``# NAME.EXTENSION`` is a file, which the page's

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import asyncio
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
@@ -158,8 +158,9 @@ class EmulatorSite:
             raise RefusedError(503, f"waiting call {MAX_WAITING + 1}", f"{MAX_WAITING} at one time")
         self._waiting += 1
         try:
-            deadline = time.monotonic() + seconds
-            while time.monotonic() < deadline and is_open(request) and not condition():
+            loop = asyncio.get_running_loop()
+            deadline = loop.time() + seconds
+            while loop.time() < deadline and is_open(request) and not condition():
                 if await self.pause(LOOK_AGAIN):
                     break
         finally:

@@ -164,6 +164,7 @@ def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_says_so(
     )
 
 
+@pytest.mark.real_time
 async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
     tmp_path: Path, files: list[str]
 ) -> None:

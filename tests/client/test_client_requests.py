@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +24,7 @@ from camera_by_hand import (
     words,
 )
 from clientkit import SHORT, by_hand, cancelled, emulated, steps, until
+from timed_loop import spend
 
 import smartcam
 from smartcam import (
@@ -391,7 +391,7 @@ class _SlowWatcher(smartcam.Observer):
 
     def on_state(self, event: smartcam.CameraEvent) -> None:
         if isinstance(event, smartcam.ApplicationChanged) and event.previous is not None:
-            time.sleep(3 * SHORT)
+            spend(3 * SHORT)
 
 
 async def test_owed_answer_and_another_question_before_its_waiter_wakes() -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 from worlds import BVS_WORLDS, INSIGHT_WORLDS
 
 from smartcam.testing.protocols import CameraSuite
+
+pytestmark = pytest.mark.long
 
 
 class TestBvs(CameraSuite):

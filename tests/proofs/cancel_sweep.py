@@ -20,9 +20,13 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from client_model import TimedLoop
+if __name__ == "__main__":  # the loop is the tests', too
+    sys.path.append(str(Path(__file__).parent.parent))
+
+from timed_loop import TimedLoop
 
 import smartcam
 from smartcam import Backoff, LinkError, ResponseTimeoutError, SmartCamera, Status
@@ -449,7 +453,7 @@ def run_sweep(name: str, wire: Wire, every: int = 1) -> Sweep:
         range(0, MOST_STEPS, every), (RESULTS_FIRST, STATE_FIRST)
     ):
         try:
-            with asyncio.Runner(loop_factory=lambda: TimedLoop(STEP)) as runner:
+            with asyncio.Runner(loop_factory=lambda: TimedLoop(turn=STEP)) as runner:
                 end = runner.run(_cancelled_after(steps, CALLS[name], wire, checks))
         except BaseException as exc:
             first = checks[0].__name__

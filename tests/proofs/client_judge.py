@@ -10,7 +10,8 @@ import contextvars
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from client_model import CameraModel, Program, TimedLoop
+from client_model import CameraModel, Program
+from timed_loop import TimedLoop
 
 import smartcam
 from smartcam import (
@@ -170,7 +171,7 @@ class ClientJudge:
     numbered: ClassVar[bool] = False
 
     def __init__(self) -> None:
-        self.runner = asyncio.Runner(loop_factory=TimedLoop)
+        self.runner = asyncio.Runner(loop_factory=lambda: TimedLoop(turn=0.0))
         self.loop = self.runner.get_loop()
         self.calls: list[Call] = []
         self.count = 0

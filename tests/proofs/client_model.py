@@ -1,15 +1,12 @@
-"""What the proofs about the asyncio client share: a loop on a time of its own, a plain camera.
+"""What the proofs about the asyncio client share: a plain camera.
 
-:class:`TimedLoop` has real sockets and no real time: where nothing is left to do it goes straight
-to the next timer. :class:`CameraModel` is written from the protocol's description, not from the
+:class:`CameraModel` is written from the protocol's description, not from the
 emulator: it is told what clients and operators did and when, and says which inspections there were,
 who triggered each, and what became of it.
 """
 
 from __future__ import annotations
 
-import asyncio
-import selectors
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -18,53 +15,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from smartcam.emulator.traffic import Log, LogEntry
 
-__all__ = ["CameraModel", "Program", "Run", "TimedLoop"]
-
-# ---------------------------------------------------------------------- time
-
-GRACE = 0.001
-"""Real seconds that sockets get before the time goes on: what was written to the loopback is there
-at once, unless the machine is very busy."""
-
-STUCK = 5.0
-"""Real seconds after which a loop without a timer counts as stuck: only a thread can wake it."""
-
-
-class _TimedSelector(selectors.DefaultSelector):
-    """Waits for sockets in real time, and for timers not at all."""
-
-    def __init__(self, step: float) -> None:
-        super().__init__()
-        self.now = 0.0
-        self._step = step
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        if timeout is not None and timeout <= 0:
-            self.now += self._step
-            return super().select(0)
-        ready = super().select(STUCK if timeout is None else GRACE)
-        if not ready and timeout is None:
-            raise RuntimeError("the loop waits for nothing that could ever happen")
-        if not ready and timeout is not None:
-            self.now += timeout
-        return ready
-
-
-class TimedLoop(asyncio.SelectorEventLoop):
-    """An event loop whose time moves only where it would wait.
-
-    Args:
-        step: seconds that each busy turn of the loop takes besides; 0 for none.
-    """
-
-    def __init__(self, step: float = 0.0) -> None:
-        self._timed = _TimedSelector(step)
-        super().__init__(self._timed)
-
-    def time(self) -> float:
-        """Return the loop's time, seconds since it was made."""
-        return self._timed.now
-
+__all__ = ["CameraModel", "Program", "Run"]
 
 # ---------------------------------------------------------------------- the camera
 

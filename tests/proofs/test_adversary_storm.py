@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import adversary_storm
+import pytest
 from adversary_storm import VARIANTS
 
-if TYPE_CHECKING:
-    import pytest
+pytestmark = pytest.mark.long
 
 CALLS = 100
 SEED = 1

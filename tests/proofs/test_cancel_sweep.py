@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from cancel_sweep import CALLS, ID, SMART, WIRES, Wire, calls_over, missing_calls, run_sweep
 
+pytestmark = pytest.mark.long
+
 STRIDE = 5
 """Steps between two cancellations; the long form has every one."""
 

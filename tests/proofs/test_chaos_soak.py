@@ -5,17 +5,16 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 from random import Random
-from typing import TYPE_CHECKING
 
 import chaos_soak
+import pytest
 from chaos_ledger import NOBODY, RECORD, Ledger
 from chaos_station import Station, TellingEmulator, Watch
 
 from smartcam.emulator import EmulatedCamera
 from smartcam.protocols import messages as m
 
-if TYPE_CHECKING:
-    import pytest
+pytestmark = pytest.mark.long
 
 SEED = 1
 

@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 STRIDE = 260
 """Of some 49,000 cells; the short form takes seconds."""
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="link proxies need add_reader")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(sys.platform == "win32", reason="link proxies need add_reader"),
+]
 
 TCP = World("handbook", "tcp", numbered=True)
 BID = World("bid", "tcp", numbered=False)

@@ -16,6 +16,8 @@ from smartcam.models import Status
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+pytestmark = pytest.mark.long
+
 CALLS = 150
 SEED = 1
 

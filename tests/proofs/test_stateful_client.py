@@ -1,5 +1,7 @@
 """A real client and the emulated camera over the loopback in any history, against a plain model.
 
+pytestmark = pytest.mark.long
+
 Long form: ``HYPOTHESIS_PROFILE=nightly pytest tests/proofs/test_stateful_client.py``.
 
 The rules start calls of the client, meddle as an operator, cut links and let time pass, and look at

@@ -26,6 +26,8 @@ from smartcam.testing.clients import (
 )
 from smartcam.testing.clients.scenes import EVERY_DIALECT
 
+pytestmark = [pytest.mark.long, pytest.mark.real_time]
+
 HERE = Path(__file__).parent
 AT_ONCE = 24
 """Tasks that are done side by side: most of them wait for something that never comes."""

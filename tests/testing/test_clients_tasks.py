@@ -12,6 +12,8 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.testing.clients import CommandClient, FunctionClient, Outcome, Task
 from smartcam.testing.clients.tasks import read_results
 
+pytestmark = pytest.mark.real_time
+
 TASK = Task(
     verb="switch",
     number=3,

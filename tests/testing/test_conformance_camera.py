@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from smartcam.testing.conformance import Report
     from smartcam.testing.threads import LoopThread
 
+pytestmark = pytest.mark.long
+
 FAST = {"reboot_time": 0.2}
 
 IMPATIENT = {"timeout": 0.4}

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from smartcam.testing.threads import LoopThread
 
+pytestmark = pytest.mark.long
+
 pytest_plugins = ["pytester"]
 
 PLUGINS = ("-p", "no:cacheprovider", "-p", "no:asyncio")

@@ -17,6 +17,8 @@ from smartcam.testing.threads import ThreadedCamera
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+pytestmark = pytest.mark.real_time
+
 CONNECT = bytes.fromhex("50535642 00000000 01000000")
 DISCONNECT = bytes.fromhex("50535642 00000000 02000000")
 QUERY = bytes.fromhex("50535642 00000000 30000000")

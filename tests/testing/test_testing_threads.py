@@ -19,6 +19,8 @@ from smartcam.testing.threads import LoopThread, ThreadedCamera, ThreadedFleet
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+pytestmark = pytest.mark.real_time
+
 CONNECT = bytes.fromhex("50535642 00000000 01000000")
 CONNECTED = bytes.fromhex("50535642 04000000 01000000 01000000")
 

@@ -57,6 +57,7 @@ def curl_lacks() -> str:
 
 
 @pytest.mark.skipif(bool(curl_lacks()), reason=curl_lacks())
+@pytest.mark.real_time
 async def test_curl_lines_are_answered() -> None:
     assert len(CURL) > 20
     lacking: list[str] = []

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 playwright = pytest.importorskip("playwright.async_api")
 
 pytestmark = [
+    pytest.mark.long,
+    pytest.mark.real_time,
     pytest.mark.asyncio(loop_scope="module"),
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path, nor named by CHROMIUM"),
 ]
