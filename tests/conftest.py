@@ -1,4 +1,4 @@
-"""Hypothesis' profiles, the event loop of the tests, and the check that none leaves anything open."""
+"""Profiles of Hypothesis, the event loop of the tests, and the check that none leaves anything."""
 
 from __future__ import annotations
 
