@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import random
 import socket
-import time
 from collections import Counter, deque
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -85,7 +84,7 @@ class Watch:
 
     def lag_since(self, begun: float) -> float:
         """Return how long the loop was late since then, all in all, seconds."""
-        lost = max(0.0, time.monotonic() - max(self._due, begun))
+        lost = max(0.0, asyncio.get_running_loop().time() - max(self._due, begun))
         for at, lag in reversed(self.lags):
             if at < begun:
                 break
@@ -95,9 +94,9 @@ class Watch:
     async def measure_lag(self, step: float = 0.01) -> None:
         """Note how late timers are; for ever."""
         while True:
-            self._due = time.monotonic() + step
+            self._due = asyncio.get_running_loop().time() + step
             await asyncio.sleep(step)
-            now = time.monotonic()
+            now = asyncio.get_running_loop().time()
             self.lags.append((now, now - self._due))
             self.longest_lag = max(self.longest_lag, now - self._due)
 
@@ -419,10 +418,10 @@ class Station:
         self, what: str, waiting: Awaitable[object], bound: float
     ) -> BaseException | None:
         """Await something; return its error. It must end in time, and by an error of ours."""
-        begun = time.monotonic()
+        begun = asyncio.get_running_loop().time()
         task = asyncio.ensure_future(waiting)
         await asyncio.wait({task}, timeout=bound + 10)
-        over = time.monotonic() - begun - bound
+        over = asyncio.get_running_loop().time() - begun - bound
         if not task.done():
             self._complain(f"{what} hangs: {task}")
             task.cancel()
