@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import asyncio
 import struct
-import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
@@ -176,7 +175,7 @@ class Run:
         trigger: which Trigger message of that session began it, :data:`SENSOR` for none.
         application: that made it.
         number: its sequence number.
-        began: when, as ``time.perf_counter()`` says.
+        began: when, as the loop says.
         steps: what it has still to say.
     """
 
@@ -404,7 +403,14 @@ class LineCamera:
             _cancel(earlier.timer)
             self._go_on(earlier)
         index = len(self.runs) + 1
-        run = Run(index, self.sessions, trigger, self._active, self._number, time.perf_counter())
+        run = Run(
+            index,
+            self.sessions,
+            trigger,
+            self._active,
+            self._number,
+            asyncio.get_running_loop().time(),
+        )
         self.runs[index] = run
         self._number = (self._number + 1) & 0xFFFFFFFF
         self._waiting = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +20,7 @@ class Sending(NamedTuple):
     Attributes:
         session: in which, counted from 1 by the Connects that were sent.
         trigger: which of that session, from 1.
-        at: when, as ``time.perf_counter()`` says.
+        at: when, as the loop says.
     """
 
     session: int
@@ -65,7 +64,7 @@ class TriggerEar(Observer):
             self._in_session += 1
             task = asyncio.current_task()
             assert task is not None
-            sending = Sending(self.session, self._in_session, time.perf_counter())
+            sending = Sending(self.session, self._in_session, asyncio.get_running_loop().time())
             self.sendings.setdefault(task, []).append(sending)
             if self.at_trigger is not None:
                 self.at_trigger(task)

@@ -33,8 +33,8 @@ async def test_storm_of_late_results_gives_no_trigger_another_ones_result(
     for one in done:
         assert one.outcomes["result"] > one.calls / 20, one.variant.name
         # loading an application after each trigger whose input is in doubt pays the debts
-        fewest = 50 if one.variant.habits.reads_input else 20
-        assert one.late > one.calls / fewest, one.variant.name
+        fewest = 0.0 if one.variant.habits.reads_input else one.calls / 20
+        assert one.late > fewest, one.variant.name
 
 
 async def test_storm_where_nothing_is_promised_counts_wrong_results() -> None:
