@@ -30,13 +30,13 @@ def pytest_asyncio_loop_factories(
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Run side by side where there are cores, a single file or test without the workers' start."""
-    single = len(config.args) == 1 and ".py" in config.args[0]
+    """Run side by side where there are cores; a few files or tests not, for their start is dear."""
+    few = len(config.args) <= 3 and all(".py" in one for one in config.args)
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    return 0 if single or cores == 1 else cores
+    return 0 if few or cores == 1 else cores
 
 
 GRACE_STEPS = 100
