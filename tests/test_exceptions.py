@@ -8,6 +8,7 @@ import pickle
 from typing import Any
 
 import pytest
+from grids import over
 
 from smartcam import exceptions as e
 
@@ -81,7 +82,7 @@ SPECIAL: dict[tuple[type[Exception], str], Any] = {
     (e.CalibrationError, "code"): "",
 }
 
-each_error = pytest.mark.parametrize("kind", TREE, ids=lambda one: one.__name__)
+each_error = over("kind", TREE, lambda one: one.__name__)
 
 
 def public_errors() -> set[type]:
@@ -113,7 +114,7 @@ def test_error_with_a_text_only_has_default_attributes(kind: type[Exception]) ->
 
 
 @each_error
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@over("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_error_survives_pickle_with_its_attributes(kind: type[Exception], protocol: int) -> None:
     error = kind("what happened", **ATTRIBUTES.get(kind, {}))
     error.add_note("seen at night")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
+from grids import over
 from machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, EVERYTHING, EXAMPLES, NO_ID, label
 
 from smartcam.exceptions import (
@@ -24,7 +25,7 @@ CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
 KNOWN = [(dialect, message) for dialect, message in EVERYTHING if message is not EXAMPLES[-1]]
 
 each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
-each_message = pytest.mark.parametrize(("dialect", "message"), KNOWN, ids=label)
+each_message = over("dialect, message", KNOWN, label)
 
 WITHOUT_SWITCH = dataclasses.replace(
     HANDBOOK,
@@ -44,7 +45,7 @@ def test_message_type_and_id_are_each_others_inverse(dialect: FramedDialect) -> 
         assert dialect.has(row.type)
 
 
-@pytest.mark.parametrize(("dialect", "message"), EVERYTHING, ids=label)
+@over("dialect, message", EVERYTHING, label)
 def test_message_id_is_the_frames(dialect: FramedDialect, message: m.Message) -> None:
     assert dialect.message_id(message) == dialect.to_frame(message).message_id
 
@@ -60,9 +61,9 @@ def test_message_type_unknown_id_or_wrong_sender_is_an_unknown_message() -> None
     assert BID.knows(CAMERA, 0x40)
 
 
-@pytest.mark.parametrize("dialect", [HANDBOOK, THESIS, B16, CODE], ids=label)
-@pytest.mark.parametrize(
-    ("request_id", "answer_id"),
+@over("dialect", [HANDBOOK, THESIS, B16, CODE], label)
+@over(
+    "request_id, answer_id",
     [(0x01, 0x01), (0x30, 0x30), (0x31, 0x31), (0x32, 0x32)]
     + [(silent, None) for silent in (0x02, 0x33, 0x34, 0x35, 0x40, 0x41, 0x42, 0x43)]
     + [(0x77, 0x77)],
@@ -163,10 +164,10 @@ def test_encode_message_that_the_dialect_lacks_is_unsupported() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("dialect", "message"),
+@over(
+    "dialect, message",
     [(dialect, one) for dialect in DIALECTS for one in EXAMPLES[:-1] if not dialect.has(type(one))],
-    ids=label,
+    label,
 )
 def test_every_message_that_a_dialect_lacks_is_unsupported_by_name(
     dialect: FramedDialect, message: m.Message

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
+from grids import over
 from hypothesis import given
 from hypothesis import strategies as st
 from machines import BIG_ENDIAN_NUMBER, DIALECTS, EVERYTHING, EXAMPLES, label
@@ -69,9 +70,7 @@ def test_view_fields_unknown_id_is_one_payload() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("dialect", "message"), [one for one in EVERYTHING if one[1] is not EXAMPLES[-1]], ids=label
-)
+@over("dialect, message", [one for one in EVERYTHING if one[1] is not EXAMPLES[-1]], label)
 def test_view_fields_cover_every_byte_in_order(dialect: FramedDialect, message: m.Message) -> None:
     data = dialect.encode(message)
     views = view_fields(dialect, message.sender, data)

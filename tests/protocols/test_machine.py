@@ -7,6 +7,7 @@ import struct
 from typing import TYPE_CHECKING
 
 import pytest
+from grids import over
 from machines import (
     BIG_ENDIAN_NUMBER,
     CODE,
@@ -65,7 +66,7 @@ KIN = (B16, BID, CODE)
 BID_OR_CODE = (BID, CODE)
 
 each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
-each_state = pytest.mark.parametrize("state", State)
+each_state = over("state", State)
 each_transport = pytest.mark.parametrize("transport", Transport)
 
 
@@ -125,9 +126,7 @@ def test_transitions_every_message_has_a_place() -> None:
 
 
 @each_state
-@pytest.mark.parametrize(
-    ("dialect", "message"), [*EVERYTHING, *((one, MALFORMED) for one in DIALECTS)], ids=label
-)
+@over("dialect, message", [*EVERYTHING, *((one, MALFORMED) for one in DIALECTS)], label)
 @pytest.mark.parametrize("role", Role)
 def test_send_in_every_state_follows_the_table_or_changes_nothing(
     role: Role, dialect: FramedDialect, message: m.Message, state: State
@@ -148,10 +147,10 @@ def test_send_in_every_state_follows_the_table_or_changes_nothing(
     assert (made.state, made.data_to_send(), made.counters) == (state, [], Counters())
 
 
-@pytest.mark.parametrize(
-    ("dialect", "message"),
+@over(
+    "dialect, message",
     [(dialect, one) for dialect in DIALECTS for one in EXAMPLES[:-1] if not dialect.has(type(one))],
-    ids=label,
+    label,
 )
 def test_send_what_the_dialect_lacks_is_unsupported_and_changes_nothing(
     dialect: FramedDialect, message: m.Message
@@ -165,14 +164,15 @@ def test_send_what_the_dialect_lacks_is_unsupported_and_changes_nothing(
 
 @each_state
 @each_transport
-@pytest.mark.parametrize(
-    ("role", "dialect", "message"),
+@over(
+    "role, dialect, message",
     [
-        pytest.param(role, dialect, one, id=f"{role.value}-{label(dialect)}-{label(one)}")
+        (role, dialect, one)
         for role in Role
         for dialect, one in EVERYTHING
         if getattr(one, "sender", role.receives) is role.receives
     ],
+    label,
 )
 def test_receive_in_every_state_follows_the_table_or_the_policy(
     role: Role, transport: Transport, dialect: FramedDialect, message: m.Message, state: State

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from grids import over
 from machines import DIALECTS, camera, client, label
 
 from smartcam.exceptions import FrameError
@@ -62,9 +63,7 @@ def large(dialect: FramedDialect) -> int:
 # ---------------------------------------------------------------------- its length
 
 
-@pytest.mark.parametrize(
-    ("dialect", "number", "lengths"), FIXED, ids=[f"{d.label} {n:#04x}" for d, n, _ in FIXED]
-)
+@over("dialect, number, lengths", FIXED)
 def test_length_far_beyond_the_documented_one_is_refused_at_the_header(
     dialect: FramedDialect, number: int, lengths: range
 ) -> None:

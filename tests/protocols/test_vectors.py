@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
+from grids import over
 from machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, NO_ID, camera, client, feed, receiver_of
 
 from smartcam.models import Status
@@ -84,9 +85,7 @@ def read_vector(dialect: FramedDialect, row: dict[str, Any]) -> Vector:
 
 VECTORS = [vector for name in FILES for vector in read_vectors(name)]
 
-each_vector = pytest.mark.parametrize(
-    "vector", VECTORS, ids=[f"{one.dialect.label}: {one.name}" for one in VECTORS]
-)
+each_vector = over("vector", VECTORS, lambda one: f"{one.dialect.label}: {one.name}")
 each_file = pytest.mark.parametrize("name", FILES)
 
 
