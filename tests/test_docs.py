@@ -1,7 +1,5 @@
 """The documents: their examples run, their tables are complete, every page is in the contents.
 
-pytestmark = pytest.mark.long
-
 ``python`` blocks run as scripts of their own. ``console`` blocks run line by line, each block with
 an emulator of its own unless it starts one; what they show must be what is printed, numbers aside.
 A block of any language whose first line is ``# NAME.EXTENSION`` is a file, which the page's
@@ -35,6 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from smartcam.protocols.framed import FramedDialect
+
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -31,7 +31,7 @@ ROOT = Path(__file__).parent.parent.parent
 TAKEN = ("smartcam", "tests", "examples", "docs", "pyproject.toml", "README.md")
 """What a copy of the tree has."""
 
-LONGEST = 600.0
+LONGEST = 200.0
 """Seconds that the tests of one mutant may take: one that hangs is noticed."""
 
 

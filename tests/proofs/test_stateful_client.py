@@ -1,7 +1,5 @@
 """A real client and the emulated camera over the loopback in any history, against a plain model.
 
-pytestmark = pytest.mark.long
-
 Long form: ``HYPOTHESIS_PROFILE=nightly pytest tests/proofs/test_stateful_client.py``.
 
 The rules start calls of the client, meddle as an operator, cut links and let time pass, and look at
@@ -546,3 +544,6 @@ def test_switch_of_a_camera_that_is_too_busy_ends_at_once_with_the_client(
     history.a_little_time_passes(0.05)
     history.close()
     assert history.calls == []
+
+
+pytestmark = pytest.mark.long
