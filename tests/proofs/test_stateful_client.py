@@ -44,6 +44,7 @@ from smartcam import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+pytestmark = pytest.mark.long
 
 PROFILE = settings()
 HISTORIES = settings(max_examples=max(1, PROFILE.max_examples // 2), stateful_step_count=40)
@@ -544,6 +545,3 @@ def test_switch_of_a_camera_that_is_too_busy_ends_at_once_with_the_client(
     history.a_little_time_passes(0.05)
     history.close()
     assert history.calls == []
-
-
-pytestmark = pytest.mark.long
