@@ -419,11 +419,12 @@ class Inbox:
             return None
         values, empty_slots = done
         self.account.empty_slots += empty_slots
-        numbers = itertools.count(first)
-        return [
-            _new_tuple(Result, (name, application, None, number, None, at, None, data, value))
-            for number, data, value in zip(numbers, burst.data, values, strict=False)
-        ]
+        # rows of a Result's fields; a loop in Python would take twice as long
+        numbers, none = itertools.count(first), itertools.repeat(None)
+        names, applications, ats = map(itertools.repeat, (name, application, at))
+        fields = (names, applications, none, numbers, none, ats, none, burst.data, values)
+        rows = zip(*fields, strict=False)
+        return list(map(_new_tuple, itertools.repeat(Result), rows))
 
     def release_held(self) -> None:
         """Give the containers their fate of which it was not known whether they are the trigger's.
