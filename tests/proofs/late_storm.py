@@ -18,8 +18,12 @@ import statistics
 import sys
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any
+
+if __name__ == "__main__":  # the wire is another camera's, too
+    sys.path.append(str(Path(__file__).parent.parent))
 
 from storm_camera import EXTERNAL, Habits, StormCamera
 from storm_variants import PATIENCE, VARIANTS, make_camera

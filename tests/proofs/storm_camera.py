@@ -13,57 +13,37 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+from line_camera import (
+    BUSY,
+    CONNECT,
+    ID_READY,
+    ID_TRIGGER_ERROR,
+    ID_WAITING,
+    INPUT,
+    LOAD_TIME,
+    NOK_BUSY,
+    NOK_INSPECTION,
+    OK,
+    OK_INSPECTION_ID,
+    OVERTRIGGERED,
+    OVERTRIGGERED_TIME,
+    QUERY,
+    RESET,
+    RESULT,
+    RUNNING,
+    STATUS,
+    SWITCH,
+    TRIGGER,
+    WAITING,
+    WIRES,
+)
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from random import Random
     from typing import Self
 
-CONNECT, DISCONNECT, STATUS, RESET, RESULT = 0x01, 0x02, 0x12, 0x16, 0x20
-QUERY, SWITCH, INPUT, NUMBER = 0x30, 0x31, 0x34, 0x35
-TRIGGER, START, STOP = 0x40, 0x41, 0x42
-
-INPUT_CONTAINER, BUSY, RUNNING, OVERTRIGGERED, WAITING = 0x004, 0x010, 0x080, 0x100, 0x200
-
-ID_WAITING, ID_READY, ID_TRIGGER_ERROR = 0x001, 0x020, 0x100
-OK, OK_INSPECTION_ID, NOK_BUSY, NOK_INSPECTION = 0x00, 0x02, 0x16, 0x1A
-"""Status bits and result codes of ``bid``."""
-
-
-class Wire(NamedTuple):
-    """What frames look like: struct code of the integers, magic, what the length counts too."""
-
-    word: str
-    magic: bytes = b""
-    beyond: int = 0
-
-    @property
-    def size(self) -> int:
-        """Bytes of a header."""
-        return len(self.magic) + 2 * struct.calcsize(self.word)
-
-    def words(self, *values: int) -> bytes:
-        """Return integers as they are on the wire."""
-        return struct.pack(f"<{len(values)}{self.word}", *values)
-
-    def frame(self, message_id: int, payload: bytes) -> bytes:
-        """Return a frame."""
-        length = len(payload) + self.beyond
-        numbers = (length, message_id) if self.magic else (message_id, length)
-        return self.magic + self.words(*numbers) + payload
-
-    def read(self, data: bytes) -> tuple[int, int]:
-        """Return the message id and the payload's length that a header tells."""
-        assert data.startswith(self.magic), f"no frame begins with {data[:12].hex()}"
-        first, second = struct.unpack_from(f"<2{self.word}", data, len(self.magic))
-        return (second, first - self.beyond) if self.magic else (first, second)
-
-
-WIRES = {
-    "handbook": Wire("I", bytes.fromhex("50535642")),
-    "thesis": Wire("I", bytes.fromhex("42565350"), 4),
-    "b16": Wire("H"),
-    "bid": Wire("H"),
-}
+INPUT_CONTAINER = 0x004
 
 CONTAINER = struct.Struct("<5i")
 FIELDS = "number: int32{mark}, trigger: int32, run: int32, token: int32, part: int32"
@@ -71,8 +51,6 @@ EXTERNAL = 0
 """In place of a trigger's count: a run that the digital input began."""
 
 QUEUE_DEPTH = 8
-OVERTRIGGERED_TIME = 0.002
-LOAD_TIME = 0.001
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -350,13 +328,9 @@ class StormCamera:
     def _take(self, data: bytes, peer: tuple[str, int] | None) -> None:
         self._peer = peer
         self._buffer += data
-        header = self._wire.size
-        while len(self._buffer) >= header:
-            message_id, length = self._wire.read(self._buffer)
-            size = header + length
-            if len(self._buffer) < size:
-                return
-            payload, self._buffer = self._buffer[header:size], self._buffer[size:]
+        while frame := self._wire.read(self._buffer):
+            message_id, payload = frame
+            self._buffer = self._buffer[self._wire.size + len(payload) :]
             if message_id == CONNECT:
                 self._connect()
             elif self._session:
