@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from smartcam.calibration.frames import Transform
@@ -25,6 +26,9 @@ OCTANTS = [(x, y, z) for x in (1, -1) for y in (1, -1) for z in (1, -1)]
 
 AXES = [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)]
 """Normals at which careless formulas divide by zero."""
+
+FEW = settings(max_examples=max(1, settings().max_examples // 5))
+"""Examples of a property that takes long to judge: a fifth of the profile's."""
 
 lengths = st.floats(0.01, 10.0)
 angles = st.floats(-np.pi, np.pi)

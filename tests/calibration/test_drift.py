@@ -335,6 +335,7 @@ def sample(sigma: float | None) -> list[PlaneCalibration]:
     return [calibrated(seed, sigma) for seed in range(200)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sigma", "mark"), [(SIGMA, GRID[0]), (SIGMA, GRID[4]), (None, GRID[4])])
 def test_touches_needed_notice_a_knock_as_often_as_said(
     sigma: float | None, mark: tuple[float, float]

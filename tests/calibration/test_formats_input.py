@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from rigid import refused
+from rigid import FEW, refused
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.formats import (
@@ -68,6 +68,7 @@ def read(path: Path, form: str) -> object:
 
 
 @pytest.mark.parametrize("form", READERS)
+@FEW
 @given(
     body=st.one_of(
         st.binary(max_size=200),
@@ -95,6 +96,7 @@ def test_random_file_gives_a_value_or_an_error_with_a_code(
 
 
 @pytest.mark.parametrize("form", PARSED)
+@FEW
 @given(data=st.data())
 def test_changed_file_gives_a_transform_or_an_error_with_a_code(
     tmp_path_factory: Any, form: str, data: st.DataObject

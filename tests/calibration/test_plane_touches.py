@@ -62,6 +62,7 @@ def test_fit_touches_without_sigma_estimates_it_badly_and_says_so() -> None:
     assert found.freedom == 1
 
 
+@pytest.mark.long
 def test_fit_touches_predicted_error_equals_the_observed_one() -> None:
     places = np.array([[0.1, 0.05], [0.3, 0.2], [0.0, 0.3]])
     found = [fitted(seed) for seed in range(400)]
@@ -70,6 +71,7 @@ def test_fit_touches_predicted_error_equals_the_observed_one() -> None:
     assert found[0].predicted_error(places) == pytest.approx(observed, rel=0.1)
 
 
+@pytest.mark.long
 def test_fit_touches_beats_the_frame_from_three_points() -> None:
     place = np.array([[0.1, 0.05]]) + rotate_ccw([[0.2, 0.2]], THETA)
     ours, plain = 0.0, 0.0

@@ -42,6 +42,7 @@ def files(folder: Path) -> list[str]:
     return sorted(one.name for one in folder.iterdir())
 
 
+@pytest.mark.long
 def test_many_writers_at_once_leave_whole_files_and_the_last_ones(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     write(path, "plane", {"n": -1})
@@ -126,6 +127,7 @@ while more:
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
 @pytest.mark.parametrize("links", ["links", "copies"])
 def test_process_killed_at_each_step_leaves_a_file_and_the_next_save_clears_up(

@@ -27,7 +27,7 @@ NAME = Step(
         Flag(name="fixed", label="Fixed", default=True),
     ),
 )
-PICTURE = Step(id="picture", title="Picture", button="Trigger", timeout=0.05)
+PICTURE = Step(id="picture", title="Picture", button="Trigger", timeout=60.0)
 MORE = Step(
     id="more",
     title="More",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 import sys
 from datetime import UTC, datetime
@@ -81,11 +82,18 @@ def localized(u: float, v: float, theta: float = 0.0, frame: str = "camera") -> 
     return Localization("part", 0.9, 0, pose)
 
 
+@functools.cache
+def picture(number: int, *, straight: bool = False) -> Any:
+    """Return what the camera sees of the sheet; each picture has its own noise."""
+    random = np.random.default_rng([5, number])
+    return render(TARGET, STRAIGHT if straight else CAMERA, SEEN, noise=2.0, random=random)
+
+
 class Cell:
     """A camera and a robot; ``pictures`` are taken before the sheet's own.
 
     Args:
-        camera: the real lens.
+        camera: the real lens, CAMERA or STRAIGHT.
         sigma: of a touch, metres.
         scale: of the print.
     """
@@ -104,7 +112,7 @@ class Cell:
         self.taken += 1
         if self.pictures:
             return self.pictures.pop(0)
-        return render(TARGET, self.camera, SEEN, noise=2.0, random=self._random)
+        return picture(self.taken, straight=self.camera is STRAIGHT)
 
     def touched(self, points: Sequence[Sequence[float]]) -> Array:
         """Return where the robot touches points (N, 2) of the sheet, metres."""

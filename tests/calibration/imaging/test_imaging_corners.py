@@ -36,7 +36,10 @@ def bound(noise: float, blur: float, contrast: float, half: int) -> float:
     return float(noise * np.sqrt(np.linalg.inv(jacobian @ jacobian.T)[0, 0]))
 
 
-@pytest.mark.parametrize(("noise", "blur"), [(1.0, 0.7), (2.0, 1.5), (5.0, 1.5)])
+@pytest.mark.parametrize(
+    ("noise", "blur"),
+    [(1.0, 0.7), *(pytest.param(one, 1.5, marks=pytest.mark.long) for one in (2.0, 5.0))],
+)
 def test_refine_corners_errors_are_near_the_bound(noise: float, blur: float) -> None:
     squares = []
     for away in (0.45, 0.46, 0.47):

@@ -35,8 +35,14 @@ TARGETS: list[Target] = [
 ]
 
 
-@pytest.mark.parametrize("roll", [0, 70, 200])
-@pytest.mark.parametrize("target", TARGETS, ids=repr)
+ROLLS = (0, 70, 200)
+TILTED = [(target, ROLLS[number % 3]) for number, target in enumerate(TARGETS)]
+OTHERS = [(target, roll) for target in TARGETS for roll in ROLLS if (target, roll) not in TILTED]
+
+
+@pytest.mark.parametrize(
+    ("target", "roll"), [*TILTED, *(pytest.param(*one, marks=pytest.mark.long) for one in OTHERS)]
+)
 def test_find_target_of_tilted_sheet_has_each_point_where_it_is(target: Target, roll: int) -> None:
     picture = drawn(target, tilt=35, roll=roll)
     view = find_target(picture.image, target, name="one")
@@ -65,8 +71,16 @@ def test_find_target_in_colour_and_in_16_bits_is_the_same(tilt: int) -> None:
     np.testing.assert_allclose(find_target(deep, PLAIN).points, grey, atol=5e-3)
 
 
-@pytest.mark.parametrize("roll", [0, 45, 130])
-@pytest.mark.parametrize("target", [PLAIN, DARK, DOTS, TARGETS[8]], ids=repr)
+@pytest.mark.parametrize(
+    ("target", "roll"),
+    [
+        *((PLAIN, 45), (DOTS, 130)),
+        *(
+            pytest.param(*one, marks=pytest.mark.long)
+            for one in [(PLAIN, 0), (DARK, 130), (DARK, 0), (DOTS, 45), *zip(TARGETS[8:9] * 2, (0, 45))]
+        ),
+    ],
+)
 def test_find_target_of_steep_far_and_noisy_sheet_has_its_points(target: Target, roll: int) -> None:
     picture = drawn(target, tilt=60, roll=roll, away=0.7, blur=1.2, noise=4)
     off = picture.off(find_target(picture.image, target))

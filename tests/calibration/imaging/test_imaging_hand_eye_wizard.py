@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from imaging_scenes import CAMERA, SHEET, scene
+from imaging_scenes import SHEET, scene
 
 from smartcam.calibration.formats.robots import ROBOTS, pose_to
+from smartcam.calibration.imaging.cameras import CameraModel
 from smartcam.calibration.imaging.hand_eye import HandEyeCalibration
 from smartcam.calibration.imaging.hand_eye_wizard import SUGGESTIONS, hand_eye_wizard
 from smartcam.calibration.imaging.rendering import render
@@ -19,24 +21,35 @@ if TYPE_CHECKING:
 
     from smartcam.calibration.frames import Transform
 
+CAMERA = CameraModel(size=(640, 480), matrix=np.array([[600.0, 0, 320], [0, 595, 235], [0, 0, 1]]))
 TRUTH = scene("eye-in-hand", poses=6, seed=7)
+
+
+@functools.cache
+def picture(number: int) -> Any:
+    """Return what the camera sees at a pose of the robot."""
+    return render(SHEET, CAMERA, TRUTH.seen(TRUTH.robot_poses[number]), blur=0.7)
 
 
 class Cell:
     """A robot with a camera; each picture is taken at the next pose."""
 
     def __init__(self) -> None:
-        self.poses = list(TRUTH.robot_poses)
+        self.left = list(range(len(TRUTH.robot_poses)))
         self.hidden = 0
 
     async def take_picture(self) -> Any:
         if self.hidden:
             self.hidden -= 1
             return np.full(CAMERA.size[::-1], 128, dtype=np.uint8)
-        return render(SHEET, CAMERA, TRUTH.seen(self.poses[0]), blur=0.7)
+        return picture(self.left[0])
 
     async def read_robot(self) -> Transform:
-        return self.poses[0] if self.hidden else self.poses.pop(0)
+        return self.pose if self.hidden else TRUTH.robot_poses[self.left.pop(0)]
+
+    @property
+    def pose(self) -> Transform:
+        return TRUTH.robot_poses[self.left[0]]
 
 
 def begin(folder: Path, cell: Cell, journal: Path | None = None) -> Session:
@@ -107,7 +120,7 @@ async def test_view_removed_is_calculated_without(tmp_path: Path) -> None:
 
 async def test_views_that_give_nothing_say_why(tmp_path: Path) -> None:
     cell = Cell()
-    cell.poses = [cell.poses[0]] * 3
+    cell.left = [0] * 3
     session = begin(tmp_path, cell)
     for _ in range(4):
         await say(session)
@@ -122,11 +135,11 @@ async def test_views_are_there_again_after_a_crash(tmp_path: Path) -> None:
     session = begin(tmp_path, cell, tmp_path / "journal")
     for _ in range(4):
         view = await say(session)
-    left = len(cell.poses)
+    left = len(cell.left)
     session.close()
     again = begin(tmp_path, cell, tmp_path / "journal")
     assert again.current["step"] == view["step"] == "view-4"
-    assert len(cell.poses) == left
+    assert len(cell.left) == left
     again.close()
 
 
@@ -145,8 +158,8 @@ async def test_poses_typed_as_the_robot_writes_them_are_the_same(tmp_path: Path)
     for number in range(6):
         view = session.current
         assert ("svg" in (view["preview"] or {})) == (number > 0)
-        await say(session, typed(cell.poses[0]))
-        cell.poses.pop(0)
+        await say(session, typed(cell.pose))
+        cell.left.pop(0)
     view = await session.submit(session.token, {"next": "view", "x": 1.0})
     assert view["errors"]["a"] == "no answer"
     await say(session, {"next": "calculate"})

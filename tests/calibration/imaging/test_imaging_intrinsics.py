@@ -30,6 +30,7 @@ def test_calibrate_intrinsics_finds_the_lens_as_well_as_it_says() -> None:
     assert (found.sheet, found.sigma, found.bad_views) == (None, 0.0, ())
 
 
+@pytest.mark.long
 def test_calibrate_intrinsics_covariance_is_that_of_its_errors() -> None:
     squares = []
     for seed in range(12):

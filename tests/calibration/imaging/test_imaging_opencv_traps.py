@@ -21,6 +21,7 @@ SIGMAS = RobotSigmas(1e-4, 1e-4)
 METHODS = ("tsai", "park", "horaud", "andreff", "daniilidis")
 
 
+@pytest.mark.long
 def test_trap_hand_eye_methods_are_not_all_tsais() -> None:
     """``calibrateHandEye(a, b, c, d, METHOD)`` takes the method for an output, and runs Tsai's."""
     poses, views = scene("eye-in-hand").measured(

@@ -33,6 +33,7 @@ def test_locate_of_a_view_without_noise_is_exact(camera: CameraModel) -> None:
     assert found.rms < 1e-6
 
 
+@pytest.mark.long
 def test_locate_covariance_is_that_of_its_errors() -> None:
     squares = []
     for seed in range(60):

@@ -61,6 +61,7 @@ def test_sheet_without_noise_maps_pixels_exactly(camera: CameraModel) -> None:
     assert np.abs(found.inverse(found.transform(pixels)) - pixels).max() < 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("camera", "touch"), [(CAMERA, 0.0), (CAMERA, SIGMA), (STRAIGHT, SIGMA)])
 def test_sheet_errors_over_the_field_are_as_predicted(camera: CameraModel, touch: float) -> None:
     lens = camera if camera is CAMERA else None

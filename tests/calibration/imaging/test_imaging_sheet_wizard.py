@@ -295,6 +295,7 @@ def go_on(process: subprocess.Popen[str]) -> None:
     process.stdin.flush()
 
 
+@pytest.mark.long
 def test_process_killed_behind_picture_and_touches_loses_nothing(tmp_path: Path) -> None:
     reached, taken = 1, 0
     for steps in (4, 2, 3):
@@ -316,6 +317,7 @@ def test_process_killed_behind_picture_and_touches_loses_nothing(tmp_path: Path)
     assert np.linalg.norm(found.transform(field()) - truth(field()), axis=1).max() < 2e-4
 
 
+@pytest.mark.long
 def test_process_killed_with_a_picture_under_way_takes_the_step_or_leaves_it(
     tmp_path: Path,
 ) -> None:
