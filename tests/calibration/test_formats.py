@@ -17,7 +17,7 @@ import pytest
 import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
-from rigid import NOON, after, close, refused, rotation_about, transforms
+from rigid import FEW, NOON, after, close, refused, rotation_about, transforms
 
 from smartcam.calibration.formats import (
     SAMPLES,
@@ -84,6 +84,7 @@ def table(model: PlaneModel = "similarity", scale: float = 0.001) -> PlaneCalibr
 
 
 @pytest.mark.parametrize("form", TRANSFORMS)
+@FEW
 @given(transform=transforms("base", "cam"))
 def test_transform_written_and_read_is_the_same(
     tmp_path_factory: Any, form: str, transform: Transform
@@ -361,6 +362,7 @@ def times(count: int) -> list[Transform]:
 
 
 @pytest.mark.parametrize("form", TRAJECTORIES)
+@FEW
 @example(microseconds=[10**17], transform=Transform("world", "body", np.eye(3), np.zeros(3)))
 @given(
     microseconds=st.lists(st.integers(0, 10**17), max_size=3),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from rigid import FEW, refused
 
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 PARSED = ["ros2", "ros_industrial", "easy_handeye", "easy_handeye2", "opencv"]
 """One format of a transform for each reader; the others share theirs."""
+
+LOADERS = ["ros2", "ros_industrial", "opencv", "moveit", "asl"]
+"""One format of each way in which text is read."""
 
 READERS: dict[str, tuple[Callable[..., object], str | None]] = {
     **{form: (read_transform, form) for form in PARSED},
@@ -75,17 +78,13 @@ def read(path: Path, form: str) -> object:
         st.lists(st.sampled_from(WORDS), max_size=20).map(lambda words: "".join(words).encode()),
     )
 )
-@example(body=b"")
-@example(body=b"[" * 5000)
-@example(body=b"{a: " * 5000)
-@example(body=b"- " * 5000)
-@example(body=b"1" * 5000)
-@example(body=b'"\\UFFFFFFFF"')
-@example(body=b"!!int ")
 def test_random_file_gives_a_value_or_an_error_with_a_code(
     tmp_path_factory: Any, form: str, body: bytes
 ) -> None:
-    path: Path = tmp_path_factory.getbasetemp() / "random"
+    judge(tmp_path_factory.getbasetemp() / "random", form, body)
+
+
+def judge(path: Path, form: str, body: bytes) -> None:
     path.write_bytes(body)
     error = refusal(path, form)
     if error is not None:
@@ -93,6 +92,19 @@ def test_random_file_gives_a_value_or_an_error_with_a_code(
         assert str(path) in str(error)
         assert len(str(error)) < 1000
         assert len(repr(error.got)) < 300
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        *LOADERS,
+        *(pytest.param(one, marks=pytest.mark.long) for one in READERS if one not in LOADERS),
+    ],
+)
+def test_deep_or_long_file_gives_an_error_with_a_code(tmp_path: Path, form: str) -> None:
+    for body in (b"", b"[" * 5000, b"{a: " * 5000, b"- " * 5000, b"1" * 5000, b"!!int "):
+        judge(tmp_path / "file", form, body)
+    judge(tmp_path / "file", form, b'"\\UFFFFFFFF"')
 
 
 @pytest.mark.parametrize("form", PARSED)

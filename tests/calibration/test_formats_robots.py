@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from rigid import angles, close, refused, transforms
+from rigid import FEW, angles, close, refused, transforms
 
 from smartcam.calibration.formats import ROBOTS, pose_from, pose_to
 from smartcam.calibration.formats.robots import angles_zyx, rotation_zyx
@@ -28,6 +28,7 @@ def scipy_rotation() -> Any:
 
 
 @pytest.mark.parametrize("robot", EULER)
+@FEW
 @given(turns=st.tuples(angles, angles, angles))
 @example(turns=(0.3, math.pi / 2, -1.2))
 @example(turns=(0.3, -math.pi / 2, -1.2))
@@ -42,6 +43,7 @@ def test_pose_from_angles_is_the_rotation_of_scipy(
 
 
 @pytest.mark.parametrize("robot", EULER)
+@FEW
 @given(pose=transforms("base", "tool"))
 def test_pose_to_angles_is_what_scipy_makes_the_same_rotation_of(
     robot: str, pose: Transform
@@ -66,6 +68,7 @@ def test_rotation_vector_is_that_of_scipy(pose: Transform) -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
+@FEW
 @given(pose=transforms("base", "tool"))
 def test_pose_written_and_read_is_the_same(robot: str, pose: Transform) -> None:
     values = pose_to(robot, pose)

@@ -37,7 +37,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from planekit import GRID, SIGMA, Scene, part, scenes, spread
-from rigid import rotations, transforms, yaw
+from rigid import FEW, rotations, transforms, yaw
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane, fit_touches
@@ -155,6 +155,7 @@ def test_plane_p7_heading_follows_the_part(
     assert turned == pytest.approx(expected, abs=CLOSE)
 
 
+@FEW
 @given(scenes(), scenes(), places, seeds)
 def test_plane_p8_moving_the_robot_base_moves_results(
     scene: Scene, base: Scene, place: tuple[float, float], seed: int
@@ -167,6 +168,7 @@ def test_plane_p8_moving_the_robot_base_moves_results(
     assert spread(there.transform(seen), expected) < CLOSE
 
 
+@FEW
 @given(scenes(), places, angles, st.floats(-3, 3), seeds)
 def test_plane_p9_moving_the_camera_changes_nothing(
     scene: Scene, place: tuple[float, float], yaw: float, shift: float, seed: int
@@ -178,6 +180,7 @@ def test_plane_p9_moving_the_camera_changes_nothing(
     assert spread(there.transform(moved[1]), here.transform(scene.camera(marks))) < CLOSE
 
 
+@FEW
 @given(scenes(), st.permutations(range(9)), seeds)
 def test_plane_p10_order_of_points_is_irrelevant(scene: Scene, order: list[int], seed: int) -> None:
     seen, touches = scene.camera(GRID), scene.touched(GRID, seed)
@@ -231,6 +234,7 @@ def test_plane_p14_many_are_as_one(
     assert spread(repeated, found.transform(seen)) < CLOSE
 
 
+@FEW
 @given(scenes(), seeds, st.sampled_from(["auto", "rigid", "similarity", "affine", "homography"]))
 def test_plane_p16_stored_data_give_the_same_bits(scene: Scene, seed: int, model: str) -> None:
     found = fit_plane(
@@ -246,6 +250,7 @@ def test_plane_p16_stored_data_give_the_same_bits(scene: Scene, seed: int, model
     assert again.predicted_error(seen).tobytes() == found.predicted_error(seen).tobytes()
 
 
+@FEW
 @given(scenes(), transforms("base", "flange"), rotations(), angles, places, places, angles)
 def test_plane_p15_moving_camera_is_the_static_one_calibrated_anew(
     scene: Scene,

@@ -14,8 +14,8 @@ from rigid import FEW, refused
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration.codes import Code
 from smartcam.calibration import robust as robust_module
+from smartcam.calibration.codes import Code
 from smartcam.calibration.fitting import fit
 from smartcam.calibration.robust import BEST, MOST_SUBSETS, PROPOSALS, agreeing
 from smartcam.calibration.stored import PlaneData

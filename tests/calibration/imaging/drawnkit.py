@@ -57,6 +57,9 @@ def facing(target: Target, tilt: float = 0.0, roll: float = 0.0, away: float = 0
     return Transform("camera", "target", turn @ FACING, np.array([0, 0, away]) - middle)
 
 
+_drawn: dict[tuple[object, ...], tuple[CameraModel, NDArray[np.uint8]]] = {}
+
+
 def drawn(
     target: Target,
     *,
@@ -69,6 +72,8 @@ def drawn(
 ) -> Drawn:
     """Return an image of a target; angles in degrees, metres, pixels, grey levels."""
     pose = facing(target, tilt, roll, away)
-    image = render(target, camera, pose, blur=blur, noise=noise)
+    key = (target, id(camera), tilt, roll, away, blur, noise)
+    if key not in _drawn:  # with its camera, whose id is then no other's
+        _drawn[key] = camera, render(target, camera, pose, blur=blur, noise=noise)
     pixels = camera.project(target.points @ pose.rotation.T + pose.translation)
-    return Drawn(image, target, pixels)
+    return Drawn(_drawn[key][1].copy(), target, pixels)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from smartcam.calibration.imaging.cameras import CameraModel
+from smartcam.calibration.imaging.detection import find_target
+from smartcam.calibration.imaging.homography import apply_homography, fit_homography
 from smartcam.calibration.imaging.simulation import HandEyeScene, hand_eye_scene
 from smartcam.calibration.imaging.targets import Checkerboard
 from smartcam.exceptions import CalibrationError
@@ -17,7 +19,10 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import NDArray
+
     from smartcam.calibration.imaging.hand_eye_fit import Setup
+    from smartcam.calibration.imaging.views import TargetView
 
 CAMERA = CameraModel(
     size=(1280, 960),
@@ -25,6 +30,8 @@ CAMERA = CameraModel(
     distortion=np.array([-0.1, 0.02, 0.0005, -0.0003, 0.0]),
 )
 SHEET = Checkerboard(columns=5, rows=4, square=0.03)
+PAIRS_BOARD = Checkerboard(columns=9, rows=6, square=0.025)
+"""In OpenCV's pairs."""
 
 
 def scene(setup: Setup, *, poses: int = 9, tilt: float = 30.0, seed: int = 5) -> HandEyeScene:
@@ -38,6 +45,26 @@ def scene(setup: Setup, *, poses: int = 9, tilt: float = 30.0, seed: int = 5) ->
         distance=0.5,
         random=np.random.default_rng(seed),
     )
+
+
+def off_plane(view: TargetView) -> float:
+    """Return the rms distance of points from a flat sheet seen without distortion, pixels."""
+    flat = view.object_points[:, :2]
+    matrix = fit_homography(flat, view.points)
+    assert matrix is not None
+    off = apply_homography(matrix, flat) - view.points
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def check_pair(left_image: NDArray[np.uint8], right_image: NDArray[np.uint8], name: str) -> None:
+    """See that one of OpenCV's pairs has the same origin in both images."""
+    left, right = (find_target(image, PAIRS_BOARD) for image in (left_image, right_image))
+    apart = left.points - right.points
+    # the cameras stand side by side: rows agree, columns differ alike
+    assert np.ptp(apart[:, 1]) < 40, name
+    assert (apart[:, 0] > 60).all(), name
+    assert np.median(left.sigmas) < 0.03, name
+    assert off_plane(left) < 4, name
 
 
 @contextmanager

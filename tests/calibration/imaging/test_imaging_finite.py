@@ -134,7 +134,9 @@ CASES: list[tuple[Any, Callable[[Any], list[np.ndarray]]]] = [
 
 
 @pytest.mark.parametrize(
-    ("made", "gives"), CASES, ids=["similarity", "homography", "sheet", "hand-eye", "stereo"]
+    ("made", "gives"),
+    [*CASES[:2], *(pytest.param(*one, marks=pytest.mark.long) for one in CASES[2:])],
+    ids=["similarity", "homography", "sheet", "hand-eye", "stereo"],
 )
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_file_with_a_right_hash_and_any_number_gives_numbers_or_is_refused(

@@ -61,12 +61,12 @@ def calibrated_from_poses(setup: Setup) -> HandEyeCalibration:
     return calibrate_hand_eye_from_poses(truth.robot_poses, seen, setup=setup)
 
 
-@pytest.fixture(scope="module", params=SETUPS)
+@pytest.fixture(scope="module", params=ONE_LONG)
 def exact(request: pytest.FixtureRequest) -> HandEyeCalibration:
     return calibrated(request.param)
 
 
-@pytest.fixture(scope="module", params=SETUPS)
+@pytest.fixture(scope="module", params=ONE_LONG)
 def noisy(request: pytest.FixtureRequest) -> HandEyeCalibration:
     poses, views = measured(request.param, 0.1, NOISE, poses=12)
     return calibrate_hand_eye(poses, views, setup=request.param, camera=CAMERA)
@@ -116,7 +116,8 @@ def test_hand_eye_held_out_errors_are_larger_than_errors(noisy: HandEyeCalibrati
     assert noisy.worst == int(np.argmax(noisy.leave_one_out))
 
 
-@pytest.mark.parametrize("setup", ONE_LONG)
+@pytest.mark.long
+@pytest.mark.parametrize("setup", SETUPS)
 def test_hand_eye_does_not_depend_on_the_order(setup: Setup) -> None:
     poses, views = measured(setup, 0.1, NOISE)
     order = np.random.default_rng(3).permutation(len(poses))
@@ -191,14 +192,14 @@ def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
 
 
 def test_hand_eye_without_a_camera_calibrates_it_from_the_views() -> None:
-    poses, views = measured("eye-in-hand", 0.05, EXACT, poses=14, tilt=40.0)
+    poses, views = measured("eye-in-hand", 0.05, EXACT, poses=8, tilt=40.0)
     found = calibrate_hand_eye(poses, views, setup="eye-in-hand", method="reprojection")
     assert found.camera is not None
     assert found.camera.matrix[0, 0] == pytest.approx(1200, rel=0.01)
-    assert scene("eye-in-hand", poses=14, tilt=40.0).errors(found.camera_pose)[1] < 2e-3
+    assert scene("eye-in-hand", poses=8, tilt=40.0).errors(found.camera_pose)[1] < 2e-3
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ONE_LONG)
 def test_hand_eye_from_poses_without_noise_is_exact(setup: Setup) -> None:
     truth = scene(setup)
     found = calibrated_from_poses(setup)
@@ -288,7 +289,7 @@ def _parts(transform: Transform) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def test_hand_eye_with_a_wrong_lens_adjusts_it_and_says_so() -> None:
-    poses, views = measured("eye-in-hand", 0.1, NOISE, poses=14, tilt=40.0)
+    poses, views = measured("eye-in-hand", 0.1, NOISE, poses=9, tilt=40.0)
     matrix = CAMERA.matrix.copy()
     matrix[0, 0] = matrix[1, 1] = 1150.0
     wrong = dataclasses.replace(CAMERA, matrix=matrix)
@@ -301,7 +302,7 @@ def test_hand_eye_with_a_wrong_lens_adjusts_it_and_says_so() -> None:
 
 def test_hand_eye_of_few_poses_says_that_they_are_few() -> None:
     poses, views = measured("eye-in-hand", 0.0, EXACT, poses=3)
-    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA)
+    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
     assert scene("eye-in-hand", poses=3).errors(found.camera_pose)[1] < 1e-6
     assert found.held_out_error is None
     assert np.isnan(found.leave_one_out).all()
@@ -395,8 +396,12 @@ def test_to_plane_of_a_moving_camera_is_where_the_part_is() -> None:
 
 
 def test_to_plane_of_raised_features_is_where_they_are() -> None:
-    truth, found = scene("eye-to-hand"), calibrated("eye-to-hand")
-    table = truth.robot_poses[0] @ truth.target_pose
+    truth = scene("eye-to-hand")
+    poses, views = measured("eye-to-hand", 0.0, EXACT)
+    found = calibrate_hand_eye(
+        poses, views, setup="eye-to-hand", camera=CAMERA, adjust="nothing", method="robot"
+    )
+    table = poses[0] @ truth.target_pose
     parts = table.apply([[0.02, 0.03, 0.015], [0.1, 0.05, 0.015]])
     pixels = CAMERA.project(truth.camera_pose.inverse().apply(parts))
     np.testing.assert_allclose(found.to_plane(pixels, plane=table, height=0.015), parts, atol=1e-9)
@@ -449,7 +454,7 @@ def test_point_errors_of_a_target_of_another_size_are_those_of_the_adjusted_one(
     assert np.concatenate(nominal.point_errors(poses, thought)).mean() > 1e-3
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ONE_LONG)
 def test_point_errors_of_other_poses_are_the_held_out_error(setup: Setup) -> None:
     poses, views = measured(setup, 0.1, NOISE, poses=30)
     found = calibrate_hand_eye(
@@ -461,7 +466,7 @@ def test_point_errors_of_other_poses_are_the_held_out_error(setup: Setup) -> Non
     assert math.sqrt(float((other**2).mean())) == pytest.approx(found.held_out_error, rel=0.6)
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ONE_LONG)
 def test_point_errors_of_poses_of_the_target_are_its_origins(setup: Setup) -> None:
     truth = scene(setup)
     seen = [truth.seen(pose) for pose in truth.robot_poses]

@@ -15,13 +15,23 @@ from smartcam.calibration.imaging.hand_eye import (
 )
 from smartcam.calibration.imaging.hand_eye_linear import LINEAR
 
+pytestmark = pytest.mark.long
+
 DOTS, CHARUCO = RECORDED
+MOVEIT = "pose_samples.json"
+LACKING = [name for name in (DOTS.name, CHARUCO.name, MOVEIT) if find(name) is None]
+
+if LACKING:
+    pytest.skip(
+        f"needs {', '.join(LACKING)} (docs/benchmarks.md says where they are from) in a folder "
+        "that SMARTCAM_DATA names",
+        allow_module_level=True,
+    )
 
 
 def recorded(one: Recorded, **options: object) -> HandEyeCalibration:
     folder = find(one.name)
-    if folder is None:
-        pytest.skip(f"no {one.name} of ROS-Industrial under SMARTCAM_DATA")
+    assert folder is not None
     poses, views = read_set(folder, one.target)
     return calibrate_hand_eye(poses, views, setup=one.setup, **options)  # type: ignore[arg-type]
 
@@ -58,9 +68,8 @@ def test_charuco_reaches_the_goal_of_the_held_out_error() -> None:
 
 
 def test_poses_of_moveit_are_as_good_as_the_best_closed_form() -> None:
-    path = find("pose_samples.json")
-    if path is None:
-        pytest.skip("no pose_samples.json of MoveIt under SMARTCAM_DATA")
+    path = find(MOVEIT)
+    assert path is not None
     poses, seen = read_poses(path)
     found = calibrate_hand_eye_from_poses(poses[::2], seen[::2], setup="eye-to-hand")
     assert found.held_out_error is not None

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.imaging.views import TargetView
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
+ONE_LONG = [pytest.param("eye-in-hand", marks=pytest.mark.long), "eye-to-hand"]
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)
 
 Pairs = tuple[list[Transform], "list[TargetView]"]
@@ -64,7 +65,7 @@ def problem(poses: list[Transform], setup: Setup) -> Problem:
     return Problem(Robot(said, setup == "eye-in-hand"), PoseObservations(seen, white), seen)
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ONE_LONG)
 def test_hand_eye_of_shuffled_poses_is_refused(setup: Setup) -> None:
     poses, views = measured(setup)
     order = np.random.default_rng(2).permutation(len(poses))
@@ -72,7 +73,7 @@ def test_hand_eye_of_shuffled_poses_is_refused(setup: Setup) -> None:
         calibrated([poses[i] for i in order], views, setup)
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("setup", ONE_LONG)
 def test_hand_eye_of_transposed_rotations_is_refused(setup: Setup) -> None:
     poses, views = measured(setup)
     turned = [dataclasses.replace(one, rotation=one.rotation.T) for one in poses]
@@ -98,6 +99,7 @@ def test_hand_eye_of_a_target_in_millimetres_is_refused() -> None:
         calibrated(poses, [dataclasses.replace(one, target=large) for one in views], "eye-to-hand")
 
 
+@pytest.mark.long
 def test_hand_eye_of_two_exchanged_poses_leaves_both_out() -> None:
     poses, views = measured("eye-in-hand")
     found = calibrated([poses[1], poses[0], *poses[2:]], views)
@@ -118,6 +120,7 @@ def test_hand_eye_of_six_poses_leaves_one_of_another_view_out() -> None:
     assert scene("eye-in-hand", poses=6).errors(found.camera_pose)[1] < 3e-3
 
 
+@pytest.mark.long
 def test_hand_eye_told_to_keep_a_pose_of_another_view_says_how_poor_it_is() -> None:
     poses, views = measured("eye-in-hand")
     found = calibrated([poses[1], *poses[1:]], views, drop_bad=False)

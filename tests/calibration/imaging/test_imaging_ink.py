@@ -59,7 +59,14 @@ def test_checkerboard_origin_mark_is_a_dot_in_the_area_of_the_origin() -> None:
     assert 1e3 * target.corner_areas[2] == pytest.approx((43, 33))
 
 
-@pytest.mark.parametrize(("rows", "legacy"), [(3, False), (4, False), (3, True), (4, True)])
+@pytest.mark.parametrize(
+    ("rows", "legacy"),
+    [
+        (3, False),
+        (4, True),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in [(4, False), (3, True)]),
+    ],
+)
 def test_charuco_is_the_board_of_opencv(rows: int, legacy: bool) -> None:
     target = Charuco(columns=4, rows=rows, square=0.03, marker=0.021, legacy_pattern=legacy)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)

@@ -16,7 +16,12 @@ if TYPE_CHECKING:
 
 
 @pytest.mark.parametrize(
-    ("camera", "tilt", "distance"), [(LEFT, 0.6, 0.35), (WIDE, 0.7, 0.25), (FISHEYE, 0.9, 0.12)]
+    ("camera", "tilt", "distance"),
+    [
+        (LEFT, 0.6, 0.35),
+        pytest.param(WIDE, 0.7, 0.25, marks=pytest.mark.long),
+        (FISHEYE, 0.9, 0.12),
+    ],
 )
 def test_fit_lens_of_views_without_noise_finds_the_lens(
     camera: CameraModel, tilt: float, distance: float

@@ -69,8 +69,14 @@ def test_render_dots_have_their_areas_and_centroids(*, asymmetric: bool) -> None
             assert (near * y).sum() / near.sum() == pytest.approx(v, abs=0.05)
 
 
-@pytest.mark.parametrize("rows", [5, 6])
-@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize(
+    ("rows", "legacy"),
+    [
+        (5, False),
+        (6, True),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in [(6, False), (5, True)]),
+    ],
+)
 def test_render_charuco_is_the_board_that_opencv_draws(rows: int, *, legacy: bool) -> None:
     target = Charuco(columns=4, rows=rows, square=0.012, marker=0.006, legacy_pattern=legacy)
     camera = CameraModel(

@@ -31,7 +31,14 @@ Views = list["TargetView | None"]
 
 @functools.cache
 def _calibrated() -> StereoCalibration:
-    return calibrate_stereo(*pairs(10))
+    return calibrate_stereo(*pairs(8))
+
+
+@functools.cache
+def _exactly(first: int = 0) -> StereoCalibration:
+    """Return what pairs from ``first`` on give, of a sheet taken for exact."""
+    left, right = pairs(6)
+    return calibrate_stereo(left[first:], right[first:], sheet="exact")
 
 
 def _off(found: Transform) -> Array:
@@ -74,8 +81,7 @@ def test_calibrate_stereo_held_out_errors_are_those_of_each_pair() -> None:
 
 def test_calibrate_stereo_held_out_error_is_that_of_a_calibration_without_the_pair() -> None:
     left, right = pairs(6)
-    found = calibrate_stereo(left, right, sheet="exact")
-    rest = calibrate_stereo(left[1:], right[1:], sheet="exact")
+    found, rest = _exactly(), _exactly(1)
     ids, one, two = np.intersect1d(left[0].ids, right[0].ids, return_indices=True)
     points = rest.triangulate(left[0].points[one], right[0].points[two])
     errors = spacing_errors(BOARD, ids, points)
@@ -85,7 +91,7 @@ def test_calibrate_stereo_held_out_error_is_that_of_a_calibration_without_the_pa
 def test_calibrate_stereo_uses_views_of_one_camera_alone() -> None:
     left, right = pairs(8)
     some: Views = [None if number == 2 else view for number, view in enumerate(right)]
-    found = calibrate_stereo(left, some)
+    found = calibrate_stereo(left, some, left=LEFT, right=RIGHT)
     assert found.pairs[2].used == (True, False)
     assert math.isnan(found.pairs[2].held_out)
     assert found.pairs[2].transform is not None
@@ -94,7 +100,7 @@ def test_calibrate_stereo_uses_views_of_one_camera_alone() -> None:
 
 def test_calibrate_stereo_of_a_moment_that_nobody_saw_leaves_it_open() -> None:
     left, right = pairs(6)
-    found = calibrate_stereo([*left, None], [*right, None])
+    found = calibrate_stereo([*left, None], [*right, None], left=LEFT, right=RIGHT)
     assert found.pairs[6].used == (False, False)
     assert found.pairs[6].transform is None
 
@@ -103,7 +109,7 @@ def test_calibrate_stereo_names_a_view_of_another_moment_and_leaves_it_out() -> 
     left, right = pairs(10)
     moved = seen(RIGHT, [RIG @ poses(10, seed=77, name="left")[3]], seed=5)[0]
     right[3] = dataclasses.replace(moved, name="late")
-    found = calibrate_stereo(left, right)
+    found = calibrate_stereo(left, right, left=LEFT, right=RIGHT)
     assert len(found.bad_views) == 1
     assert found.bad_views[0] in {"03", "late"}
     assert sum(found.pairs[3].used) == 1
@@ -114,7 +120,7 @@ def test_calibrate_stereo_names_a_view_of_another_moment_and_leaves_it_out() -> 
 def test_calibrate_stereo_leaves_a_swapped_pair_out() -> None:
     left, right = pairs(8)
     left[3], right[3] = right[3], left[3]
-    found = calibrate_stereo(left, right, sheet="exact")
+    found = calibrate_stereo(left, right, left=LEFT, right=RIGHT, sheet="exact")
     assert not found.pairs[3].used[1]
     assert sum(one.used == (True, True) for one in found.pairs) == 7
     assert "pixels off where the left view and the other pairs have it" in found.warnings[0].text
@@ -125,7 +131,7 @@ def test_calibrate_stereo_leaves_a_swapped_pair_out() -> None:
 def test_calibrate_stereo_of_shifted_pairs_is_refused() -> None:
     left, right = pairs(6)
     with pytest.raises(CalibrationError, match="are they in the same order") as caught:
-        calibrate_stereo(left, [*right[1:], right[0]], sheet="exact")
+        calibrate_stereo(left, [*right[1:], right[0]], left=LEFT, right=RIGHT, sheet="exact")
     assert caught.value.code == Code.POOR_FIT
 
 
@@ -161,7 +167,7 @@ def test_calibrate_stereo_numbers_a_sheet_that_looks_the_same_when_turned_alike(
         )
         for view in right
     ]
-    found = calibrate_stereo(left, turned)
+    found = calibrate_stereo(left, turned, left=LEFT, right=RIGHT)
     assert np.linalg.norm(_off(found.transform)[3:]) < 4e-4
     assert found.held_out < 5e-4
 
@@ -231,8 +237,7 @@ def test_epipolar_distances_and_rectify_use_the_calibration() -> None:
 
 def test_point_errors_of_a_pair_left_out_are_its_held_out_errors() -> None:
     left, right = pairs(6)
-    found = calibrate_stereo(left, right, sheet="exact")
-    rest = calibrate_stereo(left[1:], right[1:], sheet="exact")
+    found, rest = _exactly(), _exactly(1)
     (errors,) = rest.point_errors(left[:1], right[:1])
     spacing, epipolar = (math.sqrt(float((one**2).mean())) for one in errors)
     assert spacing == pytest.approx(found.pairs[0].held_out, rel=1e-3)
