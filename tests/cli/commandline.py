@@ -7,24 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
-import os
-import select
-import shutil
 import socket
 import struct
-import subprocess
 import sys
 import threading
-import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Self
 from unittest import mock
+
+from processes import PATIENCE, Outcome, Process
 
 import smartcam.cli
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
 
 CONNECT = bytes.fromhex("50535642 00000000 01000000")
 CONNECTED = bytes.fromhex("50535642 04000000 01000000 01000000")
@@ -50,12 +46,6 @@ DIE = b"die"
 
 SESSION: Mapping[bytes, bytes] = {CONNECT: CONNECTED + WAITING, QUERY: ACTIVE_21}
 """What a camera in application 21 says until it is triggered."""
-
-PATIENCE = 15.0
-"""Seconds; no wait of the bench is longer."""
-
-MARGIN = 4.0
-"""Seconds that a command may take beside its own time-outs, on a busy machine."""
 
 SCENARIO = """\
 applications:
@@ -91,37 +81,6 @@ def thesis(frame: bytes) -> bytes:
 # ---------------------------------------------------------------------- commands
 
 
-class Outcome(NamedTuple):
-    """How a command ended."""
-
-    code: int
-    out: str
-    err: str
-    seconds: float = 0.0
-
-    @property
-    def lines(self) -> list[Any]:
-        """The lines of stdout, each read as JSON."""
-        return [json.loads(line) for line in self.out.splitlines()]
-
-    def done(self) -> Self:
-        """See that it ended well and said nothing on stderr."""
-        assert (self.code, self.err) == (0, "")
-        return self
-
-    def failed(self, code: int, *texts: str, within: float = 0.0) -> Self:
-        """See that it ended with ``code`` and one line that holds ``texts``, in time."""
-        assert self.err.startswith(("smartcam: error: ", "smartcam-emulator: error: "))
-        assert self.err.count("\n") == 1
-        assert self.err.endswith("\n")
-        assert "Traceback" not in self.err
-        for text in texts:
-            assert text in self.err
-        assert self.code == code
-        assert self.seconds < within + MARGIN
-        return self
-
-
 def run(
     *args: str,
     stdin: bytes = b"",
@@ -130,7 +89,7 @@ def run(
 ) -> Outcome:
     """Run a command in this process."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
-    begin, code = time.monotonic(), 0
+    code = 0
     with (
         mock.patch.object(sys, "argv", [program, *args]),
         mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin), encoding="utf-8")),
@@ -141,87 +100,26 @@ def run(
             (main or smartcam.cli.main)()
         except SystemExit as exc:
             code = exc.code if isinstance(exc.code, int) else 0
-    seconds = time.monotonic() - begin
     out.seek(0)
     err.seek(0)
-    return Outcome(code, out.read(), err.read(), seconds)
+    return Outcome(code, out.read(), err.read())
+
+
+def run_as_far_as(text: str, *args: str) -> Outcome:
+    """Run a command whose time-out ends it, but not before it has said ``text``.
+
+    A slow machine gets a longer one.
+    """
+    for seconds in ("0.3", "3", "60"):
+        outcome = run(*args, "--timeout", seconds)
+        if text in outcome.out + outcome.err:
+            break
+    return outcome
 
 
 def run_emulator(*args: str) -> Outcome:
     """Run ``smartcam-emulator`` in this process, where it is to end by itself."""
     return run(*args, program="smartcam-emulator", main=smartcam.cli.emulator_main)
-
-
-def script(name: str) -> str:
-    """Return the path of a console script of this environment."""
-    found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
-    assert found is not None
-    return found
-
-
-class Process:
-    """A console script in a process of its own.
-
-    Args:
-        command: its name and its arguments; a bare name of ours is looked up.
-        env: variables beside the present ones.
-    """
-
-    def __init__(self, *command: str, env: Mapping[str, str] | None = None) -> None:
-        self._popen = subprocess.Popen(  # noqa: S603 - commands of the tests
-            [script(command[0]), *command[1:]],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            bufsize=0,
-            env={**os.environ, "PYTHONUNBUFFERED": "", **(env or {})},
-        )
-        self._begin = time.monotonic()
-        self._seen: dict[str, bytes] = {"stdout": b"", "stderr": b""}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        if self._popen.poll() is None:
-            self._popen.kill()
-        for stream in (self._popen.stdout, self._popen.stderr):
-            if stream is not None:
-                stream.close()
-        self._popen.wait(PATIENCE)
-
-    def read_until(self, text: bytes, *, count: int = 1, stream: str = "stdout") -> str:
-        """Return what was said until ``text`` had come ``count`` times."""
-        pipe = getattr(self._popen, stream)
-        end = time.monotonic() + PATIENCE
-        while self._seen[stream].count(text) < count:
-            ready, _, _ = select.select([pipe], [], [], max(0.0, end - time.monotonic()))
-            data = os.read(pipe.fileno(), 65536) if ready else b""
-            assert data, f"{text!r} did not come: {self._seen}"
-            self._seen[stream] += data
-        return self._seen[stream].decode(errors="replace")
-
-    def close_stdout(self) -> None:
-        """Read no more."""
-        assert self._popen.stdout is not None
-        self._popen.stdout.close()
-
-    def send_signal(self, number: int) -> None:
-        """Send a signal."""
-        self._popen.send_signal(number)
-
-    def wait(self) -> Outcome:
-        """Return how it ended, with everything it said."""
-        if self._popen.stdout is not None and self._popen.stdout.closed:
-            self._popen.stdout = None
-        out, err = self._popen.communicate(timeout=PATIENCE)
-        seconds = time.monotonic() - self._begin
-        return Outcome(
-            self._popen.returncode,
-            (self._seen["stdout"] + (out or b"")).decode(),
-            (self._seen["stderr"] + err).decode(),
-            seconds,
-        )
 
 
 # ---------------------------------------------------------------------- cameras

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import signal
-import subprocess
-import sys
 import urllib.request
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from commandline import Outcome, closed_port, emulators, run
+from commandline import closed_port, emulators, run
+from processes import PATIENCE, Outcome, Process
 
 from smartcam.calibration.plane import PlaneCalibration, fit_plane
 from smartcam.cli.calibrating import STALE, calibrate
@@ -37,13 +36,10 @@ def calibrating(url: str, folder: Path, lines: list[str], *options: str) -> Outc
     return run(*arguments, stdin=stdin, main=lambda: calibrate(prog_name="smartcam calibrate"))
 
 
-def process(url: str, folder: Path, *options: str) -> subprocess.Popen[str]:
+def process(url: str, folder: Path, *options: str) -> Process:
     """Start the command in a process of its own."""
-    code = "from smartcam.cli.calibrating import calibrate; calibrate()"
-    command = [sys.executable, "-c", code, url, "--folder", str(folder), "--application", "7"]
-    return subprocess.Popen(  # noqa: S603 - our own interpreter
-        [*command, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
+    command = ("calibrate", url, "--folder", str(folder), "--application", "7", *options)
+    return Process("smartcam", *command)
 
 
 def touch(name: str) -> tuple[float, float, float]:
@@ -177,13 +173,11 @@ def test_calibrate_killed_at_every_step_loses_no_sample(url: str, tmp_path: Path
     some = [TOUCHES[index] for index in (0, 1, 5)]
     for number, line in enumerate(as_lines(ABOUT, {}, touched, *some, {}, {}), 1):
         with process(url, tmp_path, "--json") as killed:
-            assert killed.stdin is not None
-            assert killed.stdout is not None
-            assert json.loads(killed.stdout.readline())["number"] == number
-            killed.stdin.write(f"{line}\n")
-            killed.stdin.flush()
-            assert json.loads(killed.stdout.readline())["number"] == number + 1
-            killed.kill()
+            killed.read_until(b"\n")
+            killed.write(f"{line}\n".encode())
+            shown = killed.read_until(b"\n", count=2).splitlines()
+            assert [json.loads(one)["number"] for one in shown] == [number, number + 1]
+            killed.send_signal(signal.SIGKILL)
     calibration = PlaneCalibration.load(tmp_path / "plane.json")
     assert calibration.robot_points.tolist() == [list(one.values()) for one in some]
 
@@ -231,12 +225,11 @@ def test_calibrate_with_results_that_are_no_localizations_says_so(url: str, tmp_
 
 def test_calibrate_with_a_page_serves_it_until_it_is_ended(url: str, tmp_path: Path) -> None:
     with process(url, tmp_path, "--web") as serving:
-        assert serving.stdout is not None
-        page = serving.stdout.readline().removeprefix("page: ").strip()
-        with urllib.request.urlopen(f"{page}api/step", timeout=10) as answer:  # noqa: S310
+        page = serving.read_until(b"\n").removeprefix("page: ").strip()
+        with urllib.request.urlopen(f"{page}api/step", timeout=PATIENCE) as answer:  # noqa: S310
             step = json.loads(answer.read())
         serving.send_signal(signal.SIGINT)
-        assert serving.wait(10) == 0
+        assert serving.wait().code == 0
     assert (step["step"], step["wizard"]) == ("about", "plane")
 
 
@@ -247,5 +240,5 @@ def test_calibrate_with_an_option_of_the_page_alone_is_wrong_usage(tmp_path: Pat
 
 
 def test_calibrate_with_an_address_that_cannot_work_leaves_nothing(tmp_path: Path) -> None:
-    calibrating("http://camera", tmp_path, []).failed(2, "http", within=10)
+    calibrating("http://camera", tmp_path, []).failed(2, "http")
     assert not list(tmp_path.rglob("*.journal"))

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-import subprocess
-import sys
-from select import select
-from subprocess import PIPE
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from commandline import Outcome, closed_port, emulators, run
+from commandline import closed_port, emulators, run
+from processes import Outcome, Process
 
 from smartcam.calibration.extra import load
 from smartcam.calibration.frames import Transform
@@ -35,8 +32,6 @@ CAMERA = CameraModel(
 SEEN = Transform("camera", "target", np.diag([1.0, -1.0, -1.0]), np.array([-0.1, 0.06, 0.5]))
 OFFSET = np.array([0.4, -0.1, 0.02])
 """Where the origin of the sheet lies before the robot; its axes are the robot's."""
-
-COMMAND = "from smartcam.cli.calibrating import calibrate; calibrate()"
 
 ABOUT = {"unit": "m", "side": "-z", "touch_sigma": 0.1}
 
@@ -72,39 +67,23 @@ def test_calibrate_by_a_sheet_and_a_folder_gives_a_calibration(
     tmp_path: Path, files: list[str]
 ) -> None:
     options = ["--wizard", "sheet", "--json", "--folder", str(tmp_path / "kept"), *files]
-    with subprocess.Popen(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", COMMAND, *options],
-        stdin=PIPE,
-        stdout=PIPE,
-        text=True,
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-
-        def step() -> dict[str, Any]:
-            assert process.stdout is not None
-            view: dict[str, Any] = json.loads(process.stdout.readline())
-            return view
-
-        def say(answer: dict[str, Any]) -> None:
-            assert process.stdin is not None
-            process.stdin.write(json.dumps({"answers": answer}) + "\n")
-            process.stdin.flush()
-
-        view = step()
-        number = 0
-        while view["type"] != "result":
+    with Process("smartcam", "calibrate", *options) as process:
+        number = shots = 0
+        while True:
+            number += 1
+            view = json.loads(process.read_until(b"\n", count=number).splitlines()[-1])
+            if view["type"] == "result":
+                break
             assert view["errors"] == {}
             answer: dict[str, Any] = ABOUT if view["step"] == "about" else {}
             if view["step"].startswith("touch-"):
                 index = 9 * (view["defaults"]["row"] - 1) + view["defaults"]["column"] - 1
                 answer = dict(zip("xyz", (OFFSET + TARGET.points[index]).tolist(), strict=True))
-            say(answer)
+            process.write(json.dumps({"answers": answer}).encode() + b"\n")
             # a camera that goes on taking pictures: some come behind the button
-            while view["step"] == "picture" and not select([process.stdout], [], [], 0.5)[0]:
-                (tmp_path / "ftp" / f"shot{number}.bmp").write_bytes(bitmap())
-                number += 1
-            view = step()
+            while view["step"] == "picture" and not process.says(0.5):
+                (tmp_path / "ftp" / f"shot{shots}.bmp").write_bytes(bitmap())
+                shots += 1
     assert view["result"]["file"] == "sheet.json"
     found = SheetCalibration.load(tmp_path / "kept" / "sheet.json")
     place = found.transform(CAMERA.project(SEEN.apply(TARGET.points[[10]])))[0]
@@ -169,14 +148,12 @@ async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
     tmp_path: Path, files: list[str]
 ) -> None:
     lines = [*answers(ABOUT, {}, {}, {}), {"do": "abort"}]
-    stdin = "".join(f"{json.dumps(one)}\n" for one in lines).encode()
-    options = ["--wizard", "sheet", "--json", "--folder", str(tmp_path / "kept"), *files[:4]]
+    options = ["--wizard", "sheet", *files[:4]]
     async with EmulatedInSight(image=render(TARGET, CAMERA, SEEN), online=True) as emulator:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", COMMAND, emulator.url, *options, stdin=PIPE, stdout=PIPE
-        )
-        told, _ = await process.communicate(stdin)
-    views = [json.loads(line) for line in told.splitlines()]
+        command = ("calibrate", emulator.url, "--json", "--folder", str(tmp_path), *options)
+        with Process("smartcam", *command) as process:
+            process.write("".join(f"{json.dumps(one)}\n" for one in lines).encode())
+            views = (await asyncio.to_thread(process.wait)).lines
     assert [view.get("step") for view in views] == [
         "about", "sheet", "rulers", "picture", "touch-1", None,
     ]  # fmt: skip

@@ -18,17 +18,17 @@ from commandline import (
     TRIGGER,
     WAITING,
     Peer,
-    Process,
     closed_port,
     emulators,
     run,
 )
+from processes import Process
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from commandline import Outcome
+    from processes import Outcome
 
 GET_CLOCK = bytes.fromhex("50535642 00000000 32000000")
 NOON = bytes.fromhex(

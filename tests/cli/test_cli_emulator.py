@@ -9,7 +9,8 @@ import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from commandline import SCENARIO, Process, run, run_emulator
+from commandline import SCENARIO, run, run_emulator
+from processes import Process
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,15 +20,14 @@ URL = re.compile(r"(bvs|bvs\+udp)://127\.0\.0\.1:(\d+)\?dialect=(handbook|thesis
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_emulator_signal_ends_it_well(number: int) -> None:
-    with Process("smartcam-emulator") as emulator:
+    with Process("smartcam-emulator", fresh=True) as emulator:
         line = emulator.read_until(b"\n")
         match = URL.fullmatch(line.strip())
         assert match is not None
         assert (match[1], match[3]) == ("bvs", "handbook")
         emulator.send_signal(number)
         outcome = emulator.wait()
-    assert outcome[:3] == (0, line, "")
-    assert outcome.seconds < 5
+    assert outcome == (0, line, "")
 
 
 def test_emulator_with_a_client_ends_well() -> None:
@@ -44,7 +44,7 @@ def test_emulator_with_a_client_ends_well() -> None:
 def test_emulator_in_a_background_that_ignores_sigint_ends_well(number: int) -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        emulator = Process("smartcam-emulator")
+        emulator = Process("smartcam-emulator", fresh=True)
     finally:
         signal.signal(signal.SIGINT, before)
     with emulator:

@@ -7,7 +7,8 @@ import signal
 from typing import TYPE_CHECKING
 
 import pytest
-from commandline import Process, closed_port, run, run_emulator
+from commandline import closed_port, run, run_emulator
+from processes import Process
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -6,7 +6,8 @@ import sys
 from typing import TYPE_CHECKING
 
 import pytest
-from commandline import Process, run, run_emulator
+from commandline import run, run_emulator
+from processes import Process
 
 import smartcam
 from smartcam.registry import INTERPRETERS, PROTOCOLS
@@ -131,7 +132,7 @@ def test_command_without_the_extra_exits_2_and_names_it(
 ) -> None:
     shim = f'raise ModuleNotFoundError("{missing}")\n'
     (tmp_path / f"{missing}.py").write_text(shim, encoding="utf-8")
-    with Process(program, "--version", env={"PYTHONPATH": str(tmp_path)}) as process:
+    with Process(program, "--version", env={"PYTHONPATH": str(tmp_path)}, fresh=True) as process:
         outcome = process.wait()
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err == f'{program}: needs the extra "cli": pip install "smartcam[cli]"\n'

@@ -12,9 +12,10 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from commandline import PATIENCE, Process, closed_port, emulators, run
+from commandline import closed_port, emulators, run
 from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
+from processes import PATIENCE, Process
 
 from smartcam.models import Connected, Reconnected
 from smartcam.recording import load_recording
