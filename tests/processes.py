@@ -35,6 +35,7 @@ MAINS = {"smartcam": "main", "smartcam-emulator": "emulator_main"}
 LOADED = (
     *("smartcam.cli.commands", "smartcam.cli.emulate", "smartcam.emulator.insight"),
     *("smartcam.calibration.wizard", "smartcam.recording", "smartcam.web", "mcap.writer"),
+    "scipy.special",
 )
 """What commands import, mostly when it is used."""
 
@@ -146,9 +147,14 @@ class Process:
         """Read no more."""
         self._close("stdout")
 
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._life.ended(0) is None
+
     def send_signal(self, number: int) -> None:
         """Send a signal; its number is its own as long as it has not ended."""
-        if self._life.ended(0) is None:
+        if self.running:
             os.kill(self._life.number, number)
 
     def wait(self) -> Outcome:

@@ -105,6 +105,16 @@ def run(
     return Outcome(code, out.read(), err.read())
 
 
+@contextlib.contextmanager
+def each(*case: object) -> Iterator[None]:
+    """Name the case of a loop in what goes wrong with it."""
+    try:
+        yield
+    except BaseException as exc:
+        exc.add_note(f"in the case {case}")
+        raise
+
+
 def run_as_far_as(text: str, *args: str) -> Outcome:
     """Run a command whose time-out ends it, but not before it has said ``text``.
 

@@ -145,6 +145,6 @@ def test_trigger_without_calibration_does_not_import_it() -> None:
         "print([name for name in sys.modules if name.startswith('smartcam.calibration.plane')])"
     )
     done = subprocess.run(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.strip() == "[]"

@@ -16,6 +16,7 @@ from commandline import (
     SWITCH_5,
     SWITCHED_5,
     WAITING,
+    each,
     run,
     thesis,
 )
@@ -30,24 +31,28 @@ LAYOUT_3 = "passed: bool, count: int32, x: real32, y: real32, code: string[8]"
 VALUE_3 = {"passed": True, "count": 2, "x": 101.5, "y": -3.25, "code": "ABC"}
 
 
-@pytest.mark.parametrize(
-    ("frame", "sender", "message", "body"),
-    [
-        (CONNECT, "client", "Connect", {}),
-        (CONNECTED, "camera", "ConnectAnswer", {"version": 1}),
-        (WAITING, "camera", "StatusReport", {"status": 0x280, "endian": 0}),
-        (BUSY, "camera", "StatusReport", {"status": 0x10, "endian": 0}),
-        (QUERY, "client", "Query", {}),
-        (ACTIVE_21, "camera", "QueryAnswer", {"application": 21}),
-        (SWITCH_5, "client", "SwitchApplication", {"application": 5}),
-        (SWITCHED_5, "camera", "SwitchAnswer", {"code": 0, "application": 5}),
-    ],
-)
-@pytest.mark.parametrize("dialect", ["handbook", "thesis"])
-def test_decode_frame_json_has_every_field(
-    frame: bytes, sender: str, message: str, body: dict[str, int], dialect: str
+FRAMES: list[tuple[bytes, str, str, dict[str, int]]] = [
+    (CONNECT, "client", "Connect", {}),
+    (CONNECTED, "camera", "ConnectAnswer", {"version": 1}),
+    (WAITING, "camera", "StatusReport", {"status": 0x280, "endian": 0}),
+    (BUSY, "camera", "StatusReport", {"status": 0x10, "endian": 0}),
+    (QUERY, "client", "Query", {}),
+    (ACTIVE_21, "camera", "QueryAnswer", {"application": 21}),
+    (SWITCH_5, "client", "SwitchApplication", {"application": 5}),
+    (SWITCHED_5, "camera", "SwitchAnswer", {"code": 0, "application": 5}),
+]
+
+
+def test_decode_frame_json_has_every_field() -> None:
+    for frame, sender, message, body in FRAMES:
+        for dialect, data in (("handbook", frame), ("thesis", thesis(frame))):
+            with each(dialect, message):
+                check_frame(frame, sender, message, body, dialect, data)
+
+
+def check_frame(
+    frame: bytes, sender: str, message: str, body: dict[str, int], dialect: str, data: bytes
 ) -> None:
-    data = frame if dialect == "handbook" else thesis(frame)
     (line,) = run("decode", data.hex(), "--json").done().lines
     assert (line["offset"], line["dialect"]) == (0, dialect)
     assert (line["sender"], line["message"]) == (sender, message)

@@ -19,6 +19,7 @@ from commandline import (
     Peer,
     emulators,
     run,
+    run_as_far_as,
 )
 from processes import PATIENCE
 
@@ -88,20 +89,20 @@ def test_probe_shows_each_frame_decoded_and_as_hex() -> None:
 
 
 def test_probe_ends_with_the_url_to_use(url: str) -> None:
-    outcome = run("probe", url.partition("?")[0], "--timeout", "3").done()
+    outcome = run_as_far_as("use: ", "probe", url.partition("?")[0]).done()
     assert outcome.out.splitlines()[-1] == f"use: {url}"
 
 
 def test_probe_pinned_wrong_finds_the_right_one(url: str) -> None:
     wrong = url.replace("handbook", "thesis")
-    *tries, found = run("probe", wrong, "--timeout", "3", "--json").done().lines
+    *tries, found = run_as_far_as('"url": ', "probe", wrong, "--json").done().lines
     assert (tries[0]["dialect"], tries[-1]["outcome"]) == ("thesis", "session")
     assert (found["url"], found["application"], found["also"]) == (url, 2, [])
 
 
 def test_probe_all_goes_on_behind_the_first_answer(url: str) -> None:
-    one = run("probe", url, "--timeout", "1", "--json").done().lines
-    *tries, found = run("probe", url, "--timeout", "1", "--all", "--json").done().lines
+    one = run_as_far_as('"url": ', "probe", url, "--json").done().lines
+    *tries, found = run_as_far_as('"url": ', "probe", url, "--all", "--json").done().lines
     assert len(one) == 2
     assert {each["transport"] for each in tries} == {"tcp", "udp"}
     assert [each["outcome"] == "session" for each in tries] == [True] + [False] * (len(tries) - 1)
@@ -110,7 +111,8 @@ def test_probe_all_goes_on_behind_the_first_answer(url: str) -> None:
 
 def test_probe_garbage_is_shown_as_hex_and_text() -> None:
     with Peer(greeting=b"SSH-2.0-OpenSSH_9.6\r\n") as peer:
-        outcome = run("probe", peer.host_and_port + "?dialect=handbook", "--timeout", "1")
+        address = f"{peer.host_and_port}?dialect=handbook"
+        outcome = run_as_far_as("wrong magic number", "probe", address)
     outcome.failed(3, "wrong magic number")
     (line,) = [each for each in lines_of(outcome.out, "tcp handbook") if each.startswith("!")]
     assert line.endswith(b"SSH-2.0-OpenSSH_9.6\r\n".hex() + "  'SSH-2.0-OpenSSH_9.6..'")
@@ -118,7 +120,7 @@ def test_probe_garbage_is_shown_as_hex_and_text() -> None:
 
 def test_probe_half_a_frame_is_shown() -> None:
     with Peer({CONNECT: CONNECTED[:14]}) as peer:
-        outcome = run("probe", peer.url, "--timeout", "1")
+        outcome = run_as_far_as("14 bytes, then silence", "probe", peer.url)
     outcome.failed(3, "14 bytes, then silence")
     line = lines_of(outcome.out, "tcp handbook")[-1]
     assert line.startswith("! 14 bytes that make no whole frame  ")
@@ -148,7 +150,8 @@ def test_probe_flood_is_counted_and_not_shown() -> None:
 
 def test_probe_broken_datagram_is_shown() -> None:
     with datagrams(b"nonsense") as address:
-        outcome = run("probe", f"bvs+udp://{address}?dialect=handbook", "--timeout", "1")
+        url = f"bvs+udp://{address}?dialect=handbook"
+        outcome = run_as_far_as(b"nonsense".hex(), "probe", url)
     outcome.failed(3, "handbook over UDP")
     shown = [each for each in lines_of(outcome.out, "udp handbook") if each.startswith("!")]
     assert shown
@@ -157,8 +160,9 @@ def test_probe_broken_datagram_is_shown() -> None:
 
 def test_probe_silence_says_what_was_sent() -> None:
     with Peer() as peer:
-        outcome = run("probe", peer.host_and_port, "--timeout", "1", "--json")
-    outcome.failed(3, "waiting for the answer to Connect: silence for ")
+        step = "waiting for the answer to Connect: silence for "
+        outcome = run_as_far_as(step, "probe", peer.host_and_port, "--json")
+    outcome.failed(3, step)
     tries = [json.loads(line) for line in outcome.out.splitlines()]
     assert CONNECT.hex() in [frame["hex"] for one in tries for frame in one["frames"]]
     assert {one["omitted"] for one in tries} == {0}

@@ -22,8 +22,10 @@ from commandline import (
     WAITING,
     Peer,
     closed_port,
+    each,
     emulators,
     run,
+    run_as_far_as,
 )
 
 from smartcam import Result
@@ -58,22 +60,10 @@ def urls(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[tuple[str, s
         yield dict(zip(WAYS, found, strict=True))
 
 
-@pytest.fixture(params=WAYS, ids="-".join)
-def way(request: pytest.FixtureRequest) -> tuple[str, str]:
-    pair: tuple[str, str] = request.param
-    return pair
-
-
 @pytest.fixture
-def each_url(urls: dict[tuple[str, str], str], way: tuple[str, str]) -> str:
-    return urls[way]
-
-
-@pytest.fixture
-def stoppable_url(each_url: str, way: tuple[str, str]) -> str:
-    if way[1] == "bid":
-        pytest.skip("a BVS ID always runs")
-    return each_url
+def stoppable(urls: dict[tuple[str, str], str]) -> list[str]:
+    """Return the addresses of all that can be stopped: a BVS ID always runs."""
+    return [url for (_, dialect), url in urls.items() if dialect != "bid"]
 
 
 @pytest.fixture
@@ -114,21 +104,20 @@ def check_parts(result: dict[str, Any]) -> None:
         assert sum(value**2 for value in orientation.values()) == pytest.approx(1)
 
 
-def test_trigger_json_localizations_prints_one_object(each_url: str) -> None:
-    outcome = run(
-        "trigger", each_url, "--application", "7", "--interpret-as", "localizations", "--json"
-    )
-    (result,) = outcome.done().lines
-    check_parts(result)
+def test_trigger_json_localizations_prints_one_object(urls: dict[tuple[str, str], str]) -> None:
+    seven = ("--application", "7", "--interpret-as", "localizations", "--json")
+    for url in urls.values():
+        with each(url):
+            (result,) = run("trigger", url, *seven).done().lines
+            check_parts(result)
 
 
-def test_trigger_dialect_not_pinned_is_found_out(each_url: str) -> None:
-    bare = each_url.partition("?")[0]
-    outcome = run(
-        "trigger", bare, "--application", "7", "--interpret-as", "Localizations", "--json"
-    )
-    (result,) = outcome.done().lines
-    check_parts(result)
+def test_trigger_dialect_not_pinned_is_found_out(urls: dict[tuple[str, str], str]) -> None:
+    seven = ("--application", "7", "--interpret-as", "Localizations", "--json")
+    for url in urls.values():
+        with each(url):
+            (result,) = run("trigger", url.partition("?")[0], *seven).done().lines
+            check_parts(result)
 
 
 def test_trigger_y_down_turns_the_poses(url: str) -> None:
@@ -236,11 +225,13 @@ def test_trigger_control_characters_stay_in_their_cell(url: str) -> None:
 # ---------------------------------------------------------------------- watch
 
 
-@pytest.mark.parametrize("more", [(), ("--seconds", "60"), ("--timeout", "10")])
-def test_watch_count_prints_as_many_results(url: str, more: tuple[str, ...]) -> None:
-    outcome = run("watch", url, "--application", "5", "--count", "3", "--json", *more).done()
-    assert [result["application"] for result in outcome.lines] == [5, 5, 5]
-    assert {result["triggered_at"] for result in outcome.lines} == {None}
+def test_watch_count_prints_as_many_results(url: str) -> None:
+    for more in ([], ["--seconds", "60"], ["--timeout", "60"]):
+        with each(*more):
+            told = ("watch", url, "--application", "5", "--count", "3", "--json")
+            outcome = run(*told, *more).done()
+            assert [result["application"] for result in outcome.lines] == [5, 5, 5]
+            assert {result["triggered_at"] for result in outcome.lines} == {None}
 
 
 def test_watch_seconds_without_result_ends_well(url: str) -> None:
@@ -251,16 +242,18 @@ def test_watch_seconds_without_result_ends_well(url: str) -> None:
 # ---------------------------------------------------------------------- status, switch, start, stop
 
 
-def test_status_json_has_the_fields(stoppable_url: str) -> None:
-    run("switch", stoppable_url, "2").done()
-    run("stop", stoppable_url).done()
-    assert state(stoppable_url) == {
-        "camera": stoppable_url.partition("//")[2].partition("?")[0],
-        "url": stoppable_url,
-        "status": [],
-        "active_application": 2,
-        "protocol_version": 1,
-    }
+def test_status_json_has_the_fields(stoppable: list[str]) -> None:
+    for url in stoppable:
+        with each(url):
+            run("switch", url, "2").done()
+            run("stop", url).done()
+            assert state(url) == {
+                "camera": url.partition("//")[2].partition("?")[0],
+                "url": url,
+                "status": [],
+                "active_application": 2,
+                "protocol_version": 1,
+            }
 
 
 def test_status_bare_host_is_taken_for_bvs_over_tcp(url: str) -> None:
@@ -279,14 +272,16 @@ def test_status_changes_nothing(url: str) -> None:
 
 
 @pytest.mark.parametrize(("first", "running"), [("start", True), ("stop", False)])
-def test_switch_keeps_the_run_state(stoppable_url: str, first: str, running: bool) -> None:
-    run(first, stoppable_url).done()
-    (line,) = run("switch", stoppable_url, "21", "--json").done().lines
-    assert line["active_application"] == 21
-    assert ("RUNNING" in line["status"]) is running
-    assert "application 2, " in run("switch", stoppable_url, "2").done().out
-    assert state(stoppable_url)["active_application"] == 2
-    assert ("RUNNING" in state(stoppable_url)["status"]) is running
+def test_switch_keeps_the_run_state(stoppable: list[str], first: str, running: bool) -> None:
+    for url in stoppable:
+        with each(url):
+            run(first, url).done()
+            (line,) = run("switch", url, "21", "--json").done().lines
+            assert line["active_application"] == 21
+            assert ("RUNNING" in line["status"]) is running
+            assert "application 2, " in run("switch", url, "2").done().out
+            assert state(url)["active_application"] == 2
+            assert ("RUNNING" in state(url)["status"]) is running
 
 
 @pytest.mark.parametrize("command", ["start", "stop"])
@@ -316,23 +311,28 @@ def tries(way: tuple[str, str]) -> list[tuple[str, str]]:
     return [(where, " or ".join(group)) for where, group in groups[:last]] + [way]
 
 
-def test_probe_host_and_port_finds_transport_and_dialect(
-    each_url: str, way: tuple[str, str]
-) -> None:
-    address = each_url.partition("//")[2].partition("?")[0]
-    outcome = run("probe", address, "--timeout", "4").done()
-    assert probed(outcome.out) == tries(way)
-    assert outcome.out.splitlines()[-1] == f"use: {each_url}"
-    begin = {"handbook": "50535642", "thesis": "42565350", "b16": "0100", "bid": "0100"}[way[1]]
-    assert f"  > Connect()  {begin}" in outcome.out
-    answer = "code=0, version=1" if way[1] == "bid" else "version=1"
-    assert f"  < ConnectAnswer({answer})  {begin}" in outcome.out
+BEGINS = {"handbook": "50535642", "thesis": "42565350", "b16": "0100", "bid": "0100"}
 
 
-def test_probe_url_begins_with_what_it_says(each_url: str, way: tuple[str, str]) -> None:
-    outcome = run("probe", each_url).done()
-    assert probed(outcome.out) == [way]
-    assert outcome.out.splitlines()[0].endswith(": a camera answers")
+def test_probe_host_and_port_finds_transport_and_dialect(urls: dict[tuple[str, str], str]) -> None:
+    for way, url in urls.items():
+        with each(way):
+            address = url.partition("//")[2].partition("?")[0]
+            outcome = run_as_far_as("use: ", "probe", address).done()
+            assert probed(outcome.out) == tries(way)
+            assert outcome.out.splitlines()[-1] == f"use: {url}"
+            begin = BEGINS[way[1]]
+            assert f"  > Connect()  {begin}" in outcome.out
+            answer = "code=0, version=1" if way[1] == "bid" else "version=1"
+            assert f"  < ConnectAnswer({answer})  {begin}" in outcome.out
+
+
+def test_probe_url_begins_with_what_it_says(urls: dict[tuple[str, str], str]) -> None:
+    for way, url in urls.items():
+        with each(way):
+            outcome = run("probe", url).done()
+            assert probed(outcome.out) == [way]
+            assert outcome.out.splitlines()[0].endswith(": a camera answers")
 
 
 def test_watch_application_named_results_of_the_one_before_are_not_shown() -> None:
@@ -358,7 +358,8 @@ def test_watch_application_named_results_of_the_one_before_are_not_shown() -> No
 
 def test_probe_json_gives_every_try_then_the_url(urls: dict[tuple[str, str], str]) -> None:
     url = urls["tcp", "thesis"]
-    *shown, found = run("probe", url.partition("?")[0], "--timeout", "4", "--json").done().lines
+    outcome = run_as_far_as('"url": ', "probe", url.partition("?")[0], "--json")
+    *shown, found = outcome.done().lines
     assert [(one["transport"], one["dialect"]) for one in shown] == tries(("tcp", "thesis"))
     *silent, answered = shown
     for one in silent:
@@ -373,11 +374,13 @@ def test_probe_json_gives_every_try_then_the_url(urls: dict[tuple[str, str], str
     assert (found["url"], found["protocol_version"]) == (url, 1)
 
 
-def test_probe_changes_nothing(each_url: str) -> None:
-    run("trigger", each_url, "--application", "21").done()
-    before = state(each_url)
-    assert "status: RUNNING + WAITING_FOR_TRIGGER" in run("probe", each_url).done().out
-    assert state(each_url) == before
+def test_probe_changes_nothing(urls: dict[tuple[str, str], str]) -> None:
+    for url in urls.values():
+        with each(url):
+            run("trigger", url, "--application", "21").done()
+            before = state(url)
+            assert "status: RUNNING + WAITING_FOR_TRIGGER" in run("probe", url).done().out
+            assert state(url) == before
 
 
 def test_probe_ends_with_disconnect() -> None:
@@ -388,7 +391,7 @@ def test_probe_ends_with_disconnect() -> None:
 
 def test_probe_nothing_there_exits_3_and_names_each_try() -> None:
     with closed_port() as address:
-        outcome = run("probe", address, "--timeout", "2")
+        outcome = run("probe", address, "--timeout", "0.3")
     every = [(way, " or ".join(group)) for way in TRIED for group in TRIED[way]]
     names = [f"{dialects} over {transport.upper()}" for transport, dialects in every]
     outcome.failed(3, address, *names)
@@ -397,7 +400,7 @@ def test_probe_nothing_there_exits_3_and_names_each_try() -> None:
 
 def test_probe_garbage_shows_the_broken_bytes() -> None:
     with Peer(greeting=b"HTTP/1.1 400") as peer:
-        outcome = run("probe", peer.host_and_port, "--timeout", "1", "--json")
+        outcome = run_as_far_as("wrong magic number", "probe", peer.host_and_port, "--json")
     outcome.failed(3, "wrong magic number")
     first = json.loads(outcome.out.splitlines()[0])["frames"]
     assert any(f["direction"] == "!" and f["hex"].startswith("48545450") for f in first)

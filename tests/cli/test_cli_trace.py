@@ -25,6 +25,7 @@ from commandline import (
     WAITING,
     Peer,
     run,
+    run_as_far_as,
 )
 
 RESULT_5 = bytes.fromhex("50535642 05000000 20000000 05000000 2a")
@@ -104,7 +105,8 @@ def test_trace_short_body_is_shown_with_its_error(tmp_path: Path) -> None:
 def test_trace_probe_has_the_frames_of_every_try(tmp_path: Path) -> None:
     path = tmp_path / "trace.jsonl"
     with Peer() as peer:
-        run("probe", peer.host_and_port, "--timeout", "1", "--trace", str(path)).failed(3)
+        thesis = "thesis over TCP: waiting for the answer to Connect"
+        run_as_far_as(thesis, "probe", peer.host_and_port, "--trace", str(path)).failed(3)
     connects = [e["hex"] for e in entries(path) if e["message"] == "Connect"]
     assert connects.count(CONNECT.hex()) >= 1
     assert connects.count("425653500400000001000000") >= 1
