@@ -105,7 +105,7 @@ def test_doctor_layout_that_differs_shows_the_bytes_beside_the_fields() -> None:
 
 def test_doctor_garbage_is_shown_as_bytes_and_text() -> None:
     with Peer(greeting=b"SSH-2.0-OpenSSH_9.6\r\n") as peer:
-        outcome = doctor(peer.url)
+        outcome = run_as_far_as("SSH-2.0", "doctor", peer.url)
     assert outcome.code == 3
     assert "5353482d322e302d" in outcome.out
     assert "'SSH-2.0-OpenSSH_9.6..'" in outcome.out

@@ -176,11 +176,8 @@ def test_watch_count_without_result_exits_4() -> None:
 
 def test_command_unknown_application_exits_5(url: str) -> None:
     for application, text in (("0", "id 0"), ("99", "refused to switch to application 99")):
-        for command, *option in (
-            ["switch"],
-            ["trigger", "--application"],
-            ["watch", "--application"],
-        ):
+        for command in ("switch", "trigger", "watch"):
+            option = [] if command == "switch" else ["--application"]
             with each(command, application):
                 run(command, url, *option, application).failed(5, text)
 

@@ -74,7 +74,7 @@ class Listener:
 
     async def next(self, kind: str | None = None) -> Told:
         """Return the next event, of a kind."""
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             while True:
                 block = (await self.response.content.readuntil(b"\n\n")).decode()
                 fields = dict(line.split(": ", 1) for line in block.splitlines() if line)
@@ -91,7 +91,7 @@ class Listener:
 
     async def end(self) -> bytes:
         """Return what comes until the stream ends."""
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             return await self.response.content.read()
 
 
@@ -148,7 +148,7 @@ class Raw:
     async def ask(self, *lines: str) -> tuple[int, bytes]:
         """Send a request's head and return the answer's status and body."""
         self.writer.write("\r\n".join((*lines, "", "")).encode())
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             head = (await self.reader.readuntil(b"\r\n\r\n")).decode()
             size = next(
                 int(line.partition(":")[2])
@@ -158,7 +158,7 @@ class Raw:
             return int(head.split()[1]), await self.reader.readexactly(size)
 
 
-async def until(condition: Callable[[], object], seconds: float = 5) -> None:
+async def until(condition: Callable[[], object], seconds: float = 60) -> None:
     """Let the loop run until something is true."""
     async with asyncio.timeout(seconds):
         while not condition():  # noqa: ASYNC110 - whatever the condition is

@@ -142,7 +142,7 @@ async def test_trigger_brings_the_client_a_result() -> None:
         served(active=21, running=True) as world,
         smartcam.connect(world.emulator.url, interpret_as="text: string[20]") as camera,
     ):
-        waiting = asyncio.create_task(camera.next_result(timeout=5))
+        waiting = asyncio.create_task(camera.next_result(timeout=60))
         await asyncio.sleep(0)  # let it begin to wait
         answer = await world.caller.post("trigger")
         assert answer["taken"] is True
@@ -160,9 +160,9 @@ async def test_trigger_of_a_stopped_camera_is_not_taken() -> None:
 async def test_start_and_stop_are_seen_by_the_client() -> None:
     async with served() as world, smartcam.connect(world.emulator.url) as camera:
         assert (await world.caller.post("start"))["camera"]["running"] is True
-        await camera.wait_status(lambda status: Status.RUNNING in status, timeout=5)
+        await camera.wait_status(lambda status: Status.RUNNING in status, timeout=60)
         assert (await world.caller.post("stop", {}))["camera"]["running"] is False
-        await camera.wait_status(lambda status: Status.RUNNING not in status, timeout=5)
+        await camera.wait_status(lambda status: Status.RUNNING not in status, timeout=60)
 
 
 async def test_application_is_loaded_and_runs() -> None:
@@ -449,7 +449,7 @@ async def test_log_that_waits_ends_with_the_site(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(EmulatorSite, "pause", told)
     async with served() as world:
         waiting = asyncio.create_task(world.caller.get("log?wait=30"))
-        async with asyncio.timeout(2):
+        async with asyncio.timeout(60):
             await waits.wait()
             await world.site.stop()
             assert (await waiting)["entries"] == []

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 PROGRAM = [sys.executable, "-c", "from smartcam.cli import emulator_main; emulator_main()"]
-PATIENCE = 15
+PATIENCE = 60
 TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
 
 

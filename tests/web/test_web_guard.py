@@ -227,6 +227,6 @@ def test_missing_aiohttp_is_told_in_one_line() -> None:
         "except smartcam.exceptions.MissingExtraError as error: print(error, error.extra)"
     )
     done = subprocess.run(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout == 'the web page needs aiohttp: pip install "smartcam[web]" web\n'

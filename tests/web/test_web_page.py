@@ -1,23 +1,19 @@
-"""The emulator's page in a real browser, with real clients at the cameras.
-
-It needs Chromium: on the path, or named by the environment variable CHROMIUM.
-"""
+"""The emulator's page in a real browser, with real clients at the cameras."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import math
-import os
-import shutil
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 import pytest_asyncio
+from browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
 from sitekit import TOKEN, until
 
 import smartcam
-from smartcam.emulator import EmulatedCamera
+from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.emulator.faults import FAULTS
 from smartcam.emulator.scene import PIECES
 from smartcam.models import Status
@@ -26,21 +22,10 @@ from smartcam.web import EmulatorSite
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from playwright.async_api import ConsoleMessage, Error, Page, ViewportSize
+    from playwright.async_api import Page, ViewportSize
 
-playwright = pytest.importorskip("playwright.async_api")
+pytestmark = BROWSER_MARKS
 
-CHROMIUM = os.environ.get("CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path, nor named by CHROMIUM"),
-]
-
-PATIENCE_MS = 5000
 LIVE = "#live[data-state=live]"
 HELLO = "text: string[20]"
 
@@ -70,12 +55,8 @@ SIZE: ViewportSize = {"width": 1440, "height": 1000}
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def page() -> AsyncIterator[Page]:
     """The one page of all tests; each opens a site of its own in it."""
-    async with playwright.async_playwright() as tool:
-        browser = await tool.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = await browser.new_page(viewport=SIZE)
-        page.set_default_timeout(PATIENCE_MS)
+    async with new_page(**SIZE) as page:
         yield page
-        await browser.close()
 
 
 @contextlib.asynccontextmanager
@@ -83,19 +64,8 @@ async def opened(
     page: Page, *cameras: EmulatedCamera, token: str | None = None, at: str | None = None
 ) -> AsyncIterator[View]:
     """Show cameras; what the browser finds wrong with the page fails the test."""
-    wrong: list[str] = []
-
-    def on_error(error: Error) -> None:
-        wrong.append(str(error))
-
-    def on_console(said: ConsoleMessage) -> None:
-        # an answer that refuses is told here, too
-        if said.type == "error" and "Failed to load resource" not in said.text:
-            wrong.append(said.text)
-
-    page.on("pageerror", on_error)
-    page.on("console", on_console)
     async with contextlib.AsyncExitStack() as stack:
+        stack.enter_context(nothing_wrong(page))
         for camera in cameras:
             await stack.enter_async_context(camera)
         named = {camera.name: camera for camera in cameras}
@@ -107,9 +77,6 @@ async def opened(
             await view.see("#camera-title", cameras[0].name)
         yield view
         await page.goto("about:blank")
-    page.remove_listener("pageerror", on_error)
-    page.remove_listener("console", on_console)
-    assert wrong == []
 
 
 def greeting(**options: Any) -> EmulatedCamera:
@@ -134,7 +101,7 @@ async def test_page_shows_the_camera_and_its_client(page: Page) -> None:
 async def test_trigger_button_brings_the_client_a_result(page: Page) -> None:
     async with opened(page, greeting()) as view:
         async with smartcam.connect(view.emulator.url, interpret_as=HELLO) as camera:
-            waiting = asyncio.create_task(camera.next_result(timeout=5))
+            waiting = asyncio.create_task(camera.next_result(timeout=PATIENCE))
             await page.click("#trigger")
             assert (await waiting).value.text == "Hello World"
             await view.see("#told", "an inspection began")
@@ -148,23 +115,23 @@ async def test_trigger_button_brings_the_client_a_result(page: Page) -> None:
 async def test_buttons_change_what_the_client_sees(page: Page) -> None:
     async with opened(page, greeting()) as view, smartcam.connect(view.emulator.url) as camera:
         await page.click("#stop")
-        await camera.wait_status(lambda status: Status.RUNNING not in status, timeout=5)
+        await camera.wait_status(lambda status: Status.RUNNING not in status, timeout=PATIENCE)
         await view.see("li[data-bit=RUNNING][data-on=false]")
         await page.click("#start")
-        await camera.wait_status(lambda status: Status.RUNNING in status, timeout=5)
+        await camera.wait_status(lambda status: Status.RUNNING in status, timeout=PATIENCE)
         await view.see("li[data-bit=WAITING_FOR_TRIGGER][data-on=true]")
         hot = "[data-condition=overheat]"
         await page.click(hot)
-        await camera.wait_status(lambda status: Status.OVERHEAT in status, timeout=5)
+        await camera.wait_status(lambda status: Status.OVERHEAT in status, timeout=PATIENCE)
         await view.see(f"{hot}[aria-pressed=true]")
         await view.see("li[data-bit=OVERHEAT][data-on=true]")
         await page.click(hot)
-        await camera.wait_status(lambda status: Status.OVERHEAT not in status, timeout=5)
+        await camera.wait_status(lambda status: Status.OVERHEAT not in status, timeout=PATIENCE)
         await view.see(f"{hot}[aria-pressed=false]")
         await page.select_option("#application", "3")
         await page.check("#switch-running")
         await page.click("#switch button")
-        await camera.wait_status(lambda status: Status.BUSY in status, timeout=5)
+        await camera.wait_status(lambda status: Status.BUSY in status, timeout=PATIENCE)
         await view.see("#mode", "running")
         await view.see("#facts", "3 part check, triggered")
         assert await camera.query_application() == 3
@@ -181,13 +148,15 @@ async def test_byte_order_is_that_of_the_next_result(page: Page) -> None:
 
 
 async def test_reboot_is_seen_and_the_client_comes_back(page: Page) -> None:
-    async with opened(page, greeting()) as view:
+    clock = ManualClock()
+    async with opened(page, greeting(clock=clock)) as view:
         async with smartcam.connect(view.emulator.url) as camera:
             events = camera.events()
             await page.fill("#reboot-seconds", "0.4")
             await page.click("#reboot button")
             await view.see("#mode", "rebooting")
-            async with asyncio.timeout(10):
+            clock.advance(0.4)
+            async with asyncio.timeout(PATIENCE):
                 async for event in events:
                     if isinstance(event, smartcam.Reconnected):
                         break

@@ -37,7 +37,7 @@ def places_of(world: World) -> Places:
 
 async def ended(raw: Raw) -> bytes:
     """Return what comes until the site closes the connection."""
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         try:
             return await raw.reader.read()
         except ConnectionResetError:
@@ -191,7 +191,7 @@ async def test_head_may_come_byte_by_byte_and_its_body_with_it() -> None:
             raw.writer.write(bytes([byte]))
             await raw.writer.drain()
             await asyncio.sleep(0)
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             assert (await raw.reader.readuntil(b"\r\n")).startswith(b"HTTP/1.1 200 ")
         assert world.emulator.device.endian == 1
 
@@ -255,7 +255,7 @@ async def test_site_that_stops_while_a_client_is_accepted_leaves_nothing(rounds:
         for _ in range(rounds):
             await asyncio.sleep(0)
         await world.site.stop()
-        sock.settimeout(5)
+        sock.settimeout(60)
         with sock, contextlib.suppress(ConnectionResetError):
             assert sock.recv(1) == b""
 
@@ -353,9 +353,9 @@ async def test_half_requests_do_not_take_the_process_its_descriptors() -> None:
         stack.callback(ended_process, process)
         port, url = (await process.stdout.readline()).decode().split()
         for _ in range(300):
-            attacker = socket.create_connection(("127.0.0.1", int(port)), timeout=5)
+            attacker = socket.create_connection(("127.0.0.1", int(port)), timeout=60)
             stack.enter_context(attacker).sendall(HALF)
-        async with smartcam.connect(url, connect_timeout=5) as camera:
+        async with smartcam.connect(url, connect_timeout=60) as camera:
             assert camera.active_application == 1
         async with (
             aiohttp.ClientSession() as session,

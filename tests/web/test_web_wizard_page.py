@@ -1,17 +1,13 @@
-"""The wizard's page in a real browser.
-
-It needs Chromium: on the path, or named by the environment variable CHROMIUM.
-"""
+"""The wizard's page in a real browser."""
 
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 import pytest_asyncio
+from browser import BROWSER_MARKS, new_page, nothing_wrong
 from sitekit import TOKEN
 from test_web_wizard import MARKS, World, run_through, served
 
@@ -21,19 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from playwright.async_api import ConsoleMessage, Error, Page
+    from playwright.async_api import Page
 
-playwright = pytest.importorskip("playwright.async_api")
-
-CHROMIUM = os.environ.get("CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path, nor named by CHROMIUM"),
-]
+pytestmark = BROWSER_MARKS
 
 TOUCHES = [
     (x + shift, y - shift, 0.0) for (x, y), shift in zip(MARKS, (0, 3e-4, 0, 0), strict=True)
@@ -43,12 +29,8 @@ TOUCHES = [
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def page() -> AsyncIterator[Page]:
     """The one page of all tests; each opens a site of its own in it."""
-    async with playwright.async_playwright() as tool:
-        browser = await tool.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = await browser.new_page(viewport={"width": 1200, "height": 900})
-        page.set_default_timeout(5000)
+    async with new_page() as page:
         yield page
-        await browser.close()
 
 
 class View(NamedTuple):
@@ -78,25 +60,11 @@ class View(NamedTuple):
 @contextlib.asynccontextmanager
 async def opened(page: Page, folder: Path, token: str | None = None) -> AsyncIterator[View]:
     """Show the page; what the browser finds wrong with it fails the test."""
-    wrong: list[str] = []
-
-    def on_error(error: Error) -> None:
-        wrong.append(str(error))
-
-    def on_console(said: ConsoleMessage) -> None:
-        # an answer that refuses is told here, too
-        if said.type == "error" and "Failed to load resource" not in said.text:
-            wrong.append(said.text)
-
-    page.on("pageerror", on_error)
-    page.on("console", on_console)
-    async with served(folder, token) as world:
-        await page.goto(world.site.url)
-        yield View(page, world)
-        await page.goto("about:blank")
-    page.remove_listener("pageerror", on_error)
-    page.remove_listener("console", on_console)
-    assert wrong == []
+    with nothing_wrong(page):
+        async with served(folder, token) as world:
+            await page.goto(world.site.url)
+            yield View(page, world)
+            await page.goto("about:blank")
 
 
 async def begin(view: View) -> None:

@@ -1,16 +1,12 @@
-"""The wizard's page with steps that look at pictures, in a real browser.
-
-It needs Chromium: on the path, or named by the environment variable CHROMIUM.
-"""
+"""The wizard's page with steps that look at pictures, in a real browser."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pytest
 import pytest_asyncio
-from test_web_wizard_page import CHROMIUM
+from browser import BROWSER_MARKS, new_page
 
 from smartcam.calibration.folder import Folder
 from smartcam.calibration.frames import Transform
@@ -29,14 +25,7 @@ if TYPE_CHECKING:
 
     from playwright.async_api import Page
 
-playwright = pytest.importorskip("playwright.async_api")
-
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path, nor named by CHROMIUM"),
-]
+pytestmark = BROWSER_MARKS
 
 TARGET = Checkerboard(columns=9, rows=6, square=0.025, origin_mark=True)
 CAMERA = CameraModel(
@@ -49,12 +38,8 @@ SEEN = Transform("camera", "target", np.diag([1.0, -1.0, -1.0]), np.array([-0.1,
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def page() -> AsyncIterator[Page]:
-    async with playwright.async_playwright() as tool:
-        browser = await tool.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = await browser.new_page(viewport={"width": 1200, "height": 900})
-        page.set_default_timeout(10_000)
+    async with new_page() as page:
         yield page
-        await browser.close()
 
 
 @pytest_asyncio.fixture(loop_scope="module")

@@ -1,0 +1,63 @@
+"""A real browser for the pages; modules that import this are skipped where there is none."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+
+    from playwright.async_api import ConsoleMessage, Error, Page
+
+playwright = pytest.importorskip(
+    "playwright.async_api", reason="needs playwright, of the extra dev"
+)
+
+CHROMIUM = os.environ.get("CHROMIUM") or next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+if CHROMIUM is None:
+    pytest.skip("needs Chromium on the path, or named by CHROMIUM", allow_module_level=True)
+
+BROWSER_MARKS = [pytest.mark.long, pytest.mark.real_time, pytest.mark.asyncio(loop_scope="module")]
+"""What marks a module that shows pages."""
+
+PATIENCE = 60.0
+"""Seconds; only what has gone wrong takes as long."""
+
+
+@contextlib.asynccontextmanager
+async def new_page(width: int = 1200, height: int = 900) -> AsyncIterator[Page]:
+    """Start a browser and show an empty page."""
+    async with playwright.async_playwright() as tool:
+        browser = await tool.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = await browser.new_page(viewport={"width": width, "height": height})
+        page.set_default_timeout(1000 * PATIENCE)
+        yield page
+        await browser.close()
+
+
+@contextlib.contextmanager
+def nothing_wrong(page: Page) -> Iterator[None]:
+    """Fail where the browser finds something wrong with the page."""
+    wrong: list[str] = []
+
+    def on_error(error: Error) -> None:
+        wrong.append(str(error))
+
+    def on_console(said: ConsoleMessage) -> None:
+        # an answer that refuses is told here, too
+        if said.type == "error" and "Failed to load resource" not in said.text:
+            wrong.append(said.text)
+
+    page.on("pageerror", on_error)
+    page.on("console", on_console)
+    yield
+    page.remove_listener("pageerror", on_error)
+    page.remove_listener("console", on_console)
+    assert wrong == []
