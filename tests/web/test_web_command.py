@@ -3,69 +3,26 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
-import subprocess
-import sys
 import urllib.error
 import urllib.request
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from processes import PATIENCE, Process
 
 from smartcam.cli.emulate import command
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-PROGRAM = [sys.executable, "-c", "from smartcam.cli import emulator_main; emulator_main()"]
-PATIENCE = 60
 TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
 
 
-class Command:
-    """A running ``smartcam-emulator``."""
-
-    def __init__(self, *options: str, **environment: str) -> None:
-        self.process = subprocess.Popen(  # noqa: S603 - our own interpreter
-            [*PROGRAM, *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **environment},
-        )
-
-    def line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline().strip()
-
-    def page(self) -> str:
-        """Return the page's address."""
-        assert self.process.stderr is not None
-        match = re.fullmatch(r"page: (http://\S+)\n", self.process.stderr.readline())
-        assert match is not None
-        return match[1]
-
-    def end(self) -> tuple[int, str, str]:
-        self.process.send_signal(signal.SIGINT)
-        out, err = self.process.communicate(timeout=PATIENCE)
-        return self.process.returncode, out, err
-
-
-@pytest.fixture
-def start() -> Iterator[Any]:
-    running: list[Command] = []
-
-    def started(*options: str, **environment: str) -> Command:
-        running.append(Command(*options, **environment))
-        return running[-1]
-
-    yield started
-    for one in running:
-        one.process.kill()
-        one.process.communicate()
+def page_of(emulator: Process) -> str:
+    """Return the page's address."""
+    match = re.fullmatch(r"page: (http://\S+)\n", emulator.read_until(b"\n", stream="stderr"))
+    assert match is not None
+    return match[1]
 
 
 def get(url: str, token: str | None = None) -> Any:
@@ -81,32 +38,34 @@ def refused(*options: str) -> str:
     return done.output.splitlines()[-1]
 
 
-def test_web_shows_all_cameras_and_ends_with_a_stream_open(start: Any) -> None:
-    emulator = start("--web", "--cameras", "2")
-    page = emulator.page()
-    urls = [emulator.line() for _ in range(2)]
-    cameras = get(f"{page}api/cameras")["cameras"]
-    assert [(one["name"], one["url"]) for one in cameras] == [
-        ("camera1", urls[0]),
-        ("camera2", urls[1]),
-    ]
-    with urllib.request.urlopen(f"{page}api/cameras/camera2/events") as stream:  # noqa: S310
-        assert stream.readline() == b"event: camera\n"
-        assert emulator.end() == (0, "", "")
+def test_web_shows_all_cameras_and_ends_with_a_stream_open() -> None:
+    with Process("smartcam-emulator", "--web", "--cameras", "2", fresh=True) as emulator:
+        page = page_of(emulator)
+        urls = emulator.read_until(b"\n", count=2).splitlines()
+        cameras = get(f"{page}api/cameras")["cameras"]
+        assert [(one["name"], one["url"]) for one in cameras] == [
+            ("camera1", urls[0]),
+            ("camera2", urls[1]),
+        ]
+        with urllib.request.urlopen(f"{page}api/cameras/camera2/events") as stream:  # noqa: S310
+            assert stream.readline() == b"event: camera\n"
+            emulator.send_signal(signal.SIGINT)
+            ended = emulator.wait()
+    assert (ended.code, ended.err) == (0, f"page: {page}\n")
 
 
-def test_web_json_has_name_and_page_of_a_camera_and_the_token_is_that_of_the_environment(
-    start: Any,
-) -> None:
-    emulator = start("--web", "--json", SMARTCAM_WEB_TOKEN=TOKEN)
-    camera = json.loads(emulator.line())
-    page, _, fragment = camera["web"].partition("#")
-    assert (camera["name"], fragment) == ("camera", f"token={TOKEN}")
-    assert emulator.page() == camera["web"]
-    assert get(f"{page}api/cameras/camera", TOKEN)["url"] == camera["url"]
-    with pytest.raises(urllib.error.HTTPError, match="401"):
-        get(f"{page}api/cameras")
-    assert emulator.end() == (0, "", "")
+def test_web_json_has_name_and_page_of_a_camera_and_the_token_is_that_of_the_environment() -> None:
+    env = {"SMARTCAM_WEB_TOKEN": TOKEN}
+    with Process("smartcam-emulator", "--web", "--json", env=env, fresh=True) as emulator:
+        camera = json.loads(emulator.read_until(b"\n"))
+        page, _, fragment = camera["web"].partition("#")
+        assert (camera["name"], fragment) == ("camera", f"token={TOKEN}")
+        assert page_of(emulator) == camera["web"]
+        assert get(f"{page}api/cameras/camera", TOKEN)["url"] == camera["url"]
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            get(f"{page}api/cameras")
+        emulator.send_signal(signal.SIGINT)
+        assert emulator.wait().code == 0
 
 
 def test_web_that_cannot_be_is_refused_in_one_line() -> None:
