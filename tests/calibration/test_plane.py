@@ -80,9 +80,9 @@ def test_fit_plane_similarity_of_a_tilted_camera_warns() -> None:
 @pytest.mark.long
 def test_fit_plane_chooses_a_wrong_model_seldom() -> None:
     chosen = [
-        fit_plane(GRID, SCENE.touched(GRID, seed), touch_sigma=SIGMA).model for seed in range(200)
+        fit_plane(GRID, SCENE.touched(GRID, seed), touch_sigma=SIGMA).model for seed in range(100)
     ]
-    assert chosen.count("similarity") >= 194
+    assert chosen.count("similarity") >= 96
 
 
 def test_fit_plane_auto_leaves_out_a_model_that_is_not_determined() -> None:
@@ -224,11 +224,11 @@ def test_predicted_error_equals_the_observed_one(model: Any) -> None:
     places = np.array([[0.0, 0.0], [0.15, 0.12], [0.35, 0.1]])
     found = [
         fit_plane(GRID, SCENE.touched(GRID, seed), model=model, touch_sigma=SIGMA)
-        for seed in range(300)
+        for seed in range(200)
     ]
     errors = np.array([one.transform(places) - SCENE.robot(places) for one in found])
     observed = np.sqrt((errors**2).sum(axis=2).mean(axis=0))
-    assert found[0].predicted_error(places) == pytest.approx(observed, rel=0.1)
+    assert found[0].predicted_error(places) == pytest.approx(observed, rel=0.12)
 
 
 def test_predicted_error_without_any_sigma_raises() -> None:

@@ -104,12 +104,12 @@ def test_fit_plane_robust_of_points_that_all_agree_is_the_ordinary_fit() -> None
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("sigma", "most"), [(SIGMA, 8), (None, 14)])
+@pytest.mark.parametrize(("sigma", "most"), [(SIGMA, 5), (None, 8)])
 def test_fit_plane_robust_leaves_out_a_good_point_seldom(sigma: float | None, most: int) -> None:
     ones = np.ones(9)
     left_out = sum(
         not agreeing(GRID, SCENE.touched(GRID, seed), ones, sigma).all()
-        for seed in range(1000, 1300)
+        for seed in range(1000, 1150)
     )
     assert left_out <= most
 
@@ -124,13 +124,13 @@ def test_fit_plane_robust_predicted_error_is_the_observed_one(
 ) -> None:
     places = np.array([[0.0, 0.0], [0.15, 0.12], [0.35, 0.1]])
     observed = predicted = 0.0
-    for seed in range(2000, 2100):
+    for seed in range(2000, 2060):
         wrong = np.random.default_rng(seed).permutation(len(marks))[:count].tolist()
         touches = with_wrong(marks, wrong, seed)
         found = robust(marks, touches, touch_sigma=sigma, model="similarity")
         observed += float(((found.transform(places) - SCENE.robot(places)) ** 2).sum())
         predicted += float((found.predicted_error(places) ** 2).sum())
-    assert math.sqrt(predicted / observed) == pytest.approx(1.0, abs=0.1)
+    assert math.sqrt(predicted / observed) == pytest.approx(1.0, abs=0.13)
 
 
 @pytest.mark.long

@@ -88,6 +88,7 @@ def test_ellipse_shift_grows_with_the_tilt(tilt: int) -> None:
     assert low <= np.linalg.norm(shifts, axis=1).max() < high
 
 
+@pytest.mark.long
 def test_refine_dots_of_large_dots_is_as_exact() -> None:
     large = CameraModel(size=(1280, 960), matrix=np.diag([2, 2, 1]) @ STRAIGHT.matrix)
     few = CircleGrid(columns=4, rows=3, spacing=0.06, diameter=0.045)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration.frames import Transform
 
-CAMERA = CameraModel(size=(640, 480), matrix=np.array([[600.0, 0, 320], [0, 595, 235], [0, 0, 1]]))
+CAMERA = CameraModel(size=(480, 360), matrix=np.array([[450.0, 0, 240], [0, 447, 176], [0, 0, 1]]))
 TRUTH = scene("eye-in-hand", poses=6, seed=7)
 
 

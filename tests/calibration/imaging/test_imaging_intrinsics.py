@@ -33,11 +33,11 @@ def test_calibrate_intrinsics_finds_the_lens_as_well_as_it_says() -> None:
 @pytest.mark.long
 def test_calibrate_intrinsics_covariance_is_that_of_its_errors() -> None:
     squares = []
-    for seed in range(12):
-        found = calibrate_intrinsics(seen(LEFT, poses(8, seed=seed), seed=seed), sheet="exact")
+    for seed in range(9):
+        found = calibrate_intrinsics(seen(LEFT, poses(6, seed=seed), seed=seed), sheet="exact")
         off = lens_values(found.camera) - lens_values(LEFT)
         squares.append(off @ np.linalg.solve(found.covariance, off))
-    assert np.mean(squares) == pytest.approx(9.0, abs=3.7)  # 3 sigma of the mean
+    assert np.mean(squares) == pytest.approx(9.0, abs=4.3)  # 3 sigma of the mean
 
 
 def test_calibrate_intrinsics_residuals_are_the_noise_and_held_out_a_little_more() -> None:
