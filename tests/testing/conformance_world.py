@@ -7,6 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pace import is_first, slowed
+
 from smartcam.emulator import EmulatedCamera
 from smartcam.testing.conformance import Allow, Plan, Report, judge
 from smartcam.testing.threads import LoopThread
@@ -73,7 +75,18 @@ def short_plan(url: str, **fields: Any) -> Plan:
         "sequence_offset": 0,
         "input_data": bytes(4),
     }
-    return Plan(url=url, **{**given, **fields})
+    return Plan(url=url, **_slowed({**given, **fields}))
+
+
+SECONDS = {
+    *("quiet", "timeout", "switch_timeout", "reboot_timeout"),
+    *("load_time", "processing_time", "overtriggered_time", "reboot_time"),
+}
+"""What is told in seconds, of a plan, an application and a camera's quirks."""
+
+
+def _slowed(fields: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: slowed(one) if name in SECONDS else one for name, one in fields.items()}
 
 
 @contextlib.contextmanager
@@ -92,7 +105,10 @@ def emulated(
     thread: LoopThread, sin: Callable[[Any], None] | None = None, **options: Any
 ) -> Iterator[EmulatedCamera]:
     """Run an emulated camera with short times in a thread."""
-    emulator = EmulatedCamera(**{"applications": APPLICATIONS, **options})
+    given = {"applications": APPLICATIONS, **options}
+    given["applications"] = [_slowed(one) for one in given["applications"]]
+    given["quirks"] = _slowed(given.get("quirks", {}))
+    emulator = EmulatedCamera(**given)
     if sin is not None:
         sin(emulator)
     thread.wait(emulator.start())
@@ -112,3 +128,17 @@ def judge_all(cases: Iterable[Case]) -> list[Report]:
     """Judge cameras, several at the same time."""
     with loop_thread() as thread, ThreadPoolExecutor(AT_ONCE) as pool:
         return list(pool.map(lambda case: judge_case(thread, case), cases))
+
+
+class Judged:
+    """The reports of cases: of all together, and at a slower pace of each that is asked for."""
+
+    def __init__(self, cases: list[Case]) -> None:
+        self._cases = cases
+        self._reports = judge_all(cases)
+
+    def __getitem__(self, number: int) -> Report:
+        if is_first():
+            return self._reports[number]
+        (report,) = judge_all([self._cases[number]])
+        return report

@@ -15,11 +15,13 @@ from conformance_world import (
     OTHER,
     WORLDS,
     Case,
+    Judged,
     emulated,
     judge_all,
     loop_thread,
     short_plan,
 )
+from pace import at_any_pace, slowed
 
 from smartcam.emulator import Quirks, Scenario, links
 from smartcam.exceptions import ConfigurationError
@@ -34,7 +36,6 @@ from smartcam.testing.conformance.verdicts import Check, Outcome
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from smartcam.testing.conformance import Report
     from smartcam.testing.threads import LoopThread
 
 pytestmark = pytest.mark.long
@@ -84,7 +85,7 @@ SETTINGS = [
 
 
 @pytest.fixture(scope="module")
-def judged() -> Iterator[list[Report]]:
+def judged() -> Iterator[Judged]:
     """Judge all cameras of this file together: they wait nearly always."""
     cases = [
         *(Case({"dialect": d, "transport": t, "quirks": FAST}) for d, t in WORLDS),
@@ -104,32 +105,16 @@ def judged() -> Iterator[list[Report]]:
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(links.Link, "_take", conformance_sins.open_to_bytes)
-        yield judge_all(cases)
-
-
-@pytest.fixture(scope="module")
-def documented(judged: list[Report]) -> dict[tuple[str, str], Report]:
-    return dict(zip(WORLDS, judged, strict=False))
-
-
-@pytest.fixture(scope="module")
-def quirky(judged: list[Report]) -> dict[tuple[str, Any, str, str], Report]:
-    return dict(zip(SETTINGS, judged[len(WORLDS) :], strict=False))
-
-
-@pytest.fixture(scope="module")
-def sinful(judged: list[Report]) -> list[Report]:
-    return judged[len(WORLDS) + len(SETTINGS) :]
+        yield Judged(cases)
 
 
 # ---------------------------------------------------------------------- documented cameras
 
 
 @pytest.mark.parametrize("world", WORLDS, ids="-".join)
-def test_judge_documented_camera_finds_nothing(
-    world: tuple[str, str], documented: dict[tuple[str, str], Report]
-) -> None:
-    report = documented[world]
+@at_any_pace
+def test_judge_documented_camera_finds_nothing(world: tuple[str, str], judged: Judged) -> None:
+    report = judged[WORLDS.index(world)]
     assert [(one.item.name, one.expected, one.came) for one in report.differing] == []
     unseen = {one.item.name for one in report.findings if one.outcome is Outcome.NOT_OBSERVED}
     assert unseen <= {"free-run-needs-no-trigger", "waiting_before_result"}
@@ -137,20 +122,20 @@ def test_judge_documented_camera_finds_nothing(
 
 
 @pytest.mark.parametrize("world", WORLDS, ids="-".join)
+@at_any_pace
 def test_judge_documented_camera_gives_the_default_quirks(
-    world: tuple[str, str], documented: dict[tuple[str, str], Report]
+    world: tuple[str, str], judged: Judged
 ) -> None:
-    found = dict(documented[world].quirks)
-    assert found.pop("overtriggered_time", 0.1) == pytest.approx(0.1, abs=0.2)
-    assert found.pop("reboot_time", 0.2) == pytest.approx(0.2, abs=0.4)
+    found = dict(judged[WORLDS.index(world)].quirks)
+    assert found.pop("overtriggered_time", 0.1) == pytest.approx(0.1, abs=slowed(0.2))
+    assert found.pop("reboot_time", slowed(0.2)) == pytest.approx(slowed(0.2), abs=slowed(0.4))
     assert found == {name: Quirks.model_fields[name].default for name in found}
 
 
 @pytest.mark.parametrize("world", WORLDS, ids="-".join)
-def test_report_yaml_makes_a_scenario(
-    world: tuple[str, str], documented: dict[tuple[str, str], Report]
-) -> None:
-    report = documented[world]
+@at_any_pace
+def test_report_yaml_makes_a_scenario(world: tuple[str, str], judged: Judged) -> None:
+    report = judged[WORLDS.index(world)]
     scenario = Scenario.model_validate(yaml.safe_load(report.yaml()))
     assert scenario.quirks.model_dump(include=set(report.quirks)) == report.quirks
 
@@ -169,16 +154,16 @@ def test_every_contradiction_that_shows_is_decided() -> None:
 
 
 @pytest.mark.parametrize("setting", SETTINGS, ids=lambda one: "-".join(map(str, one)))
-def test_judge_quirk_is_found_out(
-    setting: tuple[str, Any, str, str], quirky: dict[tuple[str, Any, str, str], Report]
-) -> None:
+@at_any_pace
+def test_judge_quirk_is_found_out(setting: tuple[str, Any, str, str], judged: Judged) -> None:
     name, value, *_ = setting
-    report = quirky[setting]
+    report = judged[len(WORLDS) + SETTINGS.index(setting)]
     slack = {"overtriggered_time": 0.45, "reboot_time": 0.5}.get(name, 0)
     got = report.quirks.get(name, report[name])
-    assert got == (pytest.approx(value, abs=slack) if slack else value)
+    assert got == (pytest.approx(slowed(value), abs=slowed(slack)) if slack else value)
 
 
+@at_any_pace
 def test_judge_b16_with_every_deviation_pins_them_in_the_url() -> None:
     quirks = {"no_id": True, "code": True, "big_endian_number": True}
     camera: dict[str, Any] = {"dialect": "b16", "quirks": {**FAST, **quirks}}
@@ -190,12 +175,14 @@ def test_judge_b16_with_every_deviation_pins_them_in_the_url() -> None:
     assert report.quirks.items() >= quirks.items()
 
 
+@at_any_pace
 def test_judge_bid_that_pushes_shows_the_order_of_status_and_result() -> None:
     quirks = {"push_status": True, "waiting_before_result": True}
     (report,) = judge_all([Case({"dialect": "bid", "quirks": quirks}, ("waiting_before_result",))])
     assert report.quirks == {"waiting_before_result": True}
 
 
+@at_any_pace
 def test_judge_free_running_application_is_not_triggered() -> None:
     names = (
         *("free-run-needs-no-trigger", "start-begins-run-mode"),
@@ -218,9 +205,10 @@ def test_judge_free_running_application_is_not_triggered() -> None:
     range(len(conformance_sins.SINS)),
     ids=[f"{sin.check}-{sin.dialect}-{sin.transport}" for sin in conformance_sins.SINS],
 )
-def test_judge_sinful_camera_fails_the_check(number: int, sinful: list[Report]) -> None:
+@at_any_pace
+def test_judge_sinful_camera_fails_the_check(number: int, judged: Judged) -> None:
     sin = conformance_sins.SINS[number]
-    finding = sinful[number][sin.check]
+    finding = judged[len(WORLDS) + len(SETTINGS) + number][sin.check]
     assert finding.outcome is Outcome.DIFFERS, finding
     assert sin.came in finding.came
     assert finding.wire
@@ -231,6 +219,7 @@ def test_every_check_has_a_camera_that_fails_it() -> None:
     assert tried == {check.name for check in CHECKS}
 
 
+@at_any_pace
 def test_judge_camera_that_talks_before_connect_differs() -> None:
     status = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -279,6 +268,7 @@ UNDESCRIBED = [
 
 
 @pytest.mark.parametrize(("name", "sin", "dialect", "came"), UNDESCRIBED)
+@at_any_pace
 def test_judge_answer_that_no_setting_describes_is_told(
     name: str, sin: Any, dialect: str, came: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,6 +301,7 @@ def broken_off(bench: Bench) -> None:
 
 @pytest.mark.parametrize("running", [False, True])
 @pytest.mark.parametrize("dialect", ["handbook", "bid"])
+@at_any_pace
 def test_judge_item_interrupted_puts_application_and_run_mode_back(
     thread: LoopThread, dialect: str, running: bool
 ) -> None:
@@ -326,6 +317,7 @@ def test_judge_item_interrupted_puts_application_and_run_mode_back(
     assert bench.left == ""
 
 
+@at_any_pace
 def test_judge_camera_that_dies_says_what_could_not_be_put_back(thread: LoopThread) -> None:
     def dies(bench: Bench) -> None:
         with bench.session() as line:
@@ -345,6 +337,7 @@ def test_judge_camera_that_dies_says_what_could_not_be_put_back(thread: LoopThre
 
 
 @pytest.mark.parametrize("dialect", ["handbook", "bid"])
+@at_any_pace
 def test_judge_nothing_allowed_only_asks(thread: LoopThread, dialect: str) -> None:
     with emulated(thread, dialect=dialect) as emulator:
         report = judge(short_plan(emulator.url, allow=Allow.read("nothing")))
@@ -356,6 +349,7 @@ def test_judge_nothing_allowed_only_asks(thread: LoopThread, dialect: str) -> No
     assert "--camera-allow does not have trigger" in reasons
 
 
+@at_any_pace
 def test_judge_nothing_there_fails_one_check_and_ends_soon() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -411,6 +405,7 @@ def test_bench_of_another_protocol_is_refused() -> None:
 # ---------------------------------------------------------------------- odd cameras
 
 
+@at_any_pace
 def test_judge_what_is_no_camera_shows_the_bytes() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -451,6 +446,7 @@ def test_judge_what_is_no_camera_shows_the_bytes() -> None:
         ),
     ],
 )
+@at_any_pace
 def test_judge_switch_needs_another_application(
     thread: LoopThread, plan: dict[str, Any], outcome: Outcome, text: str
 ) -> None:
@@ -463,6 +459,7 @@ def test_judge_switch_needs_another_application(
     assert finding.text.endswith(text)
 
 
+@at_any_pace
 def test_judge_application_that_is_not_there_is_told(thread: LoopThread) -> None:
     with emulated(thread) as emulator:
         report = judge(short_plan(emulator.url, application=99), ["trigger-gives-one-result"])

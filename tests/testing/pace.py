@@ -1,0 +1,63 @@
+"""How fast the tests of the judges go: on a machine that is too slow for them, slower.
+
+A judge of cameras or clients measures real time, and so do those it judges: "nothing comes" is a
+silence of so many seconds. All of these seconds are short first. Where a test fails then, they are
+multiplied, and what it says of the slowest pace counts.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+PACES = (1.0, 8.0, 50.0)
+
+
+class _Pace:
+    times = PACES[0]
+
+
+def slowed(seconds: float) -> float:
+    """Return these seconds at the present pace."""
+    return seconds * _Pace.times
+
+
+def is_first() -> bool:
+    """Whether this is the fastest pace."""
+    return _Pace.times == PACES[0]
+
+
+def at_any_pace(test: Callable[..., Any]) -> Callable[..., Any]:
+    """Run a test, and where it fails at a slower pace, too."""
+
+    @functools.wraps(test)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            for times in PACES:
+                _Pace.times = times
+                try:
+                    return test(*args, **kwargs)
+                except AssertionError:
+                    if times == PACES[-1]:
+                        raise
+        finally:
+            _Pace.times = PACES[0]
+
+    @functools.wraps(test)
+    async def run_async(*args: Any, **kwargs: Any) -> None:
+        try:
+            for times in PACES:
+                _Pace.times = times
+                try:
+                    return await test(*args, **kwargs)
+                except AssertionError:
+                    if times == PACES[-1]:
+                        raise
+        finally:
+            _Pace.times = PACES[0]
+
+    return run_async if inspect.iscoroutinefunction(test) else run
