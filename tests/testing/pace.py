@@ -12,7 +12,7 @@ import inspect
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 PACES = (1.0, 8.0, 50.0)
 
@@ -31,33 +31,38 @@ def is_first() -> bool:
     return _Pace.times == PACES[0]
 
 
+def _paces() -> Iterator[float]:
+    """Set one pace after the other, and the first one again at the end."""
+    try:
+        for _Pace.times in PACES:
+            yield _Pace.times
+    finally:
+        _Pace.times = PACES[0]
+
+
 def at_any_pace(test: Callable[..., Any]) -> Callable[..., Any]:
     """Run a test, and where it fails at a slower pace, too."""
 
     @functools.wraps(test)
     def run(*args: Any, **kwargs: Any) -> None:
-        try:
-            for times in PACES:
-                _Pace.times = times
-                try:
-                    return test(*args, **kwargs)
-                except AssertionError:
-                    if times == PACES[-1]:
-                        raise
-        finally:
-            _Pace.times = PACES[0]
+        for times in _paces():
+            try:
+                test(*args, **kwargs)
+            except AssertionError:
+                if times == PACES[-1]:
+                    raise
+            else:
+                return
 
     @functools.wraps(test)
     async def run_async(*args: Any, **kwargs: Any) -> None:
-        try:
-            for times in PACES:
-                _Pace.times = times
-                try:
-                    return await test(*args, **kwargs)
-                except AssertionError:
-                    if times == PACES[-1]:
-                        raise
-        finally:
-            _Pace.times = PACES[0]
+        for times in _paces():
+            try:
+                await test(*args, **kwargs)
+            except AssertionError:
+                if times == PACES[-1]:
+                    raise
+            else:
+                return
 
     return run_async if inspect.iscoroutinefunction(test) else run

@@ -39,17 +39,19 @@ class PlainClient:
     Args:
         task: what to do.
         sins: what to do wrong.
+        seconds: for each wait; three times as many for all.
     """
 
-    def __init__(self, task: Task, sins: frozenset[str]) -> None:
+    def __init__(self, task: Task, sins: frozenset[str], seconds: float = SECONDS) -> None:
         self.task = task
+        self.seconds = seconds
         self.sins = sins
         self.status = 0
         self.active = 0
         self.results: list[tuple[int, bytes]] = []
         self._buffer = b""
         self._began = time.monotonic()
-        self._socket = socket.create_connection((task.host, task.port), SECONDS)
+        self._socket = socket.create_connection((task.host, task.port), seconds)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def run(self) -> list[bytes]:
@@ -176,8 +178,8 @@ class PlainClient:
 
     def more(self) -> bytes:
         patient = "waits for ever" in self.sins
-        left = self._began + 3 * SECONDS - time.monotonic()
-        self._socket.settimeout(None if patient else max(0.001, min(SECONDS, left)))
+        left = self._began + 3 * self.seconds - time.monotonic()
+        self._socket.settimeout(None if patient else max(0.001, min(self.seconds, left)))
         data = self._socket.recv(4096)
         if not data:
             raise TaskError("the camera closed the connection")
@@ -185,18 +187,18 @@ class PlainClient:
 
     def drain(self) -> None:
         """Read to the end, so that closing does not reset the connection."""
-        self._socket.settimeout(SECONDS)
+        self._socket.settimeout(self.seconds)
         with contextlib.suppress(OSError):
             while self._socket.recv(4096):
                 pass
 
 
-def plain_client(*sins: str) -> Callable[[Task], list[bytes]]:
+def plain_client(*sins: str, seconds: float = SECONDS) -> Callable[[Task], list[bytes]]:
     """Return a client that does its tasks, with these sins."""
 
     def perform(task: Task) -> list[bytes]:
         try:
-            return PlainClient(task, frozenset(sins)).run()
+            return PlainClient(task, frozenset(sins), seconds).run()
         except (OSError, TaskError):
             if "all is well" in sins:
                 return []
@@ -213,7 +215,7 @@ def main() -> None:
         sys.exit(77)
     count = int(number[0]) if number else None
     task: Any = SimpleNamespace(host=host, port=int(port), verb=verb, number=count)
-    for data in plain_client(*sins.split(","))(task):
+    for data in plain_client(*sins.split(","), seconds=60)(task):
         sys.stdout.write(data.hex() + "\n")
 
 

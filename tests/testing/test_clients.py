@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from pace import at_any_pace, is_first, slowed
 from plain_client import plain_client
 
 import smartcam
@@ -44,7 +45,7 @@ async def findings(
     async def one(name: str) -> Run:
         async with room:
             return await perform(
-                client, SCENES[name], dialect=dialect, transport=transport, timeout=15
+                client, SCENES[name], dialect=dialect, transport=transport, timeout=slowed(15)
             )
 
     names = {check.scene.name for check in checks}
@@ -61,9 +62,9 @@ async def ours(task: Task) -> list[bytes]:
     camera = smartcam.connect(
         task.url,
         application=task.number if task.verb == "switch" else None,
-        connect_timeout=2.0,
-        switch_timeout=3.0,
-        close_timeout=0.2,
+        connect_timeout=slowed(2.0),
+        switch_timeout=slowed(3.0),
+        close_timeout=slowed(0.2),
         reconnect=None,
     )
     stream = camera.results()
@@ -71,36 +72,27 @@ async def ours(task: Task) -> list[bytes]:
         if task.verb == "watch":
             return [(await anext(stream)).raw for _ in range(task.number or 1)]
         count = task.number if task.verb == "trigger" and task.number else 1
-        return [(await camera.trigger(timeout=2.0)).raw for _ in range(count)]
+        return [(await camera.trigger(timeout=slowed(2.0))).raw for _ in range(count)]
 
 
 KINDS = [*itertools.product(EVERY_DIALECT, ("tcp", "udp"))]
 
 
-@pytest.fixture(scope="module")
-def found_of_ours() -> dict[tuple[str, str], list[str]]:
-    """Return what all checks find of our own client, by dialect and transport."""
-
-    async def all_of_them() -> list[list[str]]:
-        room, client = asyncio.Semaphore(AT_ONCE), FunctionClient(ours)
-        return await asyncio.gather(*(findings(client, *kind, room=room) for kind in KINDS))
-
-    return dict(zip(KINDS, asyncio.run(all_of_them()), strict=True))
+@at_any_pace
+async def test_checks_of_our_own_client_find_nothing() -> None:
+    room, client = asyncio.Semaphore(AT_ONCE), FunctionClient(ours)
+    found = await asyncio.gather(*(findings(client, *kind, room=room) for kind in KINDS))
+    assert dict(zip(KINDS, found, strict=True)) == {kind: [] for kind in KINDS}
 
 
-@pytest.mark.parametrize("kind", KINDS, ids="-".join)
-def test_checks_of_our_own_client_find_nothing(
-    kind: tuple[str, str], found_of_ours: dict[tuple[str, str], list[str]]
-) -> None:
-    assert found_of_ours[kind] == []
-
-
+@at_any_pace
 async def test_checks_of_a_plain_client_find_nothing() -> None:
-    client = FunctionClient(plain_client())
+    client = FunctionClient(plain_client(seconds=slowed(1)))
     assert await findings(client, room=asyncio.Semaphore(AT_ONCE)) == []
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
+@at_any_pace
 async def test_checks_of_a_client_in_another_language_find_nothing() -> None:
     client = CommandClient(f"node {HERE / 'client.mjs'} {{host}} {{port}} {{task}}")
     assert await findings(client, room=asyncio.Semaphore(AT_ONCE)) == []
@@ -108,7 +100,7 @@ async def test_checks_of_a_client_in_another_language_find_nothing() -> None:
 
 # ---------------------------------------------------------------------- bad ones
 
-HANGS = "it was still under way after 1 s"
+HANGS = "it was still under way after "
 SINS: dict[str, tuple[str, str]] = {
     "triggers": ("id too", "is 12 bytes long; the containers have 8"),
     "triggers_three_times": ("one for all", "is of the same inspection as the one before"),
@@ -154,23 +146,32 @@ SINS: dict[str, tuple[str, str]] = {
 """For each check a client that fails it: its sin, and what is said of it."""
 
 
-@pytest.fixture(scope="module")
-def convictions() -> dict[str, ClientFinding | None]:
-    """Return what each check finds of its bad client."""
+class Convictions:
+    """What checks find of their bad clients: of all together, at a slower pace of each."""
 
-    async def all_of_them() -> list[Run]:
+    def __init__(self) -> None:
+        self._found = asyncio.run(self._find(*SINS))
+
+    def __getitem__(self, name: str) -> ClientFinding | None:
+        found = self._found if is_first() else asyncio.run(self._find(name))
+        return found[name]
+
+    async def _find(self, *names: str) -> dict[str, ClientFinding | None]:
         room = asyncio.Semaphore(AT_ONCE)
 
         async def one(name: str) -> Run:
-            client = FunctionClient(plain_client(*SINS[name][0].split(", ")))
+            client = FunctionClient(plain_client(*SINS[name][0].split(", "), seconds=slowed(1)))
             timeout = 1.0 if SINS[name][1] == HANGS else 15.0
             async with room:
-                return await perform(client, BY_NAME[name].scene, timeout=timeout)
+                return await perform(client, BY_NAME[name].scene, timeout=slowed(timeout))
 
-        return await asyncio.gather(*map(one, SINS))
+        runs = await asyncio.gather(*map(one, names))
+        return {name: judge(BY_NAME[name], run) for name, run in zip(names, runs, strict=True)}
 
-    runs = asyncio.run(all_of_them())
-    return {name: judge(BY_NAME[name], run) for name, run in zip(SINS, runs, strict=True)}
+
+@pytest.fixture(scope="module")
+def convictions() -> Convictions:
+    return Convictions()
 
 
 def test_every_check_has_a_client_that_fails_it() -> None:
@@ -178,7 +179,8 @@ def test_every_check_has_a_client_that_fails_it() -> None:
 
 
 @pytest.mark.parametrize("name", SINS)
-def test_check_finds_its_sinner(name: str, convictions: dict[str, ClientFinding | None]) -> None:
+@at_any_pace
+def test_check_finds_its_sinner(name: str, convictions: Convictions) -> None:
     finding = convictions[name]
     assert finding is not None
     assert SINS[name][1] in finding.wrong
@@ -186,8 +188,9 @@ def test_check_finds_its_sinner(name: str, convictions: dict[str, ClientFinding 
     assert ClientFinding.from_json(finding.as_json()) == finding
 
 
+@at_any_pace
 def test_finding_shows_the_wire_the_source_and_what_the_client_said(
-    convictions: dict[str, ClientFinding | None],
+    convictions: Convictions,
 ) -> None:
     text = str(convictions["passes_over_unknown_messages"])
     lines = text.splitlines()

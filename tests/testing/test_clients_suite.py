@@ -14,7 +14,7 @@ import pytest
 from smartcam.testing.clients.options import ClientOptions, read_options
 
 HERE = Path(__file__).parent
-SECONDS = 60
+SECONDS = 300
 WITHOUT = ("-p", "no:asyncio", "-p", "no:anyio", "-p", "no:cacheprovider")
 """The suite needs no plugin."""
 
@@ -27,7 +27,7 @@ class TestSinner(ClientConformance):
     """Sends a request that no camera knows, and knows no message that is new."""
 
     def perform(self, task):
-        return plain_client("unknown request", "knows all")(task)
+        return plain_client("unknown request", "knows all", seconds=60)(task)
 
 
 class TestLazy(ClientConformance):
@@ -76,16 +76,18 @@ def run_pytest(folder: Path, *arguments: str) -> Ended:
     return Ended(done.returncode, done.stdout + done.stderr)
 
 
-@pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Ended:
-    """Return what became of somebody's own test file."""
-    folder = tmp_path_factory.mktemp("own")
-    (folder / "test_mine.py").write_text(OWN, encoding="utf-8")
+def test_suite_in_somebodys_own_tests(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(OWN, encoding="utf-8")
     few = "triggers or sends_whole_messages or unknown_messages"
-    return run_pytest(folder, "-k", f"({few}) and not times and not often and not switch")
+    own = run_pytest(tmp_path, "-k", f"({few}) and not times and not often and not switch")
+    it_fails_what_must_be_and_shows_the_wire(own)
+    it_passes_what_only_should_be_and_reports_it(own)
+    it_skips_what_the_client_cannot_do(own)
+    without_a_client_it_says_what_to_type(own)
+    with_a_command_that_is_not_there_it_fails_with_its_name(own)
 
 
-def test_suite_fails_what_must_be_and_shows_the_wire(own: Ended) -> None:
+def it_fails_what_must_be_and_shows_the_wire(own: Ended) -> None:
     assert own.code == 1
     test = "TestSinner::test_client[handbook-tcp-sends_whole_messages"
     assert own.outcome(test) == "FAILED"
@@ -94,7 +96,7 @@ def test_suite_fails_what_must_be_and_shows_the_wire(own: Ended) -> None:
     assert "> ?  50 53 56 42 00 00 00 00 99 00 00 00" in own.out
 
 
-def test_suite_passes_what_only_should_be_and_reports_it(own: Ended) -> None:
+def it_passes_what_only_should_be_and_reports_it(own: Ended) -> None:
     test = "TestSinner::test_client[handbook-tcp-passes_over_unknown_messages"
     assert own.outcome(test) == "PASSED"
     section = own.out.partition("smartcam: the client")[2]
@@ -103,12 +105,12 @@ def test_suite_passes_what_only_should_be_and_reports_it(own: Ended) -> None:
     assert "  expected: a later firmware may have more messages" in section
 
 
-def test_suite_skips_what_the_client_cannot_do(own: Ended) -> None:
+def it_skips_what_the_client_cannot_do(own: Ended) -> None:
     assert own.outcome("TestLazy::test_client[b16-tcp-triggers") == "SKIPPED"
     assert 'the client cannot do the task "trigger": b16 over tcp' in own.out
 
 
-def test_suite_without_a_client_says_what_to_type(own: Ended) -> None:
+def without_a_client_it_says_what_to_type(own: Ended) -> None:
     assert own.outcome("TestNobody::test_client[handbook-tcp-triggers") == "SKIPPED"
     assert (
         'no client: pytest --pyargs smartcam.testing.clients --client-command "./mine {host} '
@@ -116,7 +118,7 @@ def test_suite_without_a_client_says_what_to_type(own: Ended) -> None:
     ) in own.out
 
 
-def test_suite_of_a_command_that_is_not_there_fails_with_its_name(own: Ended) -> None:
+def with_a_command_that_is_not_there_it_fails_with_its_name(own: Ended) -> None:
     for dialect in ("handbook", "bid"):
         assert own.outcome(f"TestMissing::test_client[{dialect}-udp-triggers") == "FAILED"
     assert "client command './no-such-client': No such file or directory" in own.out
@@ -129,7 +131,7 @@ def test_suite_from_the_shell_judges_a_command(tmp_path: Path) -> None:
     ended = run_pytest(
         tmp_path,
         *("--pyargs", "smartcam.testing.clients", "--client-command", client),
-        *("-k", "switches or watches", "--client-timeout", "20", "--client-dialect", "handbook"),
+        *("-k", "switches or watches", "--client-timeout", "200", "--client-dialect", "handbook"),
     )
     assert ended.code == 0, ended.out
     assert ended.outcome("test_client[handbook-tcp-switches") == "PASSED"

@@ -310,7 +310,7 @@ def test_judge_item_interrupted_puts_application_and_run_mode_back(
         bench = Bench(short_plan(emulator.url))
         with pytest.raises(KeyboardInterrupt):
             judge_item(bench, item)
-        thread.wait(emulator.wait_received(m.Disconnect, count=2))
+        thread.wait(emulator.wait_received(m.Disconnect, count=2, timeout=60), timeout=120)
         assert emulator.device.active_application == APPLICATION
         assert emulator.device.running == (running or dialect == "bid")
         assert not emulator.has_session

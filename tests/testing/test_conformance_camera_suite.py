@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import conformance_sins
 import pytest
 from conformance_world import emulated, loop_thread
+from pace import at_any_pace, slowed
 
 from smartcam.protocols import messages as m
 
@@ -30,6 +31,9 @@ PLUGINS = ("-p", "no:cacheprovider", "-p", "no:asyncio")
 
 PAGE = Path(__file__).parents[2] / "docs" / "judging-cameras.md"
 
+PATIENCE = 300.0
+"""Seconds; only what has gone wrong takes as long."""
+
 FLAGS = re.DOTALL | re.MULTILINE
 
 MAIN = """
@@ -40,7 +44,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.exit(pytest.main())
 """
 
-SHORT = ("--camera-quiet", "0.05", "--camera-timeout", "2")
+
+def short() -> tuple[str, ...]:
+    """Return short times, as options."""
+    return ("--camera-quiet", f"{slowed(0.05)}", "--camera-timeout", f"{slowed(2)}")
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +97,7 @@ def test_suite_without_a_camera_skips_and_says_what_to_type(folder: pytest.Pytes
     assert "is it a BVS camera?" not in printed
 
 
+@at_any_pace
 def test_suite_reports_as_the_page_shows(folder: pytest.Pytester, thread: LoopThread) -> None:
     camera: dict[str, Any] = {
         "applications": [],
@@ -102,9 +110,9 @@ def test_suite_reports_as_the_page_shows(folder: pytest.Pytester, thread: LoopTh
         process = start(
             folder,
             *("--pyargs", "smartcam.testing.conformance", "--camera-url", emulator.url),
-            *("--camera-report", str(report), *SHORT),
+            *("--camera-report", str(report), *short()),
         )
-        printed, _ = process.communicate(timeout=60)
+        printed, _ = process.communicate(timeout=PATIENCE)
         assert (emulator.device.active_application, emulator.device.running) == (21, True)
     assert process.returncode == 1
     shown = re.search(r"^```text\n\$ pytest.*?\n(.*?)^```", PAGE.read_text(), FLAGS)
@@ -145,6 +153,7 @@ def shape(line: str) -> str:
     return re.sub(r"\b\d+\.\d+", "#", " ".join(line.split()))
 
 
+@at_any_pace
 def test_subclass_takes_its_address_from_class_or_fixture(
     folder: pytest.Pytester, thread: LoopThread
 ) -> None:
@@ -156,10 +165,10 @@ from smartcam.testing.conformance import CameraConformance
 
 class TestByClass(CameraConformance):
     camera_url = {one.url!r}
-    camera_plan = {{"quiet": 0.05}}
+    camera_plan = {{"quiet": {slowed(0.05)}}}
 
 class TestByFixture(CameraConformance):
-    camera_plan = {{"quiet": 0.05}}
+    camera_plan = {{"quiet": {slowed(0.05)}}}
 
     @pytest.fixture
     def camera_address(self):
@@ -209,11 +218,13 @@ def test_suite_that_is_broken_off_leaves_the_camera_as_it_was(
             *("--pyargs", "smartcam.testing.conformance", "--camera-url", emulator.url),
             *("--camera-quiet", "60", "-k", "second-stop"),
         )
-        thread.wait(emulator.wait_received(m.Stop, count=2, timeout=20), timeout=25)
+        thread.wait(emulator.wait_received(m.Stop, count=2, timeout=PATIENCE), timeout=2 * PATIENCE)
         assert not thread.run(lambda: emulator.device.running)
         process.send_signal(signal.SIGINT)
-        printed, _ = process.communicate(timeout=20)
+        printed, _ = process.communicate(timeout=PATIENCE)
         assert process.returncode == pytest.ExitCode.INTERRUPTED
         assert "found with application 5, in run mode; left so" in printed
         assert thread.run(lambda: emulator.device.running)
-        thread.wait(emulator.wait_received(m.Disconnect, count=3), timeout=10)
+        thread.wait(
+            emulator.wait_received(m.Disconnect, count=3, timeout=PATIENCE), timeout=2 * PATIENCE
+        )
