@@ -31,7 +31,6 @@ import traceback
 import warnings
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -482,7 +481,7 @@ def main() -> int:
     level = logging.DEBUG if options.only else logging.CRITICAL
     logging.basicConfig(level=level, format="%(relativeCreated)7.0f %(name)s %(message)s")
     runner = Runner()
-    with asyncio.Runner(loop_factory=partial(TimedLoop, turn=0.0)) as timed:
+    with asyncio.Runner(loop_factory=TimedLoop) as timed:
         chosen = timed.run(_chosen(options))
         if options.list or not chosen:
             print("\n".join(cell.name for cell in chosen) or "no such cell")  # noqa: T201
