@@ -16,7 +16,7 @@ from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration import robust as robust_module
 from smartcam.calibration.codes import Code
-from smartcam.calibration.fitting import fit
+from smartcam.calibration.fitting import Fit, fit
 from smartcam.calibration.robust import BEST, MOST_SUBSETS, PROPOSALS, agreeing
 from smartcam.calibration.stored import PlaneData
 
@@ -283,7 +283,8 @@ def test_fit_plane_robust_of_a_point_behind_the_horizon_raises() -> None:
 def test_agreeing_of_200_points_takes_few_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     marks = grid(20, 10)
     touches = with_wrong(marks, [*range(0, 180, 2)])
-    proposed, fits = [], []
+    proposed: list[int] = []
+    fitted: list[Fit] = []
     for name, propose in PROPOSALS.items():
 
         def counted(camera: Array, touched: Array, propose: Any = propose) -> Array:
@@ -292,9 +293,16 @@ def test_agreeing_of_200_points_takes_few_maps(monkeypatch: pytest.MonkeyPatch) 
             return maps
 
         monkeypatch.setitem(PROPOSALS, name, counted)
-    monkeypatch.setattr(robust_module, "fit", lambda *given: fits.append(1) or fit(*given))
+
+    def kept(*given: Any) -> Fit:
+        fitted.append(fit(*given))
+        return fitted[-1]
+
+    monkeypatch.setattr(robust_module, "fit", kept)
     mask = agreeing(marks, touches, np.ones(200), SIGMA)
     assert np.flatnonzero(~mask).tolist() == [*range(0, 180, 2)]
     assert len(proposed) == 2
     assert max(proposed) <= MOST_SUBSETS
-    assert len(fits) <= 2 * BEST * 3  # a round of each, one that judges anew, and one that confirms
+    assert (
+        len(fitted) <= 2 * BEST * 3
+    )  # a round of each, one that judges anew, and one that confirms

@@ -151,7 +151,7 @@ def test_hand_eye_takes_poses_of_a_controller() -> None:
 
 def test_hand_eye_finds_the_scale_of_a_print() -> None:
     """A sheet that was printed at 98 %: the robot's motions tell."""
-    poses, views = measured("eye-in-hand", 0.1, NOISE, poses=12)
+    poses, views = measured("eye-in-hand", 0.1, NOISE, poses=9)
     said = Checkerboard(columns=5, rows=4, square=0.03 / 0.98)
     thought = [dataclasses.replace(one, target=said) for one in views]
     found = calibrate_hand_eye(poses, thought, setup="eye-in-hand", camera=CAMERA)
@@ -161,7 +161,7 @@ def test_hand_eye_finds_the_scale_of_a_print() -> None:
     assert "0.98" in found.warnings[0].text
     assert "poses and errors are those of a target of that size" in found.warnings[0].text
     assert found.target == Checkerboard(columns=5, rows=4, square=0.03 / 0.98 * found.target_scale)
-    truth = scene("eye-in-hand", poses=12)
+    truth = scene("eye-in-hand", poses=9)
     kept = calibrate_hand_eye(
         poses, thought, setup="eye-in-hand", camera=CAMERA, adjust="nothing", method="robot"
     )
@@ -193,7 +193,9 @@ def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
 
 def test_hand_eye_without_a_camera_calibrates_it_from_the_views() -> None:
     poses, views = measured("eye-in-hand", 0.05, EXACT, poses=8, tilt=40.0)
-    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", method="reprojection")
+    found = calibrate_hand_eye(
+        poses, views, setup="eye-in-hand", adjust="nothing", method="reprojection"
+    )
     assert found.camera is not None
     assert found.camera.matrix[0, 0] == pytest.approx(1200, rel=0.01)
     assert scene("eye-in-hand", poses=8, tilt=40.0).errors(found.camera_pose)[1] < 2e-3
@@ -268,7 +270,9 @@ def test_hand_eye_told_to_keep_a_wrong_pose_names_it_only() -> None:
 
 def test_hand_eye_of_few_poses_keeps_a_wrong_one() -> None:
     poses, views = _with_a_wrong_pose("eye-in-hand", poses=8)
-    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
+    found = calibrate_hand_eye(
+        poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing", method="robot"
+    )
     assert all(found.used)
     assert Code.BAD_VIEW in {one.code for one in found.warnings}
 
@@ -424,6 +428,13 @@ def test_to_plane_that_cannot_be_is_refused(exact: HandEyeCalibration) -> None:
     if exact.setup == "eye-in-hand":
         with refused("WRONG_FRAME", "the robot's pose when the image was taken, got none"):
             exact.to_plane([[5, 6]], plane=away)
+
+
+def test_predicted_error_is_of_the_size_of_the_cameras(noisy: HandEyeCalibration) -> None:
+    pose, pixels = noisy.robot_poses[0], CAMERA.matrix[None, :2, 2]
+    plane = noisy.target_pose if noisy.setup == "eye-in-hand" else pose @ noisy.target_pose
+    (found,) = noisy.predicted_error(pixels, plane=plane, robot_pose=pose)
+    assert 0.1 * noisy.translation_error < found < 10 * noisy.translation_error
 
 
 @pytest.mark.long

@@ -61,8 +61,11 @@ def _tutorial(side: str) -> list[TargetView]:
 
 def test_find_target_in_every_pair_has_the_same_origin_in_both() -> None:
     for number in NUMBERS:
-        sides = [cv2.imread(str(FOLDER / f"{side}{number:02}.jpg")) for side in ("left", "right")]
-        check_pair(*map(np.asarray, sides), f"pair {number}")
+        left, right = (
+            np.asarray(cv2.imread(str(FOLDER / f"{side}{number:02}.jpg")), dtype=np.uint8)
+            for side in ("left", "right")
+        )
+        check_pair(left, right, f"pair {number}")
 
 
 def test_pairs_left_out_have_squares_of_a_tenth_of_a_millimetre() -> None:

@@ -13,7 +13,8 @@ ODD_PAIRS = Path(__file__).parents[2] / "data" / "opencv_pairs"
 
 def test_find_target_in_a_pair_has_the_same_origin_in_both() -> None:
     for number in range(1, 15, 2):
-        sides = [
-            cv2.imread(str(ODD_PAIRS / f"{side}{number:02}.jpg")) for side in ("left", "right")
-        ]
-        check_pair(*map(np.asarray, sides), f"pair {number}")
+        left, right = (
+            np.asarray(cv2.imread(str(ODD_PAIRS / f"{side}{number:02}.jpg")), dtype=np.uint8)
+            for side in ("left", "right")
+        )
+        check_pair(left, right, f"pair {number}")
