@@ -133,14 +133,14 @@ def test_fit_plane_robust_predicted_error_is_the_observed_one(
     assert math.sqrt(predicted / observed) == pytest.approx(1.0, abs=0.13)
 
 
-@pytest.mark.long
-def test_agreeing_with_two_wrong_of_six_never_takes_one_for_right() -> None:
+@pytest.mark.parametrize("count", [20, pytest.param(150, marks=pytest.mark.long)])
+def test_agreeing_with_two_wrong_of_six_never_takes_one_for_right(count: int) -> None:
     found = []
-    for seed in range(150):
+    for seed in range(count):
         touches = with_wrong(SIX, [seed % 6, (seed + 1 + seed % 5) % 6], seed)
         with suppress(CalibrationError):  # a good point looks wrong as well
             found.append((seed, np.flatnonzero(~agreeing(SIX, touches, np.ones(6), SIGMA))))
-    assert len(found) >= 145
+    assert len(found) >= 0.95 * count
     for seed, left_out in found:
         assert {seed % 6, (seed + 1 + seed % 5) % 6} == set(left_out.tolist()), seed
 
