@@ -8,9 +8,9 @@ A block of any language whose first line is ``# NAME.EXTENSION`` is a file, whic
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import inspect
-import os
 import re
 import shlex
 import signal
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
+from processes import MAINS, Process
 
 from smartcam import exceptions
 from smartcam.client import SmartCamera
@@ -42,7 +43,8 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 CAMERA = "bvs://192.168.0.10"
 """The address of a real camera in examples; an emulator's takes its place here."""
 LOCAL = re.compile(r"127\.0\.0\.1:\d{4,5}")
-SECONDS = 20
+pytestmark = pytest.mark.long
+
 OPTIONAL = ("opentelemetry.sdk", "prometheus_client")
 """What some examples import and the tests do not demand; the extra ``dev`` has it."""
 
@@ -79,7 +81,6 @@ def files(page: Path) -> dict[str, str]:
 
 # ---------------------------------------------------------------------- running
 
-MAINS = {"smartcam": "main", "smartcam-emulator": "emulator_main"}
 MODULES = {"pytest": "pytest"}
 
 
@@ -89,39 +90,33 @@ class Shell:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.address = ""  # host and port of the emulator last started
-        self.running: list[subprocess.Popen[str]] = []
+        self._running = contextlib.ExitStack()
 
-    def start(self, arguments: list[str]) -> subprocess.Popen[str]:
+    def start(self, arguments: list[str]) -> Process:
         """Start a command; what needs an emulator gets the present one's address."""
         if arguments[0] != "smartcam-emulator" and any(map(LOCAL.search, arguments)):
             if not self.address:
                 self.emulate(["smartcam-emulator"], 1)
             arguments = [LOCAL.sub(self.address, one) for one in arguments]
         program, *rest = arguments
-        if program in MAINS:
-            code = f"from smartcam.cli import {MAINS[program]}; {MAINS[program]}()"
-            arguments = [sys.executable, "-c", code, *rest]
-        elif program in MODULES:
+        if program in MODULES:
             arguments = [sys.executable, "-m", MODULES[program], *rest]
-        process = subprocess.Popen(  # noqa: S603 - what stands in our own documents
-            arguments,
+        process = Process(
+            *arguments,
             cwd=self.folder,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            encoding="utf-8",
+            merged=True,
             # how this run of pytest was called says nothing to one on a page
-            env={**os.environ, "PYTHONUNBUFFERED": "1", "PYTEST_ADDOPTS": ""},
+            env={"PYTHONUNBUFFERED": "1", "PYTEST_ADDOPTS": ""},
+            fresh=program not in MAINS,
         )
-        self.running.append(process)
-        return process
+        process.close_stdin()
+        return self._running.enter_context(process)
 
     def emulate(self, arguments: list[str], cameras: int) -> str:
         """Start an emulator on a free port and return its first lines, one for each camera."""
         free = ["0" if before == "--port" else one for before, one in pairs(arguments)]
         process = self.start(free)
-        assert process.stdout is not None
-        printed = "".join(process.stdout.readline() for _ in range(cameras))
+        printed = process.read_until(b"\n", count=cameras)
         address = LOCAL.search(printed)
         assert address is not None, printed
         self.address = address[0]
@@ -130,19 +125,15 @@ class Shell:
     def run(self, arguments: list[str], shown: list[str]) -> tuple[str, int]:
         """Run a command to its end, or to the Ctrl-C that is shown; return output and code."""
         process = self.start(arguments)
-        assert process.stdout is not None
-        begin = ""
         if "^C" in shown:
-            begin = "".join(process.stdout.readline() for _ in range(shown.index("^C")))
+            process.read_until(b"\n", count=shown.index("^C"))
             process.send_signal(signal.SIGINT)
-        rest, _ = process.communicate(timeout=SECONDS)
-        return begin + rest, process.returncode
+        ended = process.wait()
+        return ended.out, ended.code
 
     def end(self) -> None:
         """End what still runs."""
-        for process in self.running:
-            process.terminate()
-            process.communicate(timeout=SECONDS)
+        self._running.close()
 
 
 def pairs(arguments: list[str]) -> list[tuple[str, str]]:
@@ -194,7 +185,7 @@ def test_python_block_runs(block: Block, shell: Shell) -> None:
         return  # a file, which a console block runs
     for name in OPTIONAL:
         if f"from {name}" in text:
-            pytest.importorskip(name)
+            pytest.importorskip(name, reason=f"needs {name}, of the extra dev")
     if CAMERA in text:
         text = text.replace(CAMERA, shell.emulate(["smartcam-emulator"], 1).strip())
     # empty lines in front, so that a traceback names the page's own lines
@@ -224,15 +215,6 @@ def test_console_block_runs(block: Block, shell: Shell) -> None:
         assert ended == wanted, f"{where}exit code {ended}, not {wanted}:\n{printed}"
         missing = missing_line(shown, printed)
         assert missing is None, f"{where}shown but not printed: {missing}\n{printed}"
-
-
-@pytest.mark.parametrize("block", blocks("sh", [ROOT / "README.md"]))
-def test_sh_block_of_the_readme_runs(block: Block, shell: Shell) -> None:
-    if "pip install" in block.text:
-        pytest.skip("sets up an environment: a step of its own in CI")
-    process = shell.start(["bash", "-euo", "pipefail", "-c", block.text])
-    printed, _ = process.communicate(timeout=SECONDS)
-    assert process.returncode == 0, f"{block.page}:{block.line}\n{printed}"
 
 
 def test_what_sh_blocks_name_is_there() -> None:

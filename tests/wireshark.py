@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.protocols.framed import FramedDialect
 
 PORT = 36701
-SECONDS = 60
+SECONDS = 300
 BYTES = {"magic", "data", "payload", "surplus", "skipped"}
 FINDINGS = {
     *("malformed", "no_frame", "unfinished", "long_body"),

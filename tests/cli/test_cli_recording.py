@@ -262,7 +262,11 @@ def test_pcap_is_read_by_tshark(url: str, tmp_path: Path) -> None:
     run("record", url, "-o", str(path), "--seconds", "0.1").done()
     done = run("pcap", str(path), "-o", str(packets), "--json").done()
     shown = subprocess.run(  # noqa: S603
-        [TSHARK or "tshark", "-r", str(packets)], capture_output=True, text=True, check=True
+        [TSHARK or "tshark", "-r", str(packets)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
     )
     assert done.lines == [{"file": str(packets), "packets": len(shown.stdout.splitlines())}]
     run("pcap", str(path), "-o", str(packets)).failed(2, "run.pcap: the file is there already")

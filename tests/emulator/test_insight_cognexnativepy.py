@@ -27,14 +27,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 if sys.version_info < (3, 12):
-    pytest.skip("CognexNativePy can be imported on Python 3.12 and newer", allow_module_level=True)
-CognexNativePy = pytest.importorskip("CognexNativePy")
+    pytest.skip("needs Python 3.12 for CognexNativePy", allow_module_level=True)
+CognexNativePy = pytest.importorskip(
+    "CognexNativePy", reason="needs CognexNativePy, of the extra test"
+)
 utils = pytest.importorskip("CognexNativePy.utils")
 CommandError: type[Exception] = pytest.importorskip(
     "CognexNativePy.CognexCommandError"
 ).CognexCommandError
 
-TIMEOUT = 10.0
+TIMEOUT = 60.0
 HEIGHT, WIDTH = 12, 16  # a bitmap so small that its digits come in one read of the client
 IMAGE = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH)
 

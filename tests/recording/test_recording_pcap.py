@@ -45,7 +45,7 @@ def packets(path: Path) -> list[dict[str, str]]:
         command += ["-o", f"{kind}.check_checksum:TRUE"]
     for name in FIELDS:
         command += ["-e", name]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)  # noqa: S603
     found = [dict(zip(FIELDS, row.split("\t"), strict=True)) for row in done.stdout.splitlines()]
     for packet in found:
         assert (packet["tcp.analysis.flags"], packet["_ws.malformed"]) == ("", "")

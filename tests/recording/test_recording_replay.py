@@ -107,10 +107,9 @@ async def test_replay_free_run_recorded_again_is_the_same(tmp_path: Path) -> Non
     async def run(url: str, path: Path) -> Recording:
         with Recorder(path) as recorder:
             options: Any = {"name": "left", "application": 9, "observers": [recorder]}
-            async with (
-                smartcam.connect(url, **options) as camera,
-                camera.results() as results,
-            ):
+            camera = smartcam.connect(url, **options)
+            # before there is a session, so that none is missed: there are no more than recorded
+            async with camera.results() as results, camera, asyncio.timeout(60):
                 for _ in range(10):
                     await anext(results)
         return load_recording(path)

@@ -86,45 +86,45 @@ def test_line_that_is_no_result_is_told(line: bytes) -> None:
 
 async def test_command_that_ends_well_gives_its_results() -> None:
     code = "import sys; print('0102'); print(*sys.argv[2:], file=sys.stderr)"
-    outcome = await command(code).perform(TASK, 10)
+    outcome = await command(code).perform(TASK, 60)
     assert without_time(outcome) == Outcome(results=(b"\x01\x02",), said="switch 3")
-    assert 0 < outcome.seconds < 10
+    assert outcome.seconds > 0
 
 
 async def test_command_that_fails_has_its_exit_code_and_its_words() -> None:
-    outcome = await command("import sys; print('01'); sys.exit('no camera')").perform(TASK, 10)
+    outcome = await command("import sys; print('01'); sys.exit('no camera')").perform(TASK, 60)
     assert without_time(outcome) == Outcome((b"\x01",), "exit code 1", said="no camera")
 
 
 async def test_command_with_exit_code_77_cannot_do_such_a_task() -> None:
-    outcome = await command("import sys; print('x'); sys.exit(77)").perform(TASK, 10)
+    outcome = await command("import sys; print('x'); sys.exit(77)").perform(TASK, 60)
     assert without_time(outcome) == Outcome(supported=False)
 
 
 async def test_command_that_prints_nonsense_has_failed() -> None:
-    outcome = await command("print('result: 7')").perform(TASK, 10)
+    outcome = await command("print('result: 7')").perform(TASK, 60)
     assert outcome.results == ()
     assert (outcome.error or "").startswith("line 1 of its output is no result: 'result: 7'")
 
 
 async def test_command_that_does_not_end_is_killed_with_what_it_has_started() -> None:
     # the child holds the pipes: who waits for their end waits for it
-    child = "import time; time.sleep(60)"
+    child = "import time; time.sleep(600)"
     code = f"import subprocess, sys; subprocess.run([sys.executable, '-S', '-c', '{child}'])"
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         outcome = await command(code).perform(TASK, 0.5)
     assert without_time(outcome) == Outcome(ended=False)
 
 
 async def test_command_that_is_not_there_is_a_mistake_of_the_user() -> None:
     with pytest.raises(ConfigurationError) as caught:
-        await CommandClient("./no-such-client {url} {task}").perform(TASK, 10)
+        await CommandClient("./no-such-client {url} {task}").perform(TASK, 60)
     assert str(caught.value) == "client command './no-such-client': No such file or directory"
 
 
 async def test_command_that_prints_without_end_is_read_no_further() -> None:
     code = "import sys\nfor _ in range(300): sys.stdout.write('00' * 4000 + chr(10))"
-    outcome = await command(code).perform(TASK, 20)
+    outcome = await command(code).perform(TASK, 60)
     assert sum(len(one) for one in outcome.results) <= 1 << 20
 
 
@@ -138,7 +138,7 @@ async def test_function_gives_its_results_from_a_thread_of_its_own() -> None:
         threads.append(threading.current_thread().name)
         return (b"\x01", b"\x02")
 
-    outcome = await FunctionClient(perform).perform(TASK, 5)
+    outcome = await FunctionClient(perform).perform(TASK, 60)
     assert without_time(outcome) == Outcome(results=(b"\x01", b"\x02"))
     assert threads == ["client: switch 3"]
 
@@ -147,7 +147,7 @@ async def test_function_that_raises_has_failed() -> None:
     def perform(task: Task) -> list[bytes]:
         raise OSError(f"no camera at {task.port}")
 
-    outcome = await FunctionClient(perform).perform(TASK, 5)
+    outcome = await FunctionClient(perform).perform(TASK, 60)
     assert without_time(outcome) == Outcome(error="OSError: no camera at 43127")
 
 
@@ -155,7 +155,7 @@ async def test_function_that_is_not_implemented_cannot_do_such_a_task() -> None:
     async def perform(task: Task) -> list[bytes]:
         raise NotImplementedError("it only triggers")
 
-    outcome = await FunctionClient(perform).perform(TASK, 5)
+    outcome = await FunctionClient(perform).perform(TASK, 60)
     assert without_time(outcome) == Outcome(supported=False, said="it only triggers")
 
 
@@ -163,7 +163,7 @@ async def test_function_that_does_not_end_is_left_behind() -> None:
     release = threading.Event()
 
     def perform(task: Task) -> list[bytes]:
-        release.wait(10)
+        release.wait(60)
         return []
 
     outcome = await FunctionClient(perform).perform(TASK, SHORT)
@@ -176,7 +176,7 @@ async def test_asynchronous_function_that_does_not_end_is_cancelled() -> None:
 
     async def perform(task: Task) -> list[bytes]:
         try:
-            await asyncio.sleep(60)
+            await asyncio.sleep(600)
         finally:
             ended.append("cancelled")
         return []

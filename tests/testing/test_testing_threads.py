@@ -37,7 +37,7 @@ def threads() -> set[str]:
 
 
 def test_synchronous_client_is_served(emulator: ThreadedCamera) -> None:
-    with socket.create_connection((emulator.host, emulator.port), timeout=5) as client:
+    with socket.create_connection((emulator.host, emulator.port), timeout=60) as client:
         client.sendall(CONNECT)
         assert client.recv(16, socket.MSG_WAITALL) == CONNECTED
         assert emulator.has_session
@@ -51,7 +51,7 @@ async def test_asyncio_client_is_served_while_the_test_uses_the_emulator(
     emulator: ThreadedCamera,
 ) -> None:
     async with smartcam.connect(emulator.url, interpret_as="text: string[20]") as camera:
-        waiting = asyncio.create_task(camera.next_result(timeout=5))
+        waiting = asyncio.create_task(camera.next_result(timeout=60))
         await asyncio.sleep(0)
         assert emulator.device.trigger()
         assert (await waiting).value.text == "Hello World"
@@ -59,7 +59,7 @@ async def test_asyncio_client_is_served_while_the_test_uses_the_emulator(
         with pytest.raises(smartcam.TriggerTimeoutError):
             await camera.trigger(timeout=0.05)
         assert [fired.fault.kind for fired in emulator.fired] == ["no_result"]
-        await emulator.received(Query)
+        await emulator.received(Query, timeout=60)
         with pytest.raises(ResponseTimeoutError):
             await emulator.received(Query, count=1000, timeout=0.05)
 
@@ -104,7 +104,7 @@ def test_manual_clock_moves_when_it_is_told() -> None:
 
 
 def test_log_can_be_read_when_all_is_over(emulator: ThreadedCamera) -> None:
-    with socket.create_connection((emulator.host, emulator.port), timeout=5) as client:
+    with socket.create_connection((emulator.host, emulator.port), timeout=60) as client:
         client.sendall(CONNECT)
         client.recv(16)
     emulator.stop()
@@ -123,7 +123,7 @@ def test_nothing_is_left_behind() -> None:
         address = (emulator.host, emulator.port)
     assert threads() == before
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(address, timeout=5)
+        socket.create_connection(address, timeout=60)
 
 
 def test_camera_that_cannot_listen_leaves_no_thread() -> None:
