@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 PARSED = ["ros2", "ros_industrial", "easy_handeye", "easy_handeye2", "opencv"]
 """One format of a transform for each reader; the others share theirs."""
 
-LOADERS = ["ros2", "ros_industrial", "opencv", "moveit", "asl"]
+LOADERS = ["ros2", "ros_industrial", "moveit", "asl"]
 """One format of each way in which text is read."""
 
 READERS: dict[str, tuple[Callable[..., object], str | None]] = {

@@ -56,7 +56,7 @@ def calibrated(setup: Setup) -> HandEyeCalibration:
 
 @functools.cache
 def calibrated_from_poses(setup: Setup) -> HandEyeCalibration:
-    truth = scene(setup)
+    truth = scene(setup, poses=6)
     seen = [truth.seen(pose) for pose in truth.robot_poses]
     return calibrate_hand_eye_from_poses(truth.robot_poses, seen, setup=setup)
 
@@ -141,12 +141,12 @@ def test_hand_eye_does_not_depend_on_the_order(setup: Setup) -> None:
 
 
 def test_hand_eye_takes_poses_of_a_controller() -> None:
-    poses, views = measured("eye-in-hand", 0.0, EXACT)
+    poses, views = measured("eye-in-hand", 0.0, EXACT, poses=5)
     noon = datetime(2026, 3, 4, 12, tzinfo=UTC)
     said = [dataclasses.replace(pose, at=noon).pose() for pose in poses]
     found = calibrate_hand_eye(said, views, setup="eye-in-hand", camera=CAMERA, method="park")
     assert found.camera_pose.label == "T_flange_camera"
-    assert scene("eye-in-hand").errors(found.camera_pose)[1] < 1e-6
+    assert scene("eye-in-hand", poses=5).errors(found.camera_pose)[1] < 1e-6
 
 
 def test_hand_eye_finds_the_scale_of_a_print() -> None:
@@ -203,7 +203,7 @@ def test_hand_eye_without_a_camera_calibrates_it_from_the_views() -> None:
 
 @pytest.mark.parametrize("setup", ONE_LONG)
 def test_hand_eye_from_poses_without_noise_is_exact(setup: Setup) -> None:
-    truth = scene(setup)
+    truth = scene(setup, poses=6)
     found = calibrated_from_poses(setup)
     assert truth.errors(found.camera_pose)[1] < 1e-9
     assert found.camera is None
@@ -220,7 +220,8 @@ def _with_a_wrong_pose(setup: Setup, poses: int = 12) -> Pairs:
     return said, views
 
 
-@pytest.mark.parametrize("setup", ONE_LONG)
+@pytest.mark.long
+@pytest.mark.parametrize("setup", SETUPS)
 def test_hand_eye_names_a_wrong_pose_and_leaves_it_out(setup: Setup) -> None:
     poses, views = _with_a_wrong_pose(setup)
     found = calibrate_hand_eye(
@@ -389,8 +390,8 @@ def test_hand_eye_of_wrong_inputs_is_refused() -> None:
 
 def test_to_plane_of_a_moving_camera_is_where_the_part_is() -> None:
     """The thesis' open point: an image from any pose of the robot, against the truth."""
-    truth = scene("eye-in-hand")
-    poses, views = measured("eye-in-hand", 0.0, EXACT)
+    truth = scene("eye-in-hand", poses=5)
+    poses, views = measured("eye-in-hand", 0.0, EXACT, poses=5)
     found = calibrate_hand_eye(
         poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing", method="robot"
     )
@@ -409,8 +410,8 @@ def test_to_plane_of_a_moving_camera_is_where_the_part_is() -> None:
 
 
 def test_to_plane_of_raised_features_is_where_they_are() -> None:
-    truth = scene("eye-to-hand")
-    poses, views = measured("eye-to-hand", 0.0, EXACT)
+    truth = scene("eye-to-hand", poses=5)
+    poses, views = measured("eye-to-hand", 0.0, EXACT, poses=5)
     found = calibrate_hand_eye(
         poses, views, setup="eye-to-hand", camera=CAMERA, adjust="nothing", method="robot"
     )
@@ -463,7 +464,7 @@ def test_point_errors_of_its_own_poses_are_its_errors(noisy: HandEyeCalibration)
 
 
 def test_point_errors_of_a_target_of_another_size_are_those_of_the_adjusted_one() -> None:
-    poses, views = measured("eye-in-hand", 0.0, EXACT)
+    poses, views = measured("eye-in-hand", 0.0, EXACT, poses=6)
     said = Checkerboard(columns=5, rows=4, square=0.03 / 0.98)
     thought = [dataclasses.replace(one, target=said) for one in views]
     found = calibrate_hand_eye(
@@ -474,7 +475,8 @@ def test_point_errors_of_a_target_of_another_size_are_those_of_the_adjusted_one(
     assert np.concatenate(nominal.point_errors(poses, thought)).mean() > 1e-3
 
 
-@pytest.mark.parametrize("setup", ONE_LONG)
+@pytest.mark.long
+@pytest.mark.parametrize("setup", SETUPS)
 def test_point_errors_of_other_poses_are_the_held_out_error(setup: Setup) -> None:
     poses, views = measured(setup, 0.1, NOISE, poses=30)
     found = calibrate_hand_eye(
@@ -488,7 +490,7 @@ def test_point_errors_of_other_poses_are_the_held_out_error(setup: Setup) -> Non
 
 @pytest.mark.parametrize("setup", ONE_LONG)
 def test_point_errors_of_poses_of_the_target_are_its_origins(setup: Setup) -> None:
-    truth = scene(setup)
+    truth = scene(setup, poses=6)
     seen = [truth.seen(pose) for pose in truth.robot_poses]
     found = calibrated_from_poses(setup)
     up = Transform("camera", "camera", np.eye(3), np.array([0.0, 0.003, 0.004]))
@@ -497,7 +499,7 @@ def test_point_errors_of_poses_of_the_target_are_its_origins(setup: Setup) -> No
 
 
 def test_point_errors_behind_the_camera_are_infinite() -> None:
-    poses, views = measured("eye-to-hand", 0.0, EXACT)
+    poses, views = measured("eye-to-hand", 0.0, EXACT, poses=5)
     found = calibrate_hand_eye(
         poses, views, setup="eye-to-hand", camera=CAMERA, adjust="nothing", method="park"
     )

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+OTHERS = [(3, False), (3, True), (4, False)]
+
+
 def winding(polygons: list[Polygon], x: float, y: float) -> int:
     """Return how often polygons run around a point counter-clockwise."""
     total = 0.0
@@ -61,11 +64,7 @@ def test_checkerboard_origin_mark_is_a_dot_in_the_area_of_the_origin() -> None:
 
 @pytest.mark.parametrize(
     ("rows", "legacy"),
-    [
-        (3, False),
-        (4, True),
-        *(pytest.param(*one, marks=pytest.mark.long) for one in [(4, False), (3, True)]),
-    ],
+    [(4, True), *(pytest.param(*one, marks=pytest.mark.long) for one in OTHERS)],
 )
 def test_charuco_is_the_board_of_opencv(rows: int, legacy: bool) -> None:
     target = Charuco(columns=4, rows=rows, square=0.03, marker=0.021, legacy_pattern=legacy)

@@ -35,7 +35,7 @@ def test_adjust_shape_finds_where_the_points_are() -> None:
     assert found.freedom == before.freedom - 3 * 54 + 7
 
 
-@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize("free", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_leave_out_gives_a_lens_that_did_not_see_the_view(free: bool) -> None:
     views = seen(LEFT, poses(8), points=OFF if free else None)
     spoiled = [*views[:3], seen(LEFT, poses(8, seed=9)[:1], sigma=2.0)[0], *views[4:]]

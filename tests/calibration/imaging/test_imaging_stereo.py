@@ -55,6 +55,7 @@ def test_calibrate_stereo_finds_the_transform_as_well_as_it_says() -> None:
     assert (found.sheet, found.bad_views, found.warnings) == (None, (), ())
 
 
+@pytest.mark.long
 def test_calibrate_stereo_of_pairs_without_noise_is_exact() -> None:
     found = calibrate_stereo(*pairs(4, sigma=0.0))
     np.testing.assert_allclose(_off(found.transform), 0.0, atol=1e-6)
@@ -79,6 +80,7 @@ def test_calibrate_stereo_held_out_errors_are_those_of_each_pair() -> None:
     assert found.epipolar < found.held_out_epipolar < 0.1
 
 
+@pytest.mark.long
 def test_calibrate_stereo_held_out_error_is_that_of_a_calibration_without_the_pair() -> None:
     left, right = pairs(6)
     found, rest = _exactly(), _exactly(1)
@@ -238,6 +240,7 @@ def test_epipolar_distances_and_rectify_use_the_calibration() -> None:
     assert found.rectify(1.0).alpha == 1.0
 
 
+@pytest.mark.long
 def test_point_errors_of_a_pair_left_out_are_its_held_out_errors() -> None:
     left, right = pairs(6)
     found, rest = _exactly(), _exactly(1)
