@@ -273,6 +273,7 @@ def test_fleet_has_two_cameras_or_those_of_a_scenario(pytester: pytest.Pytester)
     run(pytester, source, passed=3)
 
 
+@pytest.mark.long
 def test_workers_of_xdist_do_not_meet(pytester: pytest.Pytester) -> None:
     pytest.importorskip("xdist", reason="needs pytest-xdist, of the extra dev")
     pytester.makepyfile(

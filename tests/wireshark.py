@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import struct
 import subprocess
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -16,6 +16,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols.messages import Sender, UnknownMessage, wire_fields
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from smartcam.protocols.framed import FramedDialect
@@ -28,9 +29,16 @@ FINDINGS = {
     *("unknown_id", "refused", "unnamed_bits"),
 }
 
-needs_tshark = pytest.mark.skipif(
-    shutil.which("tshark") is None, reason="needs Wireshark's command line: tshark"
-)
+TSHARK = shutil.which("tshark") or ""
+
+TestT = TypeVar("TestT", bound="Callable[..., object]")
+
+
+def needs_tshark(test: TestT) -> TestT:
+    """Mark a test that Wireshark's command line has a part in."""
+    reason = "needs tshark: Wireshark's command line"
+    marked: TestT = pytest.mark.long(pytest.mark.skipif(not TSHARK, reason=reason)(test))
+    return marked
 
 
 class Capture:

@@ -168,6 +168,7 @@ def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:
     assert second.lines[-1]["type"] == "result"
 
 
+@pytest.mark.long
 def test_calibrate_killed_at_every_step_loses_no_sample(url: str, tmp_path: Path) -> None:
     touched = {f"mark_{number}": number in {1, 2, 6} for number in range(1, 8)}
     some = [TOUCHES[index] for index in (0, 1, 5)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from commandline import closed_port, emulators, run
 from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
 from processes import PATIENCE, Process
+from wireshark import TSHARK, needs_tshark
 
 from smartcam.models import Connected, Reconnected
 from smartcam.recording import load_recording
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SESSIONS = (Connected, Reconnected)
-TSHARK = shutil.which("tshark")
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
 
@@ -256,13 +255,13 @@ def test_replay_wrong_camera_and_speed_are_told(url: str, tmp_path: Path) -> Non
     run("replay", str(path), "--speed", "0").failed(2, "a speed from 0.001 to 1000 was expected")
 
 
-@pytest.mark.skipif(TSHARK is None, reason="needs tshark")
+@needs_tshark
 def test_pcap_is_read_by_tshark(url: str, tmp_path: Path) -> None:
     path, packets = tmp_path / "run.mcap", tmp_path / "run.pcap"
     run("record", url, "-o", str(path), "--seconds", "0.1").done()
     done = run("pcap", str(path), "-o", str(packets), "--json").done()
     shown = subprocess.run(  # noqa: S603
-        [TSHARK or "tshark", "-r", str(packets)],
+        [TSHARK, "-r", str(packets)],
         capture_output=True,
         text=True,
         check=True,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from recordingkit import COUNTER, URL, at, container, frame, record, session, status, write
+from wireshark import TSHARK, needs_tshark
 
 from smartcam.connection import TraceEntry
 from smartcam.emulator import EmulatedCamera
@@ -19,8 +19,6 @@ from smartcam.recording import Recording, write_pcap
 if TYPE_CHECKING:
     from pathlib import Path
 
-TSHARK = shutil.which("tshark")
-needs_tshark = pytest.mark.skipif(TSHARK is None, reason="needs tshark")
 FIELDS = (
     "frame.time_epoch",
     "ip.src",
@@ -40,7 +38,7 @@ WARNING = 0x600000
 
 def packets(path: Path) -> list[dict[str, str]]:
     """Return the packets as tshark reads them, and see that it finds nothing wrong."""
-    command = [TSHARK or "tshark", "-r", str(path), "-T", "fields"]
+    command = [TSHARK, "-r", str(path), "-T", "fields"]
     for kind in ("ip", "tcp", "udp"):
         command += ["-o", f"{kind}.check_checksum:TRUE"]
     for name in FIELDS:

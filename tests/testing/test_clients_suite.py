@@ -124,6 +124,7 @@ def with_a_command_that_is_not_there_it_fails_with_its_name(own: Ended) -> None:
     assert "client command './no-such-client': No such file or directory" in own.out
 
 
+@pytest.mark.long
 def test_suite_from_the_shell_judges_a_command(tmp_path: Path) -> None:
     client = (
         f"{sys.executable} -S {HERE / 'plain_client.py'} {{host}} {{port}} cannot-watch {{task}}"
