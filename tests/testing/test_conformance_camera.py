@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
     from smartcam.testing.threads import LoopThread
 
-pytestmark = pytest.mark.long
 
 FAST = {"reboot_time": 0.2}
 
