@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from smartcam.calibration.steps import Flag, Number, Option, Step, Text, as_lists, from_lists
 from smartcam.exceptions import CalibrationError
 
-jsonschema = pytest.importorskip("jsonschema", reason="needs the extra dev")
+jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema, of the extra dev")
 
 STEP = Step(
     id="all",

@@ -61,7 +61,7 @@ async def test_recorder_run_is_read_by_the_mcap_library(tmp_path: Path) -> None:
 
 
 async def test_recorder_messages_fit_their_schemas(tmp_path: Path) -> None:
-    jsonschema = pytest.importorskip("jsonschema", reason="needs the extra dev")
+    jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema, of the extra dev")
     path = tmp_path / "run.mcap"
     async with EmulatedCamera([COUNTER], faults=[{"kind": "no_result"}]) as emulator:
         with Recorder(path) as made:

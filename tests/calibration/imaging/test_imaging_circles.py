@@ -28,7 +28,7 @@ SAMPLES = 3
 
 def printed(target: CircleGrid, roll: float, tilt: float) -> tuple[np.ndarray, np.ndarray]:
     """Return what a camera sees of a printed sheet, and where its points are (N, 2)."""
-    pdfium = pytest.importorskip("pypdfium2")
+    pdfium = pytest.importorskip("pypdfium2", reason="needs pypdfium2, of the extra dev")
     sheet = make_sheet(target)
     document = pdfium.PdfDocument(sheet.pdf())
     page = np.array(document[0].render(scale=8 * 25.4 / 72, grayscale=True).to_numpy()).squeeze()
@@ -55,6 +55,7 @@ def printed(target: CircleGrid, roll: float, tilt: float) -> tuple[np.ndarray, n
     return image.astype(np.uint8), project(target.points * 1e3 + [*sheet.origin, 0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("roll", [0, 115, 250])
 @pytest.mark.parametrize("target", [ROUND, SHIFTED], ids=lambda one: make_sheet(one).id)
 def test_find_circles_among_letters_and_rulers_of_a_sheet_are_found(
