@@ -20,6 +20,9 @@ from random import Random
 from statistics import fmean
 from typing import TYPE_CHECKING
 
+if __name__ == "__main__":  # the wire is another camera's, too
+    sys.path.append(str(Path(__file__).parent.parent))
+
 from chaos_faults import TCP_FAULTS, UDP_FAULTS
 from chaos_station import Station, Watch
 
