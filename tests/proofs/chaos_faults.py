@@ -135,8 +135,9 @@ def _coalesce(victim: Victim, chance: Random) -> None:
 
 def _corrupt(victim: Victim, chance: Random) -> None:
     """The magic number is broken: nothing behind it may be believed."""
-    # a number without its trigger would be the next run's, whoever begins it
-    alone = CLIENT_MESSAGES if victim.sets_number else CLIENT_MESSAGES[2:]
+    # A number without its trigger would be the next run's, whoever begins it; and a trigger without
+    # its number has none to be known by.
+    alone = CLIENT_MESSAGES[:1] * victim.sets_number + CLIENT_MESSAGES[2:]
     on = chance.choice(CAMERA_MESSAGES + alone)
     victim.emulator.inject(
         f.Corrupt(on=on, offset=chance.randrange(4), xor=chance.randrange(1, 256))
