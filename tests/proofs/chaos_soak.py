@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import ctypes
 import gc
 import sys
 from collections import Counter
@@ -158,10 +159,16 @@ async def _sample(made: Soak, stations: Sequence[Station]) -> None:
 
 
 def resident() -> float:
-    """Return the memory that this process has, MB; 0 where the system does not say."""
+    """Return the memory that this process has, MB; 0 where the system does not say.
+
+    Holes of the heap are given back first, where the C library can: they come and go by chance.
+    """
     status = Path("/proc/self/status")
     if not status.exists():
         return 0.0
+    give_back = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if give_back is not None:
+        give_back(0)
     lines = status.read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS"))
 
