@@ -120,10 +120,11 @@ class Link:
         """Whether a frame may come now; if so, it has come."""
         dialect, sender = self.machine.dialect, self.machine.role.receives
         message = check_decoding(dialect, sender, frame)
-        surplus = max(dialect.surplus(sender, frame), 0)  # less where a code comes alone
+        surplus = dialect.surplus(sender, frame)  # less than 0 where a code comes alone
         if self.policy.tells and (message is None or surplus):
             message = m.MalformedMessage(message_id=frame.message_id, payload=frame.payload)
             surplus = 0
+        surplus = max(surplus, 0)
         if message is None or (surplus and self.policy.exact_length):
             return False
         following = TRANSITIONS.get((self.state, sender, type(message)))
