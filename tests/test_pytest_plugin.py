@@ -85,6 +85,7 @@ def test_asyncio_test_has_a_client(
     run(pytester, ASYNCHRONOUS.replace("MARK", mark), "-p", "no:anyio", *given, passed=1)
 
 
+@pytest.mark.long
 def test_anyio_test_has_a_client_in_asyncio(pytester: pytest.Pytester) -> None:
     pytest.importorskip("anyio", reason="needs anyio, of the extra dev")
     source = ASYNCHRONOUS.replace("MARK", "@pytest.mark.anyio") + (
@@ -93,6 +94,7 @@ def test_anyio_test_has_a_client_in_asyncio(pytester: pytest.Pytester) -> None:
     run(pytester, source, "-p", "no:asyncio", passed=1)
 
 
+@pytest.mark.long
 def test_client_needs_asyncio_the_emulated_camera_does_not(pytester: pytest.Pytester) -> None:
     pytest.importorskip("trio", reason="needs trio, of the extra dev")
     pytest.importorskip("anyio", reason="needs anyio, of the extra dev")

@@ -12,6 +12,7 @@ from smartcam.calibration.steps import Flag, Number, Option, Step, Text, as_list
 from smartcam.exceptions import CalibrationError
 
 jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema, of the extra dev")
+pytestmark = pytest.mark.long
 
 STEP = Step(
     id="all",

@@ -182,12 +182,14 @@ def bare_on(data: Any) -> Any:
     return data
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_loads_and_fits_the_schema(path: Path) -> None:
     EmulatedFleet(path)
     assert check(yaml.safe_load(path.read_text(encoding="utf-8"))) == []
 
 
+@pytest.mark.long
 def test_schema_finds_mistakes() -> None:
     assert check(yaml.safe_load(CELL)) == []
     assert check({"timeline": [{"at": -1, "do": {"kind": "stop"}}]}) == ["$.timeline[0].at"]

@@ -14,7 +14,7 @@ own. Its verdict asks six questions:
 The time is the loop's own, see ``timed_loop.py``; only cells whose camera is a process take real
 time.
 
-Long form: ``python tests/proofs/fault_matrix.py`` (all cells, ten minutes; fewer with
+Long form: ``python tests/proofs/fault_matrix.py`` (all cells, half an hour; fewer with
 ``--sample 60``, ``--family "udp link"``, ``--only NAME``; prints a table, exit 1 on a failure).
 """
 

@@ -60,6 +60,7 @@ async def test_recorder_run_is_read_by_the_mcap_library(tmp_path: Path) -> None:
     assert "sequence" not in results[0]  # None is left out
 
 
+@pytest.mark.long
 async def test_recorder_messages_fit_their_schemas(tmp_path: Path) -> None:
     jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema, of the extra dev")
     path = tmp_path / "run.mcap"

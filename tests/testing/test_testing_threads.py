@@ -64,6 +64,7 @@ async def test_asyncio_client_is_served_while_the_test_uses_the_emulator(
             await emulator.received(Query, count=1000, timeout=0.05)
 
 
+@pytest.mark.long
 def test_trio_program_waits_for_what_was_received(emulator: ThreadedCamera) -> None:
     trio: Any = pytest.importorskip("trio", reason="needs trio, of the extra dev")
     pytest.importorskip("anyio", reason="needs anyio, of the extra dev")
