@@ -158,6 +158,17 @@ class Mutant(NamedTuple):
         return "", ""
 
 
+def named(name: str) -> Mutant:
+    """Return the mutant of a name."""
+    room, _, rest = name.partition(":")
+    module, _, place = rest.partition(":")
+    if room in ROOMS and place.isdecimal() and (ROOT / module).is_file():
+        mutant = Mutant(room, module, int(place))
+        if mutant.text()[0]:
+            return mutant
+    raise argparse.ArgumentTypeError(f"no mutant {name!r}; a name is ROOM:MODULE:PLACE, as printed")
+
+
 def draw(room: str, count: int, seed: int) -> list[Mutant]:
     """Draw mistakes for a room, evenly over its code."""
     chance = random.Random(f"{room} {seed}")  # noqa: S311
@@ -257,12 +268,13 @@ def main(arguments: Iterable[str]) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="at once")
     parser.add_argument("--marks", default="", help="tests, as pytest's -m; default: all")
     parser.add_argument("--tests", type=Path, default=ROOT, help="a checkout with other tests")
-    parser.add_argument("--only", nargs="*", metavar="NAME", help="these")
+    parser.add_argument("--only", nargs="+", type=named, metavar="NAME", help="these")
     options = parser.parse_args([*arguments])
-    if options.only is not None:
-        split = [one.split(":") for one in options.only]
-        mutants = [Mutant(room, module, int(place)) for room, module, place in split]
-    else:
+    unknown = [room for room in options.rooms if room not in ROOMS]
+    if unknown:
+        parser.error(f"no room {unknown[0]!r}; there are {', '.join(ROOMS)}")
+    mutants: list[Mutant] | None = options.only
+    if mutants is None:
         rooms = options.rooms or ROOMS
         mutants = [one for room in rooms for one in draw(room, options.count, options.seed)]
     left = [*hunt(mutants, options.tests.resolve(), options.marks, options.jobs)]
