@@ -3,7 +3,8 @@
 ``python tests/proofs/mutants.py --count 40 --seed 1`` draws that many mistakes for each room of
 :data:`ROOMS` and runs the room's tests on a copy of the tree with each. It prints those that no
 test noticed, which is no error: some change nothing that anybody could notice. ``--tests FOLDER``
-takes the tests of another checkout, to compare; ``--only`` repeats some by name.
+takes the tests of another checkout, to compare; ``--only`` repeats some by name. The tests run once
+without a mistake first; those that fail then are named and left out.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import ast
 import contextlib
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -197,27 +199,48 @@ def copy(folder: Path, tests: Path) -> Path:
     return folder
 
 
-def command(folder: Path, mutant: Mutant, marks: str) -> list[str]:
-    """Return the command of a mutant's tests: those that have its module's name come first."""
-    found = [path for one in ROOMS[mutant.room].tests for path in sorted(folder.glob(one))]
+def command(folder: Path, room: str, first: str, options: Iterable[str]) -> list[str]:
+    """Return the command of a room's tests: those that have the module's name come first."""
+    found = [path for one in ROOMS[room].tests for path in sorted(folder.glob(one))]
     files = [file for one in found for file in ([one] if one.is_file() else one.rglob("test_*.py"))]
-    stem = Path(mutant.module).stem
-    files = sorted({*files}, key=lambda one: (stem not in one.stem, one))
+    files = sorted({*files}, key=lambda one: (first not in one.stem, one))
     names = [str(one.relative_to(folder)) for one in files if one.name not in AWAY]
-    options = ["-x", "-q", "-n", "0", "-m", marks, "-p", "no:cacheprovider", "-p", "no:randomly"]
-    return [sys.executable, "-m", "pytest", *options, *names]
+    plain = ["-q", "-n", "0", "-p", "no:cacheprovider", "-p", "no:randomly"]
+    return [sys.executable, "-m", "pytest", *plain, *options, *names]
 
 
-def noticed(folder: Path, mutant: Mutant, text: str, marks: str) -> bool:
+def environment(folder: Path) -> dict[str, str]:
+    """Return that of a process which runs the tests of a copy on its code."""
+    return {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+def failing(folder: Path, room: str, marks: str) -> list[str]:
+    """Return pytest's options that leave out what fails without any mistake."""
+    options = ["-m", marks, "--tb=no", "-rfE", "--continue-on-collection-errors"]
+    call = command(folder, room, "", options)
+    ran = subprocess.run(  # noqa: S603
+        call, cwd=folder, env=environment(folder), capture_output=True, text=True, check=False
+    )
+    if ran.returncode not in (0, 1):
+        raise SystemExit(
+            f"{room}: its tests do not run without a mistake:\n{ran.stdout}{ran.stderr}"
+        )
+    found = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", ran.stdout, re.MULTILINE)
+    for name in found:
+        print(f"left out, fails without a mistake: {name}", flush=True)  # noqa: T201
+    return [f"--{'deselect' if '::' in name else 'ignore'}={name}" for name in found]
+
+
+def noticed(folder: Path, mutant: Mutant, text: str, options: Iterable[str]) -> bool:
     """Run the tests on a mutant."""
     path = folder / mutant.module
     whole = path.read_text(encoding="utf-8")
     path.write_text(text, encoding="utf-8")
     try:
         with subprocess.Popen(  # noqa: S603
-            command(folder, mutant, marks),
+            command(folder, mutant.room, Path(mutant.module).stem, ["-x", *options]),
             cwd=folder,
-            env={**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"},
+            env=environment(folder),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
@@ -243,12 +266,17 @@ def hunt(mutants: Sequence[Mutant], tests: Path, marks: str, jobs: int) -> Itera
         for number in range(jobs):
             (Path(scratch) / str(number)).mkdir()
             trees.put(copy(Path(scratch) / str(number), tests))
+        sound = Path(scratch) / "0"
+        options = {
+            room: ["-m", marks, *failing(sound, room, marks)]
+            for room in dict.fromkeys(mutant.room for mutant in mutants)
+        }
 
         def one(mutant: Mutant) -> bool:
             text, what = mutant.text()
             tree = trees.get()
             try:
-                seen = noticed(tree, mutant, text, marks)
+                seen = noticed(tree, mutant, text, options[mutant.room])
             finally:
                 trees.put(tree)
             print(f"{'noticed ' if seen else 'SURVIVES'} {mutant.name} {what}", flush=True)  # noqa: T201
@@ -273,6 +301,8 @@ def main(arguments: Iterable[str]) -> int:
     unknown = [room for room in options.rooms if room not in ROOMS]
     if unknown:
         parser.error(f"no room {unknown[0]!r}; there are {', '.join(ROOMS)}")
+    if not (options.tests / "tests").is_dir():
+        parser.error(f"{options.tests} is no checkout: it has no tests/")
     mutants: list[Mutant] | None = options.only
     if mutants is None:
         rooms = options.rooms or ROOMS
