@@ -222,7 +222,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self.abort()
 
     def abort(self, reason: BaseException | None = None) -> None:
-        """Drop the link at once; ``reason`` is what readers are told."""
+        """Drop the link at once; ``reason`` is what the receive task and writers are told."""
         self._lose(reason or ConnectionAbortedError("closed by this side"))
         if self._transport is not None:
             self._transport.abort()
@@ -234,7 +234,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.abort(reason)
 
     def lost_error(self) -> ConnectionLostError:
-        """Return what readers and writers are told when the link is gone."""
+        """Return what the receive task and writers are told when the link is gone."""
         where = "" if self.name == self.peer else f" to {self.peer}"
         error = ConnectionLostError(
             f"{self.name}: the link{where} is gone: {self._loss}",

@@ -478,7 +478,7 @@ class Conversation:
 
     def ask_what_is_active(self) -> None:
         """Send a Query after somebody else's switch, as soon as none is open from before it."""
-        with contextlib.suppress(SmartCamError):  # the link is over: its reader knows
+        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
             if self.ask_for_life(asyncio.get_running_loop().time() + self._patience):
                 self.inbox.active_in_doubt = False
 

@@ -146,7 +146,7 @@ class Inbox:
         at, now = datetime.now(UTC), chunk.received_at
         for event in chunk.events:
             take = self._takers.get(type(event))
-            if take is not None:  # LinkFailed and LinkEnded: the link tells its reader
+            if take is not None:  # LinkFailed and LinkEnded: the receive task ends by them
                 take(event, now, at)
             if self.answers and isinstance(event, m.Message):
                 self._on_answer(event, now)

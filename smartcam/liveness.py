@@ -81,7 +81,7 @@ class _Watch:
 
     def _ask(self, now: float) -> None:
         self._asked_at = now
-        with contextlib.suppress(SmartCamError):  # the link is over: its reader knows
+        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
             self._talk.ask_for_life(now + self._patience)
 
     @property

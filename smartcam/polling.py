@@ -61,7 +61,7 @@ class StatusPoll:
 
     def ask(self) -> None:
         """Ask now, whatever is open: what was asked before may tell of what was before."""
-        with contextlib.suppress(SmartCamError):  # the link is over: its reader knows
+        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
             self._link.send(GetStatus(), answered=False)
 
     def stop(self) -> None:
@@ -87,7 +87,7 @@ class StatusPoll:
             self._heard, self._asked_at = inbox.statuses_heard, now
             try:
                 self._link.send(GetStatus(), answered=False)
-            except SmartCamError:  # the link is over: its reader knows
+            except SmartCamError:  # the link is over: the receive task tells
                 return
         period = PERIOD if inbox.awaits_status else IDLE_PERIOD
         self._timer = self._loop.call_later(period, self._tick)
