@@ -21,19 +21,12 @@ that was given up, and after its inspection began, pays it.
 
 from __future__ import annotations
 
-import random
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-from smartcam.models import Result, Status
+from smartcam.models import Status
 
-if TYPE_CHECKING:
-    import asyncio
-    from datetime import datetime
-
-    from smartcam.interpretation import Interpretation
-
-__all__ = ["NUMBER_STEP", "Attribution", "Debt", "PendingTrigger", "Run", "Verdict"]
+__all__ = ["NUMBER_STEP", "Attribution", "Debt", "Run", "Trigger", "Verdict"]
 
 Debt = Literal["late", "streamed"]
 
@@ -73,39 +66,29 @@ class Run:
     answered: bool = False
 
 
-@dataclass(slots=True)
-class PendingTrigger:
+@dataclass(slots=True, eq=False)
+class Trigger:
     """The trigger under way.
 
     Attributes:
-        outcome: gets the results or the error.
-        interpretation: how to read its results.
-        has_input: input data was sent with it.
-        sent_at: loop time.
-        triggered_at: wall clock, UTC.
         wanted: how many results it is to have.
         number: sequence number set for it, None where its layout has none.
-        certain: nobody else's run may carry that number.
-        application: the one that is believed to be active, None where any will do.
+        certain: no run of others may carry its number.
         run: how far the camera is with it.
-        results: those that came.
+        came: how many of its results came.
         early: containers that came before its fence was answered.
-        given_up: nobody waits for it any more.
+        given_up: what it still misses is owed.
+        ended: nobody waits for it any more.
     """
 
-    outcome: asyncio.Future[list[Result]]
-    interpretation: Interpretation
-    has_input: bool
-    sent_at: float
-    triggered_at: datetime
     wanted: int = 1
     number: int | None = None
     certain: bool = False
-    application: int | None = None
     run: Run = field(default_factory=Run)
-    results: list[Result] = field(default_factory=list[Result])
+    came: int = 0
     early: int = 0
     given_up: bool = False
+    ended: bool = False
 
 
 class Verdict(NamedTuple):
@@ -141,20 +124,20 @@ class Attribution:
     """Decides whose each container is; knows no wire and no time.
 
     Args:
-        chance: where the numbers begin, 0 to 1: results that another client has asked for may still
-            be in flight, and their numbers lie elsewhere most probably.
+        chance: where the numbers begin, 0 to 1, drawn by chance: results that another client has
+            asked for may still be in flight, and their numbers lie elsewhere most probably.
 
     Attributes:
         pending: the trigger under way.
         doubted: the status may be older than the last trigger, which was given up: it may say that
             the camera waits for one although it has one.
-        numbering: how to read a container's number while ours are about; None where none is.
+        numbered: numbers of ours are about: a container's may say whose it is.
     """
 
-    def __init__(self, chance: float | None = None) -> None:
-        self.pending: PendingTrigger | None = None
+    def __init__(self, chance: float) -> None:
+        self.pending: Trigger | None = None
         self.doubted: bool = False
-        self.numbering: Interpretation | None = None
+        self.numbered: bool = False
         self._ordered = False
         self._drops_waiting: bool | None = None  # whether it shows a trigger; None: not known yet
         self._satisfied = False  # the last trigger has its results, no other inspection was seen
@@ -162,7 +145,7 @@ class Attribution:
         self._owed: list[_Owed] = []
         self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
         self._last_number: int | None = None  # of the last trigger that had its results
-        self._turn = int((random.random() if chance is None else chance) * WIDE)  # noqa: S311
+        self._turn = int(chance * WIDE)
         self._given: int | None = None
 
     @property
@@ -178,7 +161,7 @@ class Attribution:
     @property
     def quiet(self) -> bool:
         """Nothing of ours is about: a container that comes is nobody's."""
-        return self.pending is None and not self._owed and self.numbering is None
+        return self.pending is None and not self._owed and not self.numbered
 
     # ------------------------------------------------------------------ the session
 
@@ -225,21 +208,25 @@ class Attribution:
         """The user has set the number of the next run."""
         self._given = number
 
-    def send(self, pending: PendingTrigger) -> None:
+    def send(self, pending: Trigger) -> None:
         """A trigger is sent now."""
         self.pending, self._satisfied = pending, False
         self._last = pending.run
         if pending.number is not None:
-            self.numbering = pending.interpretation
+            self.numbered = True
         else:
             self._given = None  # its run has it
 
-    def done(self, pending: PendingTrigger) -> None:
+    def leave(self) -> None:
+        """The trigger's caller goes on."""
+        self.pending = None
+
+    def done(self, pending: Trigger) -> None:
         """The trigger has all its results."""
         self._satisfied, self._last_number = True, pending.number
         self._last = None
 
-    def give_up(self, pending: PendingTrigger, fate: Debt = "late", *, unread: int = 0) -> None:
+    def give_up(self, pending: Trigger, fate: Debt = "late", *, unread: int = 0) -> None:
         """Nobody waits for the trigger any more; its results may still come.
 
         Args:
@@ -247,7 +234,7 @@ class Attribution:
             fate: of what still comes.
             unread: containers of it that came and could not be interpreted.
         """
-        missing = pending.wanted - len(pending.results) - unread
+        missing = pending.wanted - pending.came - unread
         if pending.given_up or missing <= 0:
             return
         pending.given_up = True
@@ -322,10 +309,10 @@ class Attribution:
             number: its sequence number, None where it has none or none of ours is about.
         """
         pending = self.pending
-        if pending is not None and not pending.outcome.done():
+        if pending is not None and not pending.ended:
             if not pending.run.reached:
                 pending.early += 1
-            elif len(pending.results) == pending.wanted:
+            elif pending.came == pending.wanted:
                 pass  # all are there, and are still to be confirmed
             elif pending.certain and number is not None:
                 if number == pending.number:
@@ -341,8 +328,6 @@ class Attribution:
                     return OURS
                 if self._drops_waiting is None and not run.shown:
                     return HELD
-        elif pending is not None and pending.outcome.cancelled():
-            self.give_up(pending)  # its caller was not woken yet
         return self.judge_other(number)
 
     def _may_pay(self, run: Run) -> bool:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import random
 import weakref
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, cast
 
 from smartcam.account import Account
-from smartcam.attribution import Attribution, PendingTrigger, Verdict
+from smartcam.attribution import Attribution, Trigger, Verdict
 from smartcam.exceptions import (
     CameraFaultError,
     ConnectionClosedError,
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     from smartcam.protocols.machine import Event
     from smartcam.streams import Queue
 
-__all__ = ["Inbox"]
+__all__ = ["Inbox", "PendingTrigger"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
@@ -71,6 +72,39 @@ class _StatusWaiter:
     outcome: asyncio.Future[Status]
 
 
+@dataclass(slots=True, eq=False, kw_only=True)
+class PendingTrigger(Trigger):
+    """The trigger under way, and who waits for it.
+
+    Attributes:
+        outcome: gets the results or the error.
+        interpretation: how to read its results.
+        has_input: input data was sent with it.
+        sent_at: loop time.
+        triggered_at: wall clock, UTC.
+        application: the one that is believed to be active, None where any will do.
+        results: those that came.
+    """
+
+    outcome: asyncio.Future[list[Result]]
+    interpretation: Interpretation
+    has_input: bool
+    sent_at: float
+    triggered_at: datetime
+    application: int | None = None
+    results: list[Result] = field(default_factory=list[Result])
+
+    def succeed(self) -> None:
+        """Give its caller the results."""
+        self.ended = True
+        self.outcome.set_result(self.results)
+
+    def fail(self, error: Exception) -> None:
+        """Give its caller the reason why there are none."""
+        self.ended = True
+        self.outcome.set_exception(error)
+
+
 class Inbox:
     """The receiving half of a client, over all its sessions.
 
@@ -90,7 +124,9 @@ class Inbox:
         self.active: int | None = None
         self.expected: int | None = None  # the application that was named, if any
         # who waits for what
-        self.attribution: Attribution = Attribution()
+        self.attribution: Attribution = Attribution(random.random())  # noqa: S311
+        self._pending: PendingTrigger | None = None
+        self._numbering: Interpretation | None = None  # how to read numbers, once there are ours
         # the input data of a trigger without a result may still be queued in the camera
         self.input_in_doubt: bool = False
         # by the answer's type; by id for a message that the dialect does not know
@@ -167,10 +203,10 @@ class Inbox:
         self.fence_open = False
         waiting: list[asyncio.Future[Any]] = [*self.next_results]
         waiting += [waiter.outcome for waiter in self._status_waiters]
-        pending = self.attribution.pending
-        if pending is not None and not pending.outcome.done():
+        pending = self.pending
+        if pending is not None:
             self.attribution.give_up(pending)
-            waiting.append(pending.outcome)
+            pending.fail(error)
         for future in waiting:
             if not future.done():
                 future.set_exception(error)
@@ -188,6 +224,31 @@ class Inbox:
     def streams(self) -> list[Queue[Any]]:
         """Every subscription that is still referred to."""
         return [*self.result_streams, *self.status_streams, *self.event_streams]
+
+    @property
+    def pending(self) -> PendingTrigger | None:
+        """The trigger under way, as long as its caller waits."""
+        pending = self._pending
+        if pending is None or pending.ended:
+            return None
+        if pending.outcome.cancelled():  # its caller was not woken yet
+            pending.ended = True
+            self.attribution.give_up(pending)
+            return None
+        return pending
+
+    def begin_trigger(self, pending: PendingTrigger) -> None:
+        """A trigger is sent now."""
+        self._pending = pending
+        if pending.number is not None:
+            self._numbering = pending.interpretation
+        self.attribution.send(pending)
+
+    def end_trigger(self) -> None:
+        """Its caller goes on."""
+        self._pending = None
+        self.attribution.leave()
+        self.release_held()
 
     def next_answer(self, key: type[m.Message] | int) -> asyncio.Future[Answer]:
         """Register for the next answer of this kind; errors come as a result, never raised."""
@@ -224,7 +285,7 @@ class Inbox:
     @property
     def awaits_status(self) -> bool:
         """Whether somebody waits for a status, or for what it may say of the trigger under way."""
-        return bool(self._status_waiters) or self.attribution.pending is not None
+        return bool(self._status_waiters) or self._pending is not None
 
     @property
     def watches_status(self) -> bool:
@@ -291,7 +352,7 @@ class Inbox:
 
     def _on_trigger_answer(self, answer: m.TriggerAnswer, now: float, at: datetime) -> None:
         self.attribution.on_answer()
-        pending = self.attribution.pending
+        pending = self._pending
         if pending is not None and not pending.run.confirmed and self.on_unconfirmed is not None:
             self.on_unconfirmed()
 
@@ -310,8 +371,7 @@ class Inbox:
             self._note_others()
         if self._held:
             self.release_held()
-        pending = self.attribution.pending
-        if pending is not None and pending.results:
+        if self._pending is not None and self._pending.results:
             self._complete(now)
         if bits & _RUNNING_OR_BUSY == _BUSY or (was or 0) & _RUNNING_OR_BUSY == _BUSY:
             self._note_loading(bits)
@@ -359,8 +419,8 @@ class Inbox:
 
     def _fail_trigger(self, risen: int, fallen: int) -> None:
         """End the trigger under way where the status says that its result cannot be trusted."""
-        pending = self.attribution.pending
-        if pending is None or pending.outcome.done():
+        pending = self.pending
+        if pending is None:
             return
         error: SmartCamError | None = None
         if risen & Status.SYSTEM_ERROR:
@@ -382,7 +442,7 @@ class Inbox:
             )
         if error is not None:
             self.attribution.give_up(pending, "streamed")  # what still comes is nobody's
-            pending.outcome.set_exception(error)
+            pending.fail(error)
 
     def _on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
         """Count and hand on several containers at once; one by one where they may differ."""
@@ -432,8 +492,8 @@ class Inbox:
         They are, if nothing of it was seen to begin since; what came before that is older.
         """
         held, self._held = self._held, []
-        pending = self.attribution.pending
-        older = pending is None or pending.outcome.done() or pending.run.begun
+        pending = self.pending
+        older = pending is None or pending.run.begun
         for container, now, at in held:
             self._on_result(container, now, at, older=older)
 
@@ -444,9 +504,7 @@ class Inbox:
         if container.application < 0:  # a quirk: it does not say whose it is
             active = m.UNNAMED_APPLICATION if self.active is None else self.active
             container = replace(container, application=active)
-        pending = attribution.pending
-        if pending is not None and pending.outcome.done():
-            pending = None
+        pending = self.pending
         expected = self.expected
         if expected is None and pending is not None:
             expected = pending.application
@@ -456,9 +514,9 @@ class Inbox:
             account.count("wrong_application")
             if pending is not None:
                 attribution.give_up(pending)  # ours may still come
-                pending.outcome.set_exception(self._wrong_application(container, expected))
+                pending.fail(self._wrong_application(container, expected))
             return
-        numbering = attribution.numbering
+        numbering = self._numbering
         number = numbering.number(container, self.endian) if numbering is not None else None
         verdict = attribution.judge_other(number) if older else attribution.judge(number)
         if verdict.fate == "held":
@@ -556,19 +614,18 @@ class Inbox:
                 future.set_result(result)
         if owner is not None:
             owner.results.append(result)
+            owner.came += 1
             self._complete(now)
 
     def _complete(self, now: float) -> None:
         """End the trigger under way if it has all its results, and nothing speaks against it."""
-        owner = self.attribution.pending
-        if owner is None or len(owner.results) < owner.wanted or not owner.run.confirmed:
-            return
-        if owner.outcome.done():
+        owner = self.pending
+        if owner is None or owner.came < owner.wanted or not owner.run.confirmed:
             return
         self._end_input_doubt(owner)
         self.account.processing.add(now - owner.sent_at)
         self.attribution.done(owner)
-        owner.outcome.set_result(owner.results)
+        owner.succeed()
 
     def _deliver_error(
         self,
@@ -596,7 +653,7 @@ class Inbox:
         self.attribution.give_up(owner, unread=int(certain))
         if not owner.given_up:
             self.attribution.done(owner)
-        owner.outcome.set_exception(error)
+        owner.fail(error)
 
     def _end_input_doubt(self, owner: PendingTrigger) -> None:
         if owner.has_input:

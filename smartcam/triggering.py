@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.alarm import Alarm
-from smartcam.attribution import PendingTrigger, Run
+from smartcam.attribution import Run
 from smartcam.conversation import is_ready
 from smartcam.exceptions import (
     CameraBusyError,
@@ -26,6 +26,7 @@ from smartcam.exceptions import (
     UnsupportedError,
     WrongApplicationError,
 )
+from smartcam.inbox import PendingTrigger
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 
@@ -183,17 +184,17 @@ class Triggers:
         fenced = talk.fences and not (certain and decided)
         loop = talk.loop or asyncio.get_running_loop()
         pending = PendingTrigger(
-            loop.create_future(),
-            interpretation,
-            request.input_data is not None,
-            loop.time(),
-            datetime.now(UTC),
-            request.results,
-            number,
-            certain,
+            outcome=loop.create_future(),
+            interpretation=interpretation,
+            has_input=request.input_data is not None,
+            sent_at=loop.time(),
+            triggered_at=datetime.now(UTC),
+            wanted=request.results,
+            number=number,
+            certain=certain,
             # where each application has its own interpreter none is read with another's layout
-            None if interpretation.by_application else self.inbox.active,
-            Run(reached=not fenced, confirmed=not talk.confirms),
+            application=None if interpretation.by_application else self.inbox.active,
+            run=Run(reached=not fenced, confirmed=not talk.confirms),
         )
         return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
 
@@ -213,7 +214,7 @@ class Triggers:
                 await self._talk.await_owed(m.QueryAnswer, _TRIGGER, deadline)
         elif input_data is not None:
             words.append(m.SetInput(data=input_data))
-        inbox.attribution.send(pending)
+        inbox.begin_trigger(pending)
         self._alarm.set(deadline)
         try:
             link.send(*words, _TRIGGER)
@@ -251,8 +252,7 @@ class Triggers:
             raise
         finally:
             self._alarm.clear()
-            inbox.attribution.pending = None
-            inbox.release_held()
+            inbox.end_trigger()
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
         """Have the trigger end at once where the camera says that it took none."""
@@ -267,19 +267,19 @@ class Triggers:
                 busy = isinstance(got, m.Acknowledgement) and self._talk.is_busy(got)
                 if not self._talk.ordered:  # it may be the answer to an earlier one
                     self.inbox.attribution.give_up(pending)
-                pending.outcome.set_exception(CameraBusyError(str(exc)) if busy else exc)
+                pending.fail(CameraBusyError(str(exc)) if busy else exc)
             except SmartCamError as exc:  # the link is over
-                pending.outcome.set_exception(exc)
+                pending.fail(exc)
 
         due = self._talk.due_after(deadline)
         self._talk.expect(m.TriggerAnswer, due).add_done_callback(on_answer)
 
     def _expire(self) -> None:
         """The trigger's deadline: from this moment on its result is late."""
-        pending = self.inbox.attribution.pending
-        if pending is not None and not pending.outcome.done():
+        pending = self.inbox.pending
+        if pending is not None:
             self.inbox.attribution.give_up(pending)
-            pending.outcome.set_exception(TimeoutError())
+            pending.fail(TimeoutError())
 
     async def _check_application(self, deadline: float) -> None:
         """See to it that the application that was named is the active one.

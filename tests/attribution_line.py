@@ -2,28 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-from datetime import UTC, datetime
-
 from smartcam import Status
-from smartcam.attribution import (
-    Attribution,
-    Debt,
-    PendingTrigger,
-    Run,
-    Verdict,
-)
-from smartcam.interpretation import Interpretation
-from smartcam.models import Result
+from smartcam.attribution import Attribution, Debt, Run, Trigger, Verdict
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 WORKING = Status.RUNNING
-RAW = Interpretation("raw", lenient=False, y_down=False)
-NOW = datetime(2024, 5, 1, tzinfo=UTC)
-SOME = Result("press 4", 7, None, 1, None, NOW, None, b"", b"")
-
-NO_LOOP = asyncio.new_event_loop()
-NO_LOOP.close()  # the futures here are never awaited
 
 
 class Line:
@@ -42,12 +25,13 @@ class Line:
         self.status: Status | None = None
         self.fence_open = False
         self.wants_query = False  # a container is held: have a Query answered
+        self.cancelled = False  # the trigger's caller, who was not woken yet
         self.held: list[tuple[int | None, object]] = []
         self.judged: list[tuple[object, Verdict]] = []  # each container's fate, in order
         self.others = 0  # inspections that somebody else has triggered
 
     @property
-    def pending(self) -> PendingTrigger | None:
+    def pending(self) -> Trigger | None:
         return self.at.pending
 
     # -- what the client does
@@ -60,26 +44,15 @@ class Line:
         fenced: bool | None = None,
         certain: bool = False,
         confirms: bool = False,
-    ) -> PendingTrigger:
+    ) -> Trigger:
         """Send a trigger; the fence in front of it is not answered yet."""
         self.fence_open = self.fences if fenced is None else fenced
-        outcome: asyncio.Future[list[Result]] = asyncio.Future(loop=NO_LOOP)
         run = Run(reached=not self.fence_open, confirmed=not confirms)
-        pending = PendingTrigger(
-            outcome,
-            RAW,
-            False,
-            0.0,
-            NOW,
-            wanted=wanted,
-            number=number,
-            certain=certain,
-            run=run,
-        )
+        pending = Trigger(wanted, number, certain, run)
         self.at.send(pending)
         return pending
 
-    def trigger(self, number: int | None = None, wanted: int = 1) -> PendingTrigger:
+    def trigger(self, number: int | None = None, wanted: int = 1) -> Trigger:
         """Send a trigger whose fence is answered at once."""
         pending = self.send(number, wanted)
         self.answer()
@@ -87,8 +60,20 @@ class Line:
 
     def leave(self) -> None:
         """The caller of the trigger has been woken."""
-        self.at.pending = None
+        self.look()
+        self.at.leave()
+        self.cancelled = False
         self.release()
+
+    def cancel(self) -> None:
+        """The trigger's caller is cancelled, which shows when it, or the inbox, looks."""
+        self.cancelled = True
+
+    def look(self) -> None:
+        """The inbox looks at the trigger."""
+        if self.cancelled and self.pending is not None and not self.pending.ended:
+            self.pending.ended = True
+            self.at.give_up(self.pending)
 
     def give_up(self, debt: Debt = "late") -> None:
         assert self.pending is not None
@@ -96,10 +81,11 @@ class Line:
         self.leave()
 
     def reconnect(self) -> None:
+        self.look()
         pending, self.fence_open = self.pending, False
-        if pending is not None and not pending.outcome.done():
+        if pending is not None and not pending.ended:
             self.at.give_up(pending)
-            pending.outcome.cancel()
+            pending.ended = True
         self.release()
         self.leave()
         self.at.begin_session(ordered=self.is_ordered)
@@ -125,9 +111,10 @@ class Line:
             self._complete()
 
     def release(self) -> None:
+        self.look()
         held, self.held = self.held, []
         pending = self.pending
-        older = pending is None or pending.outcome.done() or pending.run.begun
+        older = pending is None or pending.ended or pending.run.begun
         for number, container in held:
             self.result(number, container, older=older)
 
@@ -135,6 +122,7 @@ class Line:
         self, number: int | None = None, container: object = None, *, older: bool = False
     ) -> Verdict:
         """A container comes; what is held gets its fate later."""
+        self.look()
         pending = self.pending
         verdict = self.at.judge_other(number) if older else self.at.judge(number)
         if verdict.fate == "held":
@@ -147,17 +135,18 @@ class Line:
         self.judged.append((container, verdict))
         if verdict.fate == "triggered":
             assert pending is not None
-            pending.results.append(SOME)
+            pending.came += 1
             self._complete()
         return verdict
 
     def _complete(self) -> None:
+        self.look()
         pending = self.pending
-        if pending is None or pending.outcome.done() or not pending.run.confirmed:
+        if pending is None or pending.ended or not pending.run.confirmed:
             return
-        if len(pending.results) == pending.wanted:
+        if pending.came == pending.wanted:
             self.at.done(pending)
-            pending.outcome.set_result(pending.results)
+            pending.ended = True
 
 
 def ready(*, ordered: bool = True) -> Line:

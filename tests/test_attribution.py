@@ -6,7 +6,7 @@ import itertools
 from typing import Any, Literal
 
 import pytest
-from attribution_line import RAW, READY, WORKING, Line, ready, shown
+from attribution_line import READY, WORKING, Line, ready, shown
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +19,9 @@ from smartcam.attribution import (
     Debt,
     Verdict,
 )
+from smartcam.inbox import Inbox
 from smartcam.interpretation import MAX_NUMBER, Interpretation
+from smartcam.observers import Observers
 from smartcam.protocols.messages import ResultContainer
 
 OURS = Verdict("triggered")
@@ -28,6 +30,8 @@ LATE = Verdict("late")
 STREAMED = Verdict("streamed")
 NOBODY = Verdict("nobody")
 EXTRA = Verdict("nobody", extra=True)
+
+RAW = Interpretation("raw", lenient=False, y_down=False)
 
 
 # ---------------------------------------------------------------------- without a number
@@ -133,7 +137,7 @@ def test_held_container_is_the_triggers_when_a_further_query_is_answered() -> No
     line.result(None, "own")
     line.answer()
     assert line.judged == [("own", OURS)]
-    assert pending.outcome.done()
+    assert pending.ended
     line.leave()
     for _ in range(3):  # it is known now that the camera shows nothing
         line.trigger()
@@ -309,8 +313,8 @@ def test_container_that_came_and_was_not_read_is_not_owed() -> None:
 
 def test_container_of_a_trigger_whose_caller_was_not_woken_yet_is_late() -> None:
     line = ready()
-    pending = line.trigger()
-    pending.outcome.cancel()
+    line.trigger()
+    line.cancel()
     assert line.result() == LATE
 
 
@@ -438,7 +442,7 @@ def test_second_container_that_comes_behind_the_next_trigger_is_not_its() -> Non
     assert line.result().fate == "nobody"
     line.hear(WORKING)
     assert line.result() == OURS
-    assert pending.outcome.done()
+    assert pending.ended
 
 
 def test_several_results_are_all_the_triggers() -> None:
@@ -547,11 +551,11 @@ def test_trigger_is_confirmed_by_a_status_behind_its_answer() -> None:
     line.hear(READY)
     assert not pending.run.confirmed
     line.at.on_answer()
-    assert not pending.outcome.done()
+    assert not pending.ended
     assert line.result().fate == "nobody"  # it has all that it wants
     line.hear(WORKING)
     assert pending.run.confirmed
-    assert pending.outcome.done()
+    assert pending.ended
 
 
 def test_answer_without_a_trigger_confirms_none() -> None:
@@ -716,13 +720,13 @@ def test_number_of_a_trigger_given_up_is_known_when_nothing_is_owed_any_more() -
     assert line.at.debt is None
 
 
-def test_numbering_is_that_of_the_last_trigger_with_a_number() -> None:
+def test_numbers_are_read_as_soon_as_a_trigger_has_one() -> None:
     line = Line()
     line.trigger()
-    assert line.at.numbering is None
+    assert not line.at.numbered
     line.trigger(1000)
     line.trigger()
-    assert line.at.numbering is RAW
+    assert line.at.numbered
 
 
 def test_numbers_owed_are_bounded_and_the_oldest_are_forgotten() -> None:
@@ -816,7 +820,7 @@ def test_numbering_of_a_field_is_as_wide_as_it_and_the_wire(field_type: str, hig
 
 @pytest.mark.parametrize("highest", sorted(set(FIELDS.values())))
 def test_numbers_fit_and_do_not_come_again_soon(highest: int) -> None:
-    attribution = Attribution()
+    attribution = Attribution(chance=0.5)
     taken = [attribution.take_number(highest) for _ in range(4 * FEWEST_NUMBERS)]
     numbers = [number for number, _ in taken]
     assert {certain for _, certain in taken} == {highest == MAX_NUMBER}
@@ -854,7 +858,7 @@ def test_number_wraps_around_below_zero() -> None:
 
 
 def test_number_the_user_has_set_is_taken_once_and_may_be_anybodys() -> None:
-    attribution = Attribution()
+    attribution = Attribution(chance=0.5)
     attribution.give_number(41)
     assert attribution.take_number(MAX_NUMBER) == (41, False)
     number, certain = attribution.take_number(MAX_NUMBER)
@@ -863,7 +867,7 @@ def test_number_the_user_has_set_is_taken_once_and_may_be_anybodys() -> None:
 
 
 def test_number_the_user_has_set_that_does_not_fit_the_field_is_not_taken() -> None:
-    attribution = Attribution()
+    attribution = Attribution(chance=0.5)
     attribution.give_number(200)
     assert 0 <= attribution.take_number(127)[0] <= 127
     assert attribution.take_number(MAX_NUMBER)[0] != 200
@@ -871,7 +875,7 @@ def test_number_the_user_has_set_that_does_not_fit_the_field_is_not_taken() -> N
 
 @pytest.mark.parametrize("highest", [127, MAX_NUMBER])
 def test_number_the_user_has_set_may_be_the_highest(highest: int) -> None:
-    attribution = Attribution()
+    attribution = Attribution(chance=0.5)
     attribution.give_number(highest)
     assert attribution.take_number(highest) == (highest, False)
 
@@ -911,7 +915,8 @@ def test_number_the_user_has_set_that_a_trigger_without_a_number_took_is_not_tak
 
 
 def test_two_clients_begin_at_different_numbers() -> None:
-    assert len({Attribution().take_number(MAX_NUMBER)[0] for _ in range(5)}) > 1
+    inboxes = [Inbox("press 4", RAW, Observers()) for _ in range(5)]
+    assert len({one.attribution.take_number(MAX_NUMBER)[0] for one in inboxes}) > 1
 
 
 def test_field_in_a_record_that_may_be_missing_does_not_always_decide() -> None:

@@ -181,7 +181,7 @@ class CameraAndClient(RuleBasedStateMachine):
     @property
     def idle(self) -> bool:
         pending = self.line.pending
-        return pending is None or pending.outcome.done()
+        return pending is None or pending.ended or self.line.cancelled
 
     @precondition(lambda self: self.idle and self.line.status is not None)
     @rule(data=st.data())
@@ -227,9 +227,6 @@ class CameraAndClient(RuleBasedStateMachine):
 
     def wake(self) -> None:
         """The caller of the last trigger goes on."""
-        pending = self.line.pending
-        if pending is not None and pending.outcome.cancelled():
-            self.line.at.give_up(pending)
         self.line.leave()
 
     def round_trip(self, data: st.DataObject) -> None:
@@ -275,7 +272,8 @@ class CameraAndClient(RuleBasedStateMachine):
             return
         if fate == "late":
             self.line.at.give_up(pending)
-        pending.outcome.cancel()
+            pending.ended = True
+        self.line.cancel()
         self.given_up.add(self.sent)
         if woken:
             self.wake()
@@ -284,7 +282,7 @@ class CameraAndClient(RuleBasedStateMachine):
         pending = self.line.pending
         assert pending is not None
         self.line.at.give_up(pending, debt)
-        pending.outcome.cancel()
+        pending.ended = True
         self.given_up.add(self.sent)
 
     @precondition(lambda self: self.ordered)
@@ -353,7 +351,7 @@ class CameraAndClient(RuleBasedStateMachine):
         """Something comes to the client."""
         line = self.line
         if isinstance(what, Container):
-            reads = line.at.numbering is not None
+            reads = line.at.numbered
             line.result(what.number if reads else None, what)
         elif what == "answer":
             self.asked = False
