@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
-from benchmarks._layouts import parse_localizations
+from benchmarks.constructs import parse_localizations
 from benchmarks.measure import Comparison, Curve, Goal, Plan, cpu_microseconds, take_turns
 from benchmarks.peers import wire
 from smartcam.interpreters import Context, Reader, base, resolve

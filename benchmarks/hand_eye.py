@@ -28,27 +28,27 @@ import numpy as np
 import yaml
 
 from benchmarks.measure import Comparison, Goal, Series
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.hand_eye import (
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.hand_eye.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration.imaging.hand_eye_fit import Rigid, Robot, RobotSigmas
-from smartcam.calibration.imaging.hand_eye_linear import LINEAR, solve_linear
-from smartcam.calibration.imaging.poses import locate
-from smartcam.calibration.imaging.simulation import HandEyeScene, hand_eye_scene
-from smartcam.calibration.imaging.targets import Charuco, Checkerboard, CircleGrid
+from smartcam.calibration.hand_eye.closed_forms import LINEAR, solve_linear
+from smartcam.calibration.hand_eye.equations import Rigid, Robot, RobotSigmas
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.lens.poses import locate
+from smartcam.calibration.simulation.scenes import HandEyeScene, hand_eye_scene
+from smartcam.calibration.targets import Charuco, Checkerboard, CircleGrid
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from benchmarks.measure import Plan
-    from smartcam.calibration.imaging.hand_eye_fit import Setup
-    from smartcam.calibration.imaging.targets import Target
-    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.calibration.hand_eye.equations import Setup
+    from smartcam.calibration.targets import Target
+    from smartcam.calibration.views import TargetView
 
 __all__ = ["FOLDER", "RECORDED", "Recorded", "find", "read_poses", "read_set", "run"]
 

@@ -18,13 +18,13 @@ from benchmarks.measure import Comparison, Cost, Curve, Goal, Plan, Series, cpu_
 from benchmarks.peers import peer, wire
 from smartcam.protocols.base import Role, Transport
 from smartcam.protocols.bvs import BVS
-from smartcam.protocols.machine import Machine, ResultBurst
+from smartcam.protocols.framed.machine import Machine, ResultBurst
 from smartcam.protocols.messages import Connect, ResultContainer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from smartcam.protocols.machine import Event
+    from smartcam.protocols.framed.machine import Event
 
 __all__ = ["run"]
 

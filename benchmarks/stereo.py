@@ -26,22 +26,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.measure import Comparison, Goal, Series
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging import simulation
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.rendering import render
-from smartcam.calibration.imaging.stereo import calibrate_stereo, spacing_errors
-from smartcam.calibration.imaging.targets import Checkerboard, CircleGrid
-from smartcam.calibration.imaging.views import TargetView
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation import scenes
+from smartcam.calibration.simulation.images import render
+from smartcam.calibration.stereo.calibration import calibrate_stereo, spacing_errors
+from smartcam.calibration.targets import Checkerboard, CircleGrid
+from smartcam.calibration.views import TargetView
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from benchmarks.measure import Plan
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.stereo import StereoCalibration
-    from smartcam.calibration.imaging.targets import Target
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.stereo.calibration import StereoCalibration
+    from smartcam.calibration.targets import Target
 
 __all__ = ["run"]
 
@@ -241,7 +241,7 @@ def _opencv(pixels: Sequence[Sequence[Any]], held_out: Sequence[Any]) -> Array:
 def _poses(seed: int, count: int) -> list[Transform]:
     """Return poses of a sheet before the left camera that both cameras see whole."""
     random, found = np.random.default_rng(seed), list[Transform]()
-    around = simulation.around(BOARD, 4 * count, tilt=0.6, distance=0.42, random=random)
+    around = scenes.around(BOARD, 4 * count, tilt=0.6, distance=0.42, random=random)
     for one in around:
         back = one.inverse()
         pose = Transform("left", "target", back.rotation, back.translation)

@@ -1,8 +1,8 @@
 """The camera as the user sees it.
 
-``open()`` starts the :class:`~smartcam.supervisor.Supervisor`, which makes sessions and reads their
-links: every chunk goes to the :class:`~smartcam.inbox.Inbox`, which knows who waits for what.
-Commands stand here; each is a few messages out and a wait with a deadline.
+``open()`` starts the :class:`~smartcam._client.supervisor.Supervisor`, which makes sessions and has
+every chunk of their links dispatched by the :class:`~smartcam._client.dispatch.Inbox`, which knows
+who waits for what. Commands stand here; each is a few messages out and a wait with a deadline.
 """
 
 from __future__ import annotations
@@ -12,7 +12,12 @@ import contextlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from smartcam.conversation import Conversation, is_ready
+from smartcam._client.command_lock import Turns
+from smartcam._client.dispatch import Inbox
+from smartcam._client.interpretation import Interpretation
+from smartcam._client.requests import Conversation, is_ready
+from smartcam._client.supervisor import Supervisor
+from smartcam._client.triggering import TriggerRequest, Triggers
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectionClosedError,
@@ -22,17 +27,12 @@ from smartcam.exceptions import (
     SmartCamError,
     TriggerTimeoutError,
 )
-from smartcam.inbox import Inbox
-from smartcam.interpretation import Interpretation
 from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status
 from smartcam.observers import Observer, Observers
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
 from smartcam.settings import CameraOptions, CameraSettings
 from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
-from smartcam.supervisor import Supervisor
-from smartcam.triggering import TriggerRequest, Triggers
-from smartcam.turns import Turns
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterable

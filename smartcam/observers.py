@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from datetime import datetime
 
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
     from smartcam.exceptions import SmartCamError
     from smartcam.models import CameraEvent, Result
 

@@ -59,8 +59,8 @@ _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Pytest: the options of the suites that judge cameras and clients."""
-    from smartcam.testing.clients import options as clients
-    from smartcam.testing.conformance import options as cameras
+    from smartcam.conformance.camera import pytest_options as cameras
+    from smartcam.conformance.client import pytest_options as clients
 
     cameras.add_options(parser)
     clients.add_options(parser)
@@ -68,7 +68,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Pytest: what was found of clients; what was found of a camera, its judge tells itself."""
-    from smartcam.testing.clients.options import terminal_summary
+    from smartcam.conformance.client.pytest_options import terminal_summary
 
     terminal_summary(terminalreporter)
 
@@ -76,7 +76,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Pytest: say which marker there is."""
     config.addinivalue_line("markers", MARKER)
-    pytest.register_assert_rewrite("smartcam.testing.interpreters")
+    pytest.register_assert_rewrite("smartcam.testing.suites.interpreters")
 
 
 # ---------------------------------------------------------------------- fixtures

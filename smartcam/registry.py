@@ -178,5 +178,5 @@ INTERPRETERS = Registry(
 
 PROTOCOLS = Registry(
     "smartcam.protocols",
-    {"bvs": "smartcam.protocols.bvs:BVS", "insight": "smartcam.protocols.insight:INSIGHT"},
+    {"bvs": "smartcam.protocols.bvs:BVS", "insight": "smartcam.protocols.insight.dialect:INSIGHT"},
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from smartcam import Status
-from smartcam.attribution import Attribution, Debt, Run, Trigger, Verdict
+from smartcam._client.correlation import Attribution, Debt, Run, Trigger, Verdict
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 WORKING = Status.RUNNING

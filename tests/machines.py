@@ -9,8 +9,8 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
 from smartcam.protocols.bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols.framed import FramedDialect
-from smartcam.protocols.machine import TRANSITIONS, Event, Machine, ResultBurst, State
+from smartcam.protocols.framed.dialect import FramedDialect
+from smartcam.protocols.framed.machine import TRANSITIONS, Event, Machine, ResultBurst, State
 
 CODE, NO_ID, BIG_ENDIAN_NUMBER = (
     B16.with_quirks([name]) for name in ("code", "no_id", "big_endian_number")

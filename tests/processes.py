@@ -33,8 +33,12 @@ MAINS = {"smartcam": "main", "smartcam-emulator": "emulator_main"}
 """Our console scripts, and what of ``smartcam.cli`` they call."""
 
 LOADED = (
-    *("smartcam.cli.commands", "smartcam.cli.emulate", "smartcam.emulator.insight"),
-    *("smartcam.calibration.wizard", "smartcam.recording", "smartcam.web", "mcap.writer"),
+    *(
+        "smartcam.cli.smartcam",
+        "smartcam.cli.smartcam_emulator",
+        "smartcam.emulator.insight.camera",
+    ),
+    *("smartcam.calibration.wizards.plane", "smartcam.recording", "smartcam.web", "mcap.writer"),
     "scipy.special",
 )
 """What commands import, mostly when it is used."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 __all__ = ["bodies", "chunkings", "garbage", "message_types", "messages", "split", "streams"]
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.account import Account, Times
+from smartcam._client.counters import Account, Times
 from smartcam.models import HISTOGRAM_BOUNDS, Histogram, SubscriberStatistics
-from smartcam.protocols.machine import Counters
+from smartcam.protocols.framed.machine import Counters
 
 SECONDS = st.one_of(st.floats(0, 100), st.sampled_from(HISTOGRAM_BOUNDS), st.just(0.0))
 

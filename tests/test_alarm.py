@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from smartcam.alarm import Alarm
+from smartcam._client.deadline import Alarm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

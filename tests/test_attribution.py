@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam import Status
-from smartcam.attribution import (
+from smartcam._client.correlation import (
     FEWEST_NUMBERS,
     MAX_OWED,
     NUMBER_STEP,
@@ -19,8 +19,8 @@ from smartcam.attribution import (
     Debt,
     Verdict,
 )
-from smartcam.inbox import Inbox
-from smartcam.interpretation import MAX_NUMBER, Interpretation
+from smartcam._client.dispatch import Inbox
+from smartcam._client.interpretation import MAX_NUMBER, Interpretation
 from smartcam.observers import Observers
 from smartcam.protocols.messages import ResultContainer
 

@@ -18,8 +18,8 @@ from hypothesis.stateful import (
 )
 
 from smartcam import Status
-from smartcam.attribution import MAX_OWED, Debt
-from smartcam.interpretation import MAX_NUMBER
+from smartcam._client.correlation import MAX_OWED, Debt
+from smartcam._client.interpretation import MAX_NUMBER
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -27,21 +27,21 @@ from handmade import (
 )
 from machines import one_by_one
 
-from smartcam import connection
-from smartcam.connection import Chunk, Link, TraceEntry, open_link
+from smartcam._client import link as connection
+from smartcam._client.link import Chunk, Link, TraceEntry, open_link
 from smartcam.exceptions import ConnectionLostError, FrameError, LocalProtocolError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
 from smartcam.protocols.bvs import BVS, HANDBOOK
-from smartcam.protocols.machine import LinkEnded, LinkFailed, Machine, ResultBurst, State
+from smartcam.protocols.framed.machine import LinkEnded, LinkFailed, Machine, ResultBurst, State
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from handmade import Listener, Peer
 
-    from smartcam.protocols.machine import Event
+    from smartcam.protocols.framed.machine import Event
 
 RUNNING = m.StatusReport(status=Status(0x280))
 BUSY_REPORT = m.StatusReport(status=Status.BUSY)

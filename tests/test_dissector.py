@@ -30,7 +30,7 @@ from test_vectors import VECTORS
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 __all__ = ["lua"]
 

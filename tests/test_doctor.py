@@ -14,15 +14,15 @@ from handmade import until
 import smartcam
 from smartcam import doctor
 from smartcam.doctor import Exit, Finding, examine, summary
-from smartcam.doctor.figures import Figures, figures
+from smartcam.doctor.timing import Figures, figures
 from smartcam.emulator import Application, EmulatedCamera, faults
-from smartcam.emulator.insight import EmulatedInSight
+from smartcam.emulator.insight.camera import EmulatedInSight
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from smartcam.doctor.visit import Visit
+    from smartcam.doctor.context import Visit
 
 QUICK = [
     Application(id=2, layout="n: int32", constant={"n": 1}, load_time=0, processing_time=0.001),

@@ -11,7 +11,7 @@ import pytest
 from doctorkit import errors, examined, of, severities
 
 from smartcam.doctor import Exit
-from smartcam.doctor.reading import MAX_ROWS, PLAUSIBLE, Row, aligned
+from smartcam.doctor.result_checks import MAX_ROWS, PLAUSIBLE, Row, aligned
 from smartcam.emulator import Application, EmulatedCamera, faults
 from smartcam.layout import Layout
 

@@ -27,7 +27,8 @@ from handmade import (
 import smartcam
 from smartcam.doctor import Exit, examine
 from smartcam.emulator import EmulatedCamera, faults
-from smartcam.testing import LinkProxy, rules
+from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import rules
 
 if TYPE_CHECKING:
     from smartcam.emulator.faults import BaseFault

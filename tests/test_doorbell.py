@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from smartcam.doorbell import Doorbell
+from smartcam._client.doorbell import Doorbell
 
 
 async def asleep(bell: Doorbell, heard: list[str], times: int = 1) -> str:

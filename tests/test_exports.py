@@ -140,7 +140,7 @@ def test_first_use_of_a_light_name_stays_light(name: str) -> None:
 
 
 def test_protocol_core_imports_no_loop_socket_or_logging() -> None:
-    code = "import smartcam.protocols.bvs, smartcam.protocols.machine"
+    code = "import smartcam.protocols.bvs, smartcam.protocols.framed.machine"
     watched = ["socket", "selectors", "logging", *HEAVY]
     assert newly_imported(code, watched) == []
-    assert newly_imported("import smartcam.connection", watched) != []
+    assert newly_imported("import smartcam._client.link", watched) != []

@@ -32,7 +32,8 @@ from handmade import (
     until,
 )
 
-from smartcam import handshake
+from smartcam._client import handshake
+from smartcam._client.handshake import Session, Try, establish, load_protocol
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -40,11 +41,10 @@ from smartcam.exceptions import (
     PluginError,
     RemoteProtocolError,
 )
-from smartcam.handshake import Session, Try, establish, load_protocol
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import BVS, HANDBOOK, THESIS
-from smartcam.protocols.machine import State
+from smartcam.protocols.framed.machine import State
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
 
@@ -53,8 +53,8 @@ if TYPE_CHECKING:
 
     from handmade import Peer
 
-    from smartcam.connection import TraceEntry
-    from smartcam.protocols.machine import Event
+    from smartcam._client.link import TraceEntry
+    from smartcam.protocols.framed.machine import Event
 
 RUNNING = m.StatusReport(status=Status(0x280))
 ANSWERS = [m.ConnectAnswer(version=1), RUNNING, m.QueryAnswer(application=21)]

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from handmade import HOST, LIMIT, datagrams, scripted, until
 
-from smartcam import handshake
+from smartcam._client import handshake
+from smartcam._client.handshake import Session, establish
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConnectFailedError, MessageError
-from smartcam.handshake import Session, establish
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.settings import CameraSettings

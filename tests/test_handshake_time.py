@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from handmade import CONNECT_ANSWER, HOST, Peer, scripted
 
+from smartcam._client.handshake import DETECTION_SHARE, establish
 from smartcam.exceptions import ConnectFailedError
-from smartcam.handshake import DETECTION_SHARE, establish
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:

@@ -150,7 +150,7 @@ class _Count:
 
 
 def test_scenario_ids_are_compared_once_each() -> None:
-    from smartcam.emulator.scenario import _first_double
+    from smartcam.emulator.scenario.scenario import _first_double
 
     _Count.compared = 0
     assert _first_double(_Count(number) for number in range(5000)) is None

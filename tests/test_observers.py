@@ -10,7 +10,7 @@ import pytest
 
 import smartcam
 from smartcam import Connected, Observer, Result, SmartCamError
-from smartcam.connection import TraceEntry
+from smartcam._client.link import TraceEntry
 from smartcam.observers import Observers
 
 if TYPE_CHECKING:

@@ -25,14 +25,14 @@ from handmade import (
     scripted,
 )
 
-from smartcam.connection import MAX_REST
+from smartcam._client.link import MAX_REST
+from smartcam.doctor.probing import MAX_FRAMES, Trial, trials, ways
 from smartcam.emulator import EmulatedCamera
 from smartcam.models import Status
-from smartcam.probing import MAX_FRAMES, Trial, trials, ways
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
 
 SHORT = 0.3
 """Seconds for all tries where most of them are silence."""

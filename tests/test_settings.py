@@ -21,8 +21,8 @@ import dataclasses
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols.base import Protocol, Transport
 from smartcam.protocols.bvs import B16, HANDBOOK
-from smartcam.protocols.framed import FramedDialect
-from smartcam.protocols.machine import Machine
+from smartcam.protocols.framed.dialect import FramedDialect
+from smartcam.protocols.framed.machine import Machine
 
 PROTOCOL = Protocol(
     name="acme",

@@ -11,7 +11,7 @@ from smartcam.observers import Observer
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
 
 
 class Sending(NamedTuple):

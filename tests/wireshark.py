@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 PORT = 36701
 SECONDS = 300

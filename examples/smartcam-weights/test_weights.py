@@ -4,7 +4,7 @@ import struct
 
 from smartcam_weights import weights
 
-from smartcam.testing.interpreters import InterpreterSuite, Sample
+from smartcam.testing.suites.interpreters import InterpreterSuite, Sample
 
 
 def container(order: str) -> bytes:

@@ -10,12 +10,12 @@ __all__ = ["emulator_main", "main"]
 
 def main() -> None:
     """Run ``smartcam``."""
-    _run("smartcam", "commands")
+    _run("smartcam", "smartcam")
 
 
 def emulator_main() -> None:
     """Run ``smartcam-emulator``."""
-    _run("smartcam-emulator", "emulate")
+    _run("smartcam-emulator", "smartcam_emulator")
 
 
 def _run(program: str, module: str) -> None:

@@ -19,8 +19,8 @@ from smartcam.observers import Observer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from smartcam.calibration.kinds import AnyCalibration
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
+    from smartcam.calibration.files.load import AnyCalibration
 
 __all__ = [
     "CONNECTS",
@@ -149,7 +149,7 @@ class _Frames(Observer):
 
 def _calibration(path: str) -> AnyCalibration:
     """Return what a calibration's file holds."""
-    from smartcam.calibration.kinds import load_calibration
+    from smartcam.calibration.files.load import load_calibration
 
     try:
         return load_calibration(path)

@@ -13,14 +13,14 @@ from smartcam import __version__
 from smartcam.models import Status
 from smartcam.protocols.base import Transport
 from smartcam.protocols.bvs import BVS, DEFAULT_PORT
-from smartcam.protocols.framing import DEFAULT_MAX_LENGTH
+from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH
 from smartcam.protocols.messages import Request, Sender
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from smartcam.protocols.base import Code
-    from smartcam.protocols.framed import FramedDialect, MessageRow, StatusBits
+    from smartcam.protocols.framed.dialect import FramedDialect, MessageRow, StatusBits
 
 __all__ = ["lua_source", "lua_tables"]
 

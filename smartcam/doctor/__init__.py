@@ -10,9 +10,9 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.doctor import looking, reaching, reading, triggering
+from smartcam.doctor import result_checks, session_checks, state_checks, trigger_checks
+from smartcam.doctor.context import Plan, Visit, Witness
 from smartcam.doctor.findings import Exit, Finding, Severity, summary
-from smartcam.doctor.visit import Plan, Visit, Witness
 from smartcam.exceptions import (
     CameraFaultError,
     CommandRejectedError,
@@ -28,7 +28,7 @@ from smartcam.settings import parse_address
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable
 
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
     from smartcam.interpreters.base import Spec
 
 __all__ = ["Exit", "Finding", "Severity", "examine", "summary"]
@@ -65,7 +65,7 @@ class _Check(NamedTuple):
 
 
 def _requests(plan: Plan) -> float:
-    return plan.step(5.0) + looking.QUERIES_WITHIN
+    return plan.step(5.0) + state_checks.QUERIES_WITHIN
 
 
 def _switch(plan: Plan) -> float:
@@ -73,24 +73,26 @@ def _switch(plan: Plan) -> float:
 
 
 _CHECKS = (
-    _Check("name", reaching.resolve, lambda plan: plan.step(10.0) + 1.0, in_session=False),
+    _Check("name", session_checks.resolve, lambda plan: plan.step(10.0) + 1.0, in_session=False),
     _Check(
         "session",
-        reaching.connect,
+        session_checks.connect,
         # a session that fails, every other way, and a session by one of them; and their ends
-        lambda plan: 4 * plan.step(10.0) + reaching.CONNECTS_WITHIN + reaching.CONNECTS,
+        lambda plan: 4 * plan.step(10.0) + session_checks.CONNECTS_WITHIN + session_checks.CONNECTS,
         in_session=False,
     ),
-    _Check("status", looking.look_at_status, _requests),
+    _Check("status", state_checks.look_at_status, _requests),
     _Check(
-        "application", triggering.look_at_application, lambda plan: _requests(plan) + _switch(plan)
+        "application",
+        trigger_checks.look_at_application,
+        lambda plan: _requests(plan) + _switch(plan),
     ),
-    _Check("round trip", looking.measure_round_trip, _requests),
-    _Check("run state", looking.watch, lambda plan: plan.seconds + 1.0),
-    _Check("trigger", triggering.trigger, lambda plan: plan.count * plan.step(5.0) + 1.0),
-    _Check("application", triggering.give_back, _switch),
-    _Check("layout", reading.look_at_results, lambda plan: 10.0),
-    _Check("clock", looking.look_at_clock, _requests),
+    _Check("round trip", state_checks.measure_round_trip, _requests),
+    _Check("run state", state_checks.watch, lambda plan: plan.seconds + 1.0),
+    _Check("trigger", trigger_checks.trigger, lambda plan: plan.count * plan.step(5.0) + 1.0),
+    _Check("application", trigger_checks.give_back, _switch),
+    _Check("layout", result_checks.look_at_results, lambda plan: 10.0),
+    _Check("clock", state_checks.look_at_clock, _requests),
 )
 """In their order. The limits are there for a fault of ours: each step has a bound of its own. Their
 sum, and a second for the end of the session, bounds the whole."""
@@ -169,11 +171,11 @@ async def _run(check: _Check, visit: Visit) -> bool:
             if not visit.patient.connected and check.name != "clock":
                 await visit.patient.query_application()  # raises why
     except LinkError as exc:
-        await reaching.explain_loss(visit, exc)
+        await session_checks.explain_loss(visit, exc)
         return False
     except ResponseTimeoutError as exc:
         if not visit.patient.connected:  # an answer that did not come costs the session
-            await reaching.explain_loss(visit, exc)
+            await session_checks.explain_loss(visit, exc)
             return False
         visit.say(
             check.name,

@@ -8,18 +8,18 @@
 
 from smartcam.emulator import faults
 from smartcam.emulator.application import Application
+from smartcam.emulator.bvs.device import Device
+from smartcam.emulator.bvs.quirks import Quirks
+from smartcam.emulator.camera import EmulatedCamera
 from smartcam.emulator.clock import Clock, ManualClock, RealClock
-from smartcam.emulator.device import Device
 from smartcam.emulator.faults import FiredFault
 from smartcam.emulator.fleet import EmulatedFleet
 from smartcam.emulator.generators import Run, register_generator
-from smartcam.emulator.quirks import Quirks
-from smartcam.emulator.scenario import Scenario
-from smartcam.emulator.scenario_file import load_scenario, load_scenarios, scenario_schema
+from smartcam.emulator.scenario.file import load_scenario, load_scenarios, scenario_schema
+from smartcam.emulator.scenario.scenario import Scenario
+from smartcam.emulator.scenario.states import DeviceState
+from smartcam.emulator.scenario.timeline import Cue
 from smartcam.emulator.scene import TableScene
-from smartcam.emulator.server import EmulatedCamera
-from smartcam.emulator.states import DeviceState
-from smartcam.emulator.timeline import Cue
 from smartcam.emulator.traffic import LogEntry, Visit
 
 __all__ = [

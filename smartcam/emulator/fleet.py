@@ -6,8 +6,8 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from smartcam.emulator.scenario_file import load_scenarios
-from smartcam.emulator.server import EmulatedCamera
+from smartcam.emulator.camera import EmulatedCamera
+from smartcam.emulator.scenario.file import load_scenarios
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.emulator.clock import Clock
-    from smartcam.emulator.scenario import Scenario
+    from smartcam.emulator.scenario.scenario import Scenario
 
 __all__ = ["EmulatedFleet"]
 

@@ -1,7 +1,7 @@
 """Sockets of the emulated camera: they move bytes, what they mean is decided elsewhere.
 
 A link is one client's way to the camera: a TCP connection, or all datagrams of one address. Each
-has a :class:`~smartcam.protocols.machine.Machine` in the camera's role.
+has a :class:`~smartcam.protocols.framed.machine.Machine` in the camera's role.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import struct
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Literal, Protocol, cast
 
-from smartcam.accepting import Acceptor
-from smartcam.emulator.passage import Passage, Watch
+from smartcam._accepting import Acceptor
+from smartcam.emulator.faults.faulty_link import Passage, Watch
 from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Policy, Role, Transport
-from smartcam.protocols.machine import Machine, State
+from smartcam.protocols.framed.machine import Machine, State
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.emulator.device import Device
-    from smartcam.emulator.parcels import Parcel
-    from smartcam.emulator.quirks import Quirks
-    from smartcam.protocols.framing import Frame
+    from smartcam.emulator.bvs.device import Device
+    from smartcam.emulator.bvs.quirks import Quirks
+    from smartcam.emulator.faults.wire_effects import Parcel
+    from smartcam.protocols.framed.framing import Frame
 
 __all__ = [
     "FAREWELL",

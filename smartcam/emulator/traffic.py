@@ -10,14 +10,14 @@ from itertools import islice
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, overload
 
 from smartcam.exceptions import RemoteProtocolError, ResponseTimeoutError
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.framing import Frame
 from smartcam.protocols.messages import Message, Sender, UnknownMessage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from smartcam.emulator.parcels import Parcel
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.emulator.faults.wire_effects import Parcel
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 __all__ = ["MAX_BYTES", "MAX_ENTRIES", "MAX_IDS", "Log", "LogEntry", "TrafficLog", "Visit"]
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from smartcam.exceptions import RemoteProtocolError
     from smartcam.models import Capabilities
-    from smartcam.protocols.framing import Frame
-    from smartcam.protocols.machine import LinkMachine
+    from smartcam.protocols.framed.framing import Frame
+    from smartcam.protocols.framed.machine import LinkMachine
 
     MachineFactory = Callable[..., LinkMachine]
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Code, Protocol, Transport, Verdict
-from smartcam.protocols.framed import FramedDialect, MessageRow, StatusBits, WireQuirk
-from smartcam.protocols.framing import HeaderLayout
-from smartcam.protocols.machine import Machine
+from smartcam.protocols.framed.dialect import FramedDialect, MessageRow, StatusBits, WireQuirk
+from smartcam.protocols.framed.framing import HeaderLayout
+from smartcam.protocols.framed.machine import Machine
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

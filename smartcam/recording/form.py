@@ -14,7 +14,7 @@ import math
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
-from smartcam.connection import TraceEntry
+from smartcam._client.link import TraceEntry
 from smartcam.exceptions import MissingExtraError
 from smartcam.models import (
     ApplicationChanged,

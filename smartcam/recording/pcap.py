@@ -13,7 +13,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.connection import TraceEntry
+from smartcam._client.link import TraceEntry
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import Disconnected
 from smartcam.protocols.base import Transport

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from smartcam.connection import TraceEntry
+from smartcam._client.link import TraceEntry
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Result
 from smartcam.recording.form import (

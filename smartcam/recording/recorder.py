@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import smartcam
-from smartcam.connection import TraceEntry
+from smartcam._client.link import TraceEntry
+from smartcam._locks import try_lock
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
-from smartcam.locks import try_lock
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
 from smartcam.observers import Observer
 from smartcam.recording.form import (

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from pydantic import PrivateAttr
 
 from smartcam.emulator.application import Application
+from smartcam.emulator.camera import EmulatedCamera
 from smartcam.emulator.generators import wrap_number
-from smartcam.emulator.server import EmulatedCamera
 from smartcam.exceptions import ConfigurationError
 from smartcam.interpreters.base import resolve
 from smartcam.protocols import messages as m
-from smartcam.recording.plan import CONDITIONS, plan_replay
+from smartcam.recording.schedule import CONDITIONS, plan_replay
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from smartcam.emulator.scene import TableScene
     from smartcam.layout import Field
     from smartcam.models import ByteOrder, Status
-    from smartcam.recording.plan import ReplayPlan, Take, TakeList
     from smartcam.recording.reader import Recording
+    from smartcam.recording.schedule import ReplayPlan, Take, TakeList
 
 __all__ = ["ReplayedCamera"]
 

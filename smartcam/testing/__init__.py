@@ -15,11 +15,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from smartcam.testing.clients import ClientConformance
-    from smartcam.testing.conformance import CameraConformance
-    from smartcam.testing.interpreters import InterpreterSuite, Sample
     from smartcam.testing.logs import CameraLog
-    from smartcam.testing.protocols import (
+    from smartcam.testing.proxy.proxy import LinkProxy
+    from smartcam.testing.suites.interpreters import InterpreterSuite, Sample
+    from smartcam.testing.suites.protocols import (
         Came,
         CameraSuite,
         Conversation,
@@ -29,15 +28,12 @@ if TYPE_CHECKING:
         WireSuite,
         World,
     )
-    from smartcam.testing.proxy import LinkProxy
     from smartcam.testing.threads import ThreadedCamera, ThreadedFleet
 
 __all__ = [
     "Came",
-    "CameraConformance",
     "CameraLog",
     "CameraSuite",
-    "ClientConformance",
     "Conversation",
     "InterpreterSuite",
     "LinkProxy",
@@ -52,22 +48,20 @@ __all__ = [
 ]
 
 _MODULES = {
-    "CameraConformance": "conformance",
     "CameraLog": "logs",
-    "ClientConformance": "clients",
-    "InterpreterSuite": "interpreters",
-    "LinkProxy": "proxy",
-    "Sample": "interpreters",
+    "InterpreterSuite": "suites.interpreters",
+    "LinkProxy": "proxy.proxy",
+    "Sample": "suites.interpreters",
     "ThreadedCamera": "threads",
     "ThreadedFleet": "threads",
 }
-"""Where a name stands; what is not here stands in ``protocols``."""
+"""Where a name stands; what is not here stands in ``suites.protocols``."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_MODULES.get(name, 'protocols')}")
+    module = importlib.import_module(f"{__name__}.{_MODULES.get(name, 'suites.protocols')}")
     value = globals()[name] = getattr(module, name)
     return value
 

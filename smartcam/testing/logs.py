@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeAlias, overload
 
-from smartcam.emulator.fault_base import MESSAGE_NAMES, known_name
+from smartcam.emulator.faults.base import MESSAGE_NAMES, known_name
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m

@@ -10,12 +10,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter,
 from smartcam.emulator.faults import Fault
 from smartcam.emulator.scene import PIECES, TablePose
 from smartcam.exceptions import ConfigurationError
-from smartcam.web import shown
-from smartcam.web.calls import Ask, Call, as_table
-from smartcam.web.refusals import RefusedError
+from smartcam.web import serialize
+from smartcam.web.errors import RefusedError
+from smartcam.web.feed import Watcher
+from smartcam.web.routes import Ask, Call, as_table
 from smartcam.web.site import API, Site
 from smartcam.web.streams import is_open
-from smartcam.web.watching import Watcher
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -256,20 +256,20 @@ def _calls(_site: EmulatorSite, _ask: Ask) -> object:
 
 
 def _kinds(_site: EmulatorSite, _ask: Ask) -> object:
-    return {"kinds": shown.kinds()}
+    return {"kinds": serialize.kinds()}
 
 
 def _cameras(site: EmulatorSite, _ask: Ask) -> object:
-    return {"cameras": [shown.camera_row(name, one) for name, one in site.cameras.items()]}
+    return {"cameras": [serialize.camera_row(name, one) for name, one in site.cameras.items()]}
 
 
 def _state(site: EmulatorSite, ask: Ask) -> object:
     name = _name(site, ask)
     emulator = site.cameras[name]
     return {
-        **shown.camera_state(name, emulator),
-        **shown.times(emulator),
-        "log": shown.log_range(emulator),
+        **serialize.camera_state(name, emulator),
+        **serialize.times(emulator),
+        "log": serialize.log_range(emulator),
     }
 
 
@@ -308,7 +308,7 @@ def _reboot(site: EmulatorSite, ask: Ask) -> object:
 
 def _conditions(site: EmulatorSite, ask: Ask) -> object:
     device = _emulator(site, ask).device
-    for name, bit in shown.CONDITIONS.items():
+    for name, bit in serialize.CONDITIONS.items():
         on = getattr(ask.body, name)
         if on is not None:
             device.set_condition(bit, on)
@@ -322,7 +322,7 @@ def _endian(site: EmulatorSite, ask: Ask) -> object:
 
 
 def _faults(site: EmulatorSite, ask: Ask) -> object:
-    return shown.faults_state(_emulator(site, ask))
+    return serialize.faults_state(_emulator(site, ask))
 
 
 def _inject(site: EmulatorSite, ask: Ask) -> object:
@@ -346,7 +346,7 @@ def _command(site: EmulatorSite, ask: Ask) -> object:
 
 def _scene(site: EmulatorSite, ask: Ask) -> object:
     emulator = _emulator(site, ask)
-    return {**shown.scene_state(emulator.scene), "reported": shown.reported(emulator)}
+    return {**serialize.scene_state(emulator.scene), "reported": serialize.reported(emulator)}
 
 
 def _put_part(site: EmulatorSite, ask: Ask) -> object:
@@ -386,7 +386,7 @@ async def _log(site: EmulatorSite, ask: Ask) -> object:
 
     if part.wait:
         await site.wait_for(ask.request, came, part.wait)
-    return shown.log_part(emulator, since, part.limit)[0]
+    return serialize.log_part(emulator, since, part.limit)[0]
 
 
 def _log_entry(site: EmulatorSite, ask: Ask) -> object:
@@ -397,13 +397,13 @@ def _log_entry(site: EmulatorSite, ask: Ask) -> object:
     if not entries or serial < first:
         there = f"{first} to {count - 1}" if len(emulator.log) else "none"
         raise RefusedError(404, f"log entry {text!r}", f"one that is there: {there}")
-    return shown.camera_entry(serial, entries[0], emulator, whole=True)
+    return serialize.camera_entry(serial, entries[0], emulator, whole=True)
 
 
 def _clear_log(site: EmulatorSite, ask: Ask) -> object:
     emulator = _emulator(site, ask)
     emulator.log.clear()
-    return {"next": shown.log_count(emulator)}
+    return {"next": serialize.log_count(emulator)}
 
 
 def _events(site: EmulatorSite, ask: Ask) -> object:

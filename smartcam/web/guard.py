@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.web.refusals import RefusedError, shown
+from smartcam.web.errors import RefusedError, shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from aiohttp import web
 
-from smartcam.accepting import Acceptor
+from smartcam._accepting import Acceptor
 from smartcam.exceptions import ConfigurationError
-from smartcam.web.calls import MAX_BODY, middleware, routes
+from smartcam.web.connections import KEEP_ALIVE, Places
 from smartcam.web.guard import HEADERS, Guard, checked_token, is_loopback, new_token
-from smartcam.web.places import KEEP_ALIVE, Places
+from smartcam.web.routes import MAX_BODY, middleware, routes
 from smartcam.web.streams import Streams
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from smartcam.web.calls import Call
+    from smartcam.web.routes import Call
 
 __all__ = ["API", "BACKLOG", "FAREWELL", "RESOLVE_TIMEOUT", "Site"]
 

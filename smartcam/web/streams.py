@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from aiohttp import web
 
 from smartcam.models import jsonable
-from smartcam.web.refusals import RefusedError
+from smartcam.web.errors import RefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

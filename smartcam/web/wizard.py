@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from smartcam.calibration.codes import Code
 from smartcam.exceptions import CalibrationError
-from smartcam.web.calls import Ask, Call, as_table
-from smartcam.web.refusals import RefusedError
+from smartcam.web.errors import RefusedError
+from smartcam.web.routes import Ask, Call, as_table
 from smartcam.web.site import API, Site
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from smartcam.calibration.services import CalibrationService
+    from smartcam.calibration.wizards.services import CalibrationService
 
 __all__ = ["CALLS", "WizardSite"]
 

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 from hypothesis import strategies as st
 
-from smartcam.calibration.geometry import (
+from smartcam.calibration.geometry.rotations import (
     Array,
     matrix_from_quaternion,
     quaternion_normalize,

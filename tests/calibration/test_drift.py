@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from bench import GRID, Bench, say, where
 
-from smartcam.calibration.drift import MAX_TOUCHES, drift_wizard, touches_needed
-from smartcam.calibration.folder import Folder
-from smartcam.calibration.journal import Journal
-from smartcam.calibration.plane import PlaneCalibration, fit_plane
-from smartcam.calibration.sequence import Session
-from smartcam.calibration.store import write
-from smartcam.calibration.touches import fit_touches
+from smartcam.calibration.files.directory import Folder
+from smartcam.calibration.files.store import write
+from smartcam.calibration.plane.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration.plane.touches import fit_touches
+from smartcam.calibration.wizards.journal import Journal
+from smartcam.calibration.wizards.sequence import Session
+from smartcam.calibration.wizards.verification import MAX_TOUCHES, drift_wizard, touches_needed
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import pytest
 
-from smartcam.calibration.extra import load
+from smartcam.calibration.optional_imports import load
 from smartcam.exceptions import MissingExtraError
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
-from smartcam.calibration.fitting import (
+from smartcam.calibration.plane.fitting import (
     MODELS,
     Frame,
     ModelName,
@@ -22,7 +22,7 @@ from smartcam.calibration.fitting import (
 )
 
 if TYPE_CHECKING:
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
 NAMES: list[ModelName] = ["rigid", "similarity", "affine", "homography"]

@@ -19,6 +19,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rigid import FEW, NOON, after, close, refused, rotation_about, transforms
 
+from smartcam.calibration.files.store import write
 from smartcam.calibration.formats import (
     SAMPLES,
     TRAJECTORIES,
@@ -37,11 +38,10 @@ from smartcam.calibration.formats import (
 )
 from smartcam.calibration.formats.opencv import compose_matrix
 from smartcam.calibration.formats.plain import real
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.plane import PlaneCalibration, PlaneModel, fit_plane
-from smartcam.calibration.services import CalibrationService
-from smartcam.calibration.solvers import Chain, PlaneProjection
-from smartcam.calibration.store import write
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.geometry.solvers import Chain, PlaneProjection
+from smartcam.calibration.plane.calibration import PlaneCalibration, PlaneModel, fit_plane
+from smartcam.calibration.wizards.services import CalibrationService
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

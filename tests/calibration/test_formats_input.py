@@ -25,7 +25,7 @@ from smartcam.calibration.formats import (
     write_transform,
 )
 from smartcam.calibration.formats.plain import load_json, load_yaml
-from smartcam.calibration.frames import Transform
+from smartcam.calibration.geometry.frames import Transform
 from smartcam.exceptions import CalibrationError, MissingExtraError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from smartcam.calibration.formats import ROBOTS, pose_from, pose_to
 from smartcam.calibration.formats.robots import angles_zyx, rotation_zyx
 
 if TYPE_CHECKING:
-    from smartcam.calibration.frames import Transform
+    from smartcam.calibration.geometry.frames import Transform
 
 EULER = {"kuka": "ZYX", "fanuc": "xyz", "meca500": "XYZ"}
 """SciPy's names: capitals turn about axes that move, small letters about axes that stand."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rigid import NOON, after, close, refused, rotations, transforms, translations, yaw
 from scipy.spatial.transform import Rotation, Slerp
 
-from smartcam.calibration.frames import FrameTree, Transform
+from smartcam.calibration.geometry.frames import FrameTree, Transform
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

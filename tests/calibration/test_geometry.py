@@ -10,19 +10,19 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
-from smartcam.calibration import geometry
+from smartcam.calibration.geometry import rotations
 
 angles = st.floats(-math.pi, math.pi)
 vectors = st.tuples(*[st.floats(-10, 10)] * 3)
 quaternions = (
     st.tuples(*[st.floats(-1, 1)] * 4)
     .filter(lambda values: math.hypot(*values) > 0.1)
-    .map(geometry.quaternion_normalize)
+    .map(rotations.quaternion_normalize)
 )
 
 
 def test_wrap_angle_beyond_a_turn_gives_half_open_range() -> None:
-    assert geometry.wrap_angle([0.0, math.pi, -math.pi, 3.0 * math.pi]).tolist() == [
+    assert rotations.wrap_angle([0.0, math.pi, -math.pi, 3.0 * math.pi]).tolist() == [
         0.0,
         math.pi,
         math.pi,
@@ -31,60 +31,60 @@ def test_wrap_angle_beyond_a_turn_gives_half_open_range() -> None:
 
 
 def test_rotate_ccw_quarter_turn_takes_x_to_y() -> None:
-    assert geometry.rotate_ccw([[1, 0], [0, 1]], math.pi / 2) == pytest.approx(
+    assert rotations.rotate_ccw([[1, 0], [0, 1]], math.pi / 2) == pytest.approx(
         np.array([[0, 1], [-1, 0]])
     )
 
 
 @given(quaternions, quaternions)
-def test_quaternion_multiply_equals_scipy(first: geometry.Array, second: geometry.Array) -> None:
-    ours = geometry.matrix_from_quaternion(geometry.quaternion_multiply(first, second))
+def test_quaternion_multiply_equals_scipy(first: rotations.Array, second: rotations.Array) -> None:
+    ours = rotations.matrix_from_quaternion(rotations.quaternion_multiply(first, second))
     theirs = (Rotation.from_quat(first) * Rotation.from_quat(second)).as_matrix()
     assert ours == pytest.approx(theirs, abs=1e-12)
 
 
 @given(quaternions, vectors)
-def test_rotate_equals_scipy(quaternion: geometry.Array, vector: tuple[float, ...]) -> None:
+def test_rotate_equals_scipy(quaternion: rotations.Array, vector: tuple[float, ...]) -> None:
     expected = Rotation.from_quat(quaternion).apply(vector)
-    assert geometry.rotate(quaternion, vector) == pytest.approx(expected, abs=1e-12)
-    back = geometry.rotate(geometry.quaternion_conjugate(quaternion), expected)
+    assert rotations.rotate(quaternion, vector) == pytest.approx(expected, abs=1e-12)
+    back = rotations.rotate(rotations.quaternion_conjugate(quaternion), expected)
     assert back == pytest.approx(np.array(vector), abs=1e-12)
 
 
 @given(quaternions)
-def test_quaternion_from_matrix_gives_the_rotation_back(quaternion: geometry.Array) -> None:
-    matrix = geometry.matrix_from_quaternion(quaternion)
-    again = geometry.quaternion_from_matrix(matrix)
+def test_quaternion_from_matrix_gives_the_rotation_back(quaternion: rotations.Array) -> None:
+    matrix = rotations.matrix_from_quaternion(quaternion)
+    again = rotations.quaternion_from_matrix(matrix)
     assert abs(again @ quaternion) == pytest.approx(1.0, abs=1e-12)
     assert again[np.argmax(np.abs(again))] > 0
 
 
 def test_quaternion_from_matrix_of_many_equals_one_by_one() -> None:
-    quaternions = geometry.quaternion_normalize(
+    quaternions = rotations.quaternion_normalize(
         [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 4]]
     )
-    many = geometry.quaternion_from_matrix(geometry.matrix_from_quaternion(quaternions))
+    many = rotations.quaternion_from_matrix(rotations.matrix_from_quaternion(quaternions))
     assert many == pytest.approx(quaternions)
 
 
 def test_quaternion_about_z_of_half_a_turn_has_no_real_part() -> None:
-    assert geometry.quaternion_about_z(math.pi) == pytest.approx(np.array([0, 0, 1, 0]))
+    assert rotations.quaternion_about_z(math.pi) == pytest.approx(np.array([0, 0, 1, 0]))
 
 
 def test_quaternion_normalize_extreme_lengths_gives_length_1() -> None:
-    result = geometry.quaternion_normalize([[0, 0, 0, 1e-300], [3e300, 0, 4e300, 0]])
+    result = rotations.quaternion_normalize([[0, 0, 0, 1e-300], [3e300, 0, 4e300, 0]])
     assert result == pytest.approx(np.array([[0, 0, 0, 1], [0.6, 0, 0.8, 0]]))
 
 
 @pytest.mark.parametrize("bad", [(0, 0, 0, 0), (math.nan, 0, 0, 1), (math.inf, 0, 0, 1)])
 def test_quaternion_normalize_without_direction_raises(bad: tuple[float, ...]) -> None:
     with pytest.raises(CalibrationError, match="got zeros, NaN or infinity") as caught:
-        geometry.quaternion_normalize(bad)
+        rotations.quaternion_normalize(bad)
     assert caught.value.code == "NOT_FINITE"
 
 
 def test_frame_from_axes_skewed_keeps_the_first() -> None:
-    frame = geometry.frame_from_axes([0, 0, 2], [0, 3, 1])
+    frame = rotations.frame_from_axes([0, 0, 2], [0, 3, 1])
     assert frame == pytest.approx(np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]))
 
 
@@ -101,11 +101,11 @@ def test_frame_from_axes_that_span_no_plane_raises(
     first: list[float], second: list[float], code: str, text: str
 ) -> None:
     with pytest.raises(CalibrationError, match=text) as caught:
-        geometry.frame_from_axes(first, second)
+        rotations.frame_from_axes(first, second)
     assert caught.value.code == code
     assert pickle.loads(pickle.dumps(caught.value)).code == code  # noqa: S301  our own
 
 
 def test_as_points_of_words_raises() -> None:
     with pytest.raises(CalibrationError, match=r"marks: expected numbers of shape \(N, 2\)"):
-        geometry.as_points([["a", "b"]], 2, "marks")
+        rotations.as_points([["a", "b"]], 2, "marks")

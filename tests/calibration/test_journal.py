@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from smartcam.calibration import journal as module
-from smartcam.calibration.journal import MAX_LINE, Journal
+from smartcam.calibration.wizards import journal as module
+from smartcam.calibration.wizards.journal import MAX_LINE, Journal
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

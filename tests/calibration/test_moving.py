@@ -19,10 +19,10 @@ from rigid import (
     yaw,
 )
 
-from smartcam.calibration.frames import FrameTree, Transform
-from smartcam.calibration.moving import Moved, MovingCamera
-from smartcam.calibration.plane import fit_plane
-from smartcam.calibration.solvers import Chain, Poses, RealWorldPosition, chain_of
+from smartcam.calibration.geometry.frames import FrameTree, Transform
+from smartcam.calibration.geometry.solvers import Chain, Poses, RealWorldPosition, chain_of
+from smartcam.calibration.plane.calibration import fit_plane
+from smartcam.calibration.plane.moving_camera import Moved, MovingCamera
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

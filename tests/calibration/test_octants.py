@@ -13,8 +13,13 @@ import numpy as np
 import pytest
 from rigid import OCTANTS, localization, rotation_about, yaw
 
-from smartcam.calibration.plane import fit_plane
-from smartcam.calibration.solvers import CameraPosition2D, Chain, RealWorldPosition, chain_of
+from smartcam.calibration.geometry.solvers import (
+    CameraPosition2D,
+    Chain,
+    RealWorldPosition,
+    chain_of,
+)
+from smartcam.calibration.plane.calibration import fit_plane
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

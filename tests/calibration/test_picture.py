@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from rigid import localization, rotation_about, yaw
 
-from smartcam.calibration.picture import draw
-from smartcam.calibration.plane import PlaneCalibration, fit_plane
+from smartcam.calibration.plane.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration.plane.drawing import draw
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

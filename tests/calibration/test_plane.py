@@ -11,12 +11,12 @@ from planekit import GRID, SIGMA, SPECIAL, Scene, grid, part, spread
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration.geometry import matrix_from_quaternion
+from smartcam.calibration.geometry.rotations import matrix_from_quaternion
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
 DOWN = -SCENE.turn[:, 2]

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from smartcam import MissingExtraError
-from smartcam.calibration.extra import load
+from smartcam.calibration.optional_imports import load
 
 
 def test_load_without_the_extra_says_which(monkeypatch: pytest.MonkeyPatch) -> None:

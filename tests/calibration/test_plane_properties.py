@@ -41,18 +41,18 @@ from rigid import FEW, rotations, transforms, yaw
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane, fit_touches
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.geometry import (
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_about_z,
     quaternion_multiply,
     rotate_ccw,
 )
-from smartcam.calibration.moving import MovingCamera
-from smartcam.calibration.solvers import chain_of
+from smartcam.calibration.geometry.solvers import chain_of
+from smartcam.calibration.plane.moving_camera import MovingCamera
 
 if TYPE_CHECKING:
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
     from smartcam.models import Localization
 
 CLOSE = 1e-9

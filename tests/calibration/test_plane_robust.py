@@ -14,16 +14,16 @@ from rigid import FEW, refused
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration import robust as robust_module
 from smartcam.calibration.codes import Code
-from smartcam.calibration.fitting import Fit, fit
-from smartcam.calibration.robust import BEST, MOST_SUBSETS, PROPOSALS, agreeing
-from smartcam.calibration.stored import PlaneData
+from smartcam.calibration.files.planes import PlaneData
+from smartcam.calibration.plane import robust as robust_module
+from smartcam.calibration.plane.fitting import Fit, fit
+from smartcam.calibration.plane.robust import BEST, MOST_SUBSETS, PROPOSALS, agreeing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
 DOWN = -SCENE.turn[:, 2]

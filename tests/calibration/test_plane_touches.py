@@ -9,7 +9,7 @@ from planekit import SIGMA, SPECIAL, Scene, part, spread
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_touches
-from smartcam.calibration.geometry import Array, rotate_ccw
+from smartcam.calibration.geometry.rotations import Array, rotate_ccw
 
 SCENE = Scene(SPECIAL[4], np.array([1.0, -2.0, 0.5]))
 PLACE, THETA = np.array([0.1, 0.05]), 0.6

@@ -16,7 +16,7 @@ from planekit import GRID, SIGMA, SPECIAL, Scene, grid, part, spread
 from rigid import AXES, rotation_about, yaw
 
 from smartcam.calibration import PlaneCalibration, fit_plane, fit_touches
-from smartcam.calibration.geometry import Array, matrix_from_quaternion
+from smartcam.calibration.geometry.rotations import Array, matrix_from_quaternion
 
 ELSEWHERE = {
     "t4": ("test_camera_position_subtracts_before_it_turns", "test_plane_p1_*"),

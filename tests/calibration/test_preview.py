@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from planekit import GRID, SIGMA, SPECIAL, Scene
 
-from smartcam.calibration.marks import Mark, Touch
-from smartcam.calibration.plane import PlaneCalibration, fit_plane
-from smartcam.calibration.preview import CELLS, before, compared, plain
+from smartcam.calibration.plane.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration.wizards.marks import Mark, Touch
+from smartcam.calibration.wizards.plane_drawing import CELLS, before, compared, plain
 
 if TYPE_CHECKING:
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
 

@@ -12,9 +12,9 @@ import pytest
 import wizards
 from wizards import ANSWERS, Trigger, answer_all, survey
 
-from smartcam.calibration.journal import Journal
-from smartcam.calibration.sequence import Session, Wizard, ask
-from smartcam.calibration.steps import Step
+from smartcam.calibration.wizards.journal import Journal
+from smartcam.calibration.wizards.sequence import Session, Wizard, ask
+from smartcam.calibration.wizards.steps import Step
 from smartcam.exceptions import CalibrationError, NotRunningError
 
 if TYPE_CHECKING:

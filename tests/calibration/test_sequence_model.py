@@ -12,9 +12,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from smartcam.calibration.journal import Journal
-from smartcam.calibration.sequence import Session, Wizard, ask
-from smartcam.calibration.steps import Number, Step
+from smartcam.calibration.wizards.journal import Journal
+from smartcam.calibration.wizards.sequence import Session, Wizard, ask
+from smartcam.calibration.wizards.steps import Number, Step
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

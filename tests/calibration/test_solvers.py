@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rigid import angles, localization, refused, rotation_about, rotations, transforms, yaw
 
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.plane import PlaneModel, fit_plane
-from smartcam.calibration.solvers import (
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.geometry.solvers import (
     CameraPosition2D,
     Chain,
     Height,
@@ -27,6 +26,7 @@ from smartcam.calibration.solvers import (
     ToolOffset,
     chain_of,
 )
+from smartcam.calibration.plane.calibration import PlaneModel, fit_plane
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from smartcam.calibration.steps import Flag, Number, Option, Step, Text, as_lists, from_lists
+from smartcam.calibration.wizards.steps import (
+    Flag,
+    Number,
+    Option,
+    Step,
+    Text,
+    as_lists,
+    from_lists,
+)
 from smartcam.exceptions import CalibrationError
 
 jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema, of the extra dev")

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.calibration import store
-from smartcam.calibration.store import keep_backup, read, read_document, replace_file, write
+from smartcam.calibration.files import store
+from smartcam.calibration.files.store import keep_backup, read, read_document, replace_file, write
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from smartcam.calibration import store
-from smartcam.calibration.store import keep_backup, read, replace_file, write
+from smartcam.calibration.files import store
+from smartcam.calibration.files.store import keep_backup, read, replace_file, write
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 WRITER = """
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from smartcam.calibration.store import write
+from smartcam.calibration.files.store import write
 
 path, who = sys.argv[1], int(sys.argv[2])
 
@@ -84,7 +84,7 @@ def test_many_threads_replace_without_locks_too(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from smartcam.calibration.store import write
+from smartcam.calibration.files.store import write
 
 CALLS = {"open", "os.rename", "os.remove", "os.link", "os.truncate", "os.scandir"}
 left = []

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from planekit import part
 from rigid import angles, localization, refused, rotation_about, transforms, yaw
 
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.solvers import Poses, ToolOffset
-from smartcam.calibration.tool import fit_rotation_centre, fit_tool_tip
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.geometry.solvers import Poses, ToolOffset
+from smartcam.calibration.plane.tool import fit_rotation_centre, fit_tool_tip
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

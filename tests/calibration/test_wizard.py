@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from bench import GRID, OFFSET, Bench, say, where
 
-from smartcam.calibration.journal import Journal
-from smartcam.calibration.marks import MAX_MARKS
-from smartcam.calibration.plane import PlaneCalibration
-from smartcam.calibration.sequence import Session
-from smartcam.calibration.store import read_document
-from smartcam.calibration.wizard import plane_wizard
+from smartcam.calibration.files.store import read_document
+from smartcam.calibration.plane.calibration import PlaneCalibration
+from smartcam.calibration.wizards.journal import Journal
+from smartcam.calibration.wizards.marks import MAX_MARKS
+from smartcam.calibration.wizards.plane import plane_wizard
+from smartcam.calibration.wizards.sequence import Session
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,11 +11,11 @@ import pytest
 import yaml
 from bench import GRID, Bench, say, where
 
-from smartcam.calibration.folder import Folder
-from smartcam.calibration.plane import PlaneCalibration, fit_plane
-from smartcam.calibration.services import CalibrationService
-from smartcam.calibration.store import write
-from smartcam.calibration.wizard import plane_wizard
+from smartcam.calibration.files.directory import Folder
+from smartcam.calibration.files.store import write
+from smartcam.calibration.plane.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration.wizards.plane import plane_wizard
+from smartcam.calibration.wizards.services import CalibrationService
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

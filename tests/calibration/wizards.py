@@ -8,15 +8,15 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from smartcam.calibration.journal import Journal
-from smartcam.calibration.sequence import Session, Wizard, ask
-from smartcam.calibration.steps import Flag, Number, Option, Step, Text
+from smartcam.calibration.wizards.journal import Journal
+from smartcam.calibration.wizards.sequence import Session, Wizard, ask
+from smartcam.calibration.wizards.steps import Flag, Number, Option, Step, Text
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from smartcam.calibration.sequence import Action
+    from smartcam.calibration.wizards.sequence import Action
 
 NAME = Step(
     id="name",

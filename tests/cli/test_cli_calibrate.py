@@ -12,8 +12,8 @@ import pytest
 from commandline import closed_port, emulators, run
 from processes import PATIENCE, Outcome, Process
 
-from smartcam.calibration.plane import PlaneCalibration, fit_plane
-from smartcam.cli.calibrating import STALE, calibrate
+from smartcam.calibration.plane.calibration import PlaneCalibration, fit_plane
+from smartcam.cli.calibrate import STALE, calibrate
 from smartcam.emulator.scene import PIECES
 
 if TYPE_CHECKING:

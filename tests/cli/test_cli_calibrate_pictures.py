@@ -11,16 +11,16 @@ import pytest
 from commandline import closed_port, emulators, run
 from processes import Outcome, Process
 
-from smartcam.calibration.extra import load
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.camera_files import write_camera_info
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.rendering import render
-from smartcam.calibration.imaging.sheet import SheetCalibration, calibrate_sheet, fit_corners
-from smartcam.calibration.imaging.targets import Checkerboard, target_to_data
-from smartcam.cli.calibrating import calibrate
-from smartcam.emulator.insight import EmulatedInSight
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.formats.cameras import write_camera_info
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.optional_imports import load
+from smartcam.calibration.sheet.calibration import SheetCalibration, calibrate_sheet, fit_corners
+from smartcam.calibration.simulation.images import render
+from smartcam.calibration.targets import Checkerboard, target_to_data
+from smartcam.cli.calibrate import calibrate
+from smartcam.emulator.insight.camera import EmulatedInSight
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -103,7 +103,7 @@ def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) ->
 def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
     tmp_path: Path, files: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from smartcam.calibration.imaging import pictures
+    from smartcam.calibration.wizards import pictures
 
     monkeypatch.setattr(pictures, "DEADLINE", 0.3)
     monkeypatch.setattr(pictures.PictureFolder.__init__, "__kwdefaults__", {"deadline": 0.3})

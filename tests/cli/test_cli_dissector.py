@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from click.testing import CliRunner
 
-from smartcam.cli.dissecting import dissector
+from smartcam.cli.dissector import dissector
 from smartcam.dissector import lua_source
 
 if TYPE_CHECKING:

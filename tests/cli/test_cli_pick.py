@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from commandline import run
 
-from smartcam.cli import picking
+from smartcam.cli import demo_pick
+from smartcam.cli.demo_pick import SimulatedRobot, nine_marks, pick
 from smartcam.cli.options import Options
-from smartcam.cli.picking import SimulatedRobot, nine_marks, pick
 from smartcam.emulator.scene import PIECES, TABLE_SIZE, TablePose, TableScene
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
@@ -82,7 +82,7 @@ class _Bumpy(SimulatedRobot):
 async def test_pick_warns_of_marks_that_lie_in_no_plane(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(picking, "SimulatedRobot", _Bumpy)
+    monkeypatch.setattr(demo_pick, "SimulatedRobot", _Bumpy)
     await pick(Options(), str(tmp_path / "pick.svg"), 1)
     out = capsys.readouterr().out
     assert "   NOT_PLANAR: " in out

@@ -29,7 +29,7 @@ from commandline import (
 )
 
 from smartcam import Result
-from smartcam.attribution import NUMBER_STEP
+from smartcam._client.correlation import NUMBER_STEP
 from smartcam.models import Localization
 
 if TYPE_CHECKING:

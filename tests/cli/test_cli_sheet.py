@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 from commandline import run
 
-from smartcam.calibration.imaging.sheets import Rays, make_sheet
-from smartcam.calibration.imaging.targets import (
+from smartcam.calibration.printing.sheets import Rays, make_sheet
+from smartcam.calibration.targets import (
     Charuco,
     Checkerboard,
     CircleGrid,

@@ -672,7 +672,7 @@ async def test_bid_quiet_camera_that_answers_is_kept() -> None:
 @pytest.fixture
 def never_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """However soon a session is lost again, nobody has taken the camera."""
-    monkeypatch.setattr("smartcam.supervisor.TAKEN_WITHIN", float("-inf"))
+    monkeypatch.setattr("smartcam._client.supervisor.TAKEN_WITHIN", float("-inf"))
 
 
 @pytest.mark.usefixtures("never_taken")

@@ -22,10 +22,10 @@ from smartcam import (
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
-from smartcam.connection import LARGEST_CHUNK
+from smartcam._client.link import LARGEST_CHUNK
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader
 from smartcam.models import Localization
-from smartcam.protocols.machine import ResultBurst
+from smartcam.protocols.framed.machine import ResultBurst
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

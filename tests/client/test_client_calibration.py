@@ -24,13 +24,13 @@ from smartcam import (
     Result,
     WrongApplicationError,
 )
+from smartcam._client.interpretation import Interpretation
 from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.moving import MovingCamera
-from smartcam.calibration.solvers import chain_of
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.geometry.solvers import chain_of
+from smartcam.calibration.plane.moving_camera import MovingCamera
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator.scene import PIECES, TablePose, TableScene
-from smartcam.interpretation import Interpretation
 from smartcam.interpreters.localizations import Localizations
 from smartcam.interpreters.record import Record
 

@@ -13,7 +13,7 @@ from clientkit import balance
 
 import smartcam
 from smartcam import ConnectionClosedError, NotRunningError
-from smartcam.attribution import Run, _Owed
+from smartcam._client.correlation import Run, _Owed
 from smartcam.emulator import EmulatedCamera
 
 if TYPE_CHECKING:

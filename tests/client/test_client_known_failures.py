@@ -25,9 +25,9 @@ from clientkit import SHORT, balance, by_hand, steps, until
 
 import smartcam
 from smartcam import ResponseTimeoutError
-from smartcam.connection import Link
+from smartcam._client.link import Link
 from smartcam.testing import LinkProxy
-from smartcam.testing.rules import Rule, Split
+from smartcam.testing.proxy.rules import Rule, Split
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator

@@ -617,7 +617,7 @@ async def test_trigger_waits_until_an_older_overtriggered_has_fallen() -> None:
 async def test_overtriggered_that_stays_does_not_stop_the_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("smartcam.triggering.OVERTRIGGERED_GRACE", SHORT)
+    monkeypatch.setattr("smartcam._client.triggering.OVERTRIGGERED_GRACE", SHORT)
     async with by_hand() as (box, camera):
         box.send(box.status_frame(READY | OVERTRIGGERED))
         await camera.wait_status(lambda status: Status.OVERTRIGGERED in status)

@@ -11,13 +11,14 @@ from clientkit import balance, by_hand, until
 from handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scripted
 
 import smartcam
-from smartcam import InterpretationError, Status, handshake
-from smartcam.connection import LARGEST_CHUNK
+from smartcam import InterpretationError, Status
+from smartcam._client import handshake
+from smartcam._client.link import LARGEST_CHUNK
 from smartcam.observers import Observer
 
 if TYPE_CHECKING:
     from smartcam import CameraEvent, Result, SmartCamera, SmartCamError
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
 
 # ---------------------------------------------------------------------- what comes early
 

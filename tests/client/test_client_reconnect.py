@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 @pytest.fixture
 def never_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """However soon a session is lost again, nobody has taken the camera."""
-    monkeypatch.setattr("smartcam.supervisor.TAKEN_WITHIN", float("-inf"))
+    monkeypatch.setattr("smartcam._client.supervisor.TAKEN_WITHIN", float("-inf"))
 
 
 # ---------------------------------------------------------------------- who waits is told

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 @pytest.fixture
 def never_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """However soon a session is lost again, nobody has taken the camera."""
-    monkeypatch.setattr("smartcam.supervisor.TAKEN_WITHIN", float("-inf"))
+    monkeypatch.setattr("smartcam._client.supervisor.TAKEN_WITHIN", float("-inf"))
 
 
 # ---------------------------------------------------------------------- application, run state
@@ -170,7 +170,7 @@ async def test_restore_that_was_never_answered_is_done_in_the_next_session(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The session lasted as long as the switch was waited for: nobody else has the camera."""
-    monkeypatch.setattr("smartcam.supervisor.TAKEN_WITHIN", SHORT)
+    monkeypatch.setattr("smartcam._client.supervisor.TAKEN_WITHIN", SHORT)
     options: dict[str, Any] = {"restore": True, "reconnect": FAST, "switch_timeout": 2 * SHORT}
     async with by_hand(application=7, **options) as (box, camera):
         box.active = 3

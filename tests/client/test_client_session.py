@@ -488,7 +488,7 @@ async def test_session_that_cannot_begin_by_a_fault_of_ours_tells_the_opener(
     async def establish(*_: object) -> object:
         raise KeyError("bug")
 
-    monkeypatch.setattr("smartcam.supervisor.establish", establish)
+    monkeypatch.setattr("smartcam._client.supervisor.establish", establish)
     camera = smartcam.connect("bvs://127.0.0.1")
     with pytest.raises(ConnectionLostError, match=r"KeyError\('bug'\) in the client"):
         await camera.open()

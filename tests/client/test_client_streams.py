@@ -26,7 +26,7 @@ from smartcam import (
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
-from smartcam.connection import Chunk
+from smartcam._client.link import Chunk
 from smartcam.interpreters import Interpreter
 from smartcam.protocols import messages as m
 from smartcam.streams import BatchSubscription

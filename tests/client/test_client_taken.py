@@ -96,7 +96,7 @@ async def test_camera_taken_over_udp_is_not_fought_for_where_silence_shows_it_la
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each notices by silence only: a round takes both liveness timeouts, as long as the limit."""
-    monkeypatch.setattr("smartcam.supervisor.TAKEN_WITHIN", 2 * SHORT)
+    monkeypatch.setattr("smartcam._client.supervisor.TAKEN_WITHIN", 2 * SHORT)
     options: dict[str, Any] = {"reconnect": Backoff(initial=0.01), "liveness_timeout": SHORT}
     box: dict[str, Any] = {"applications": [FREE], "active": 9, "running": True}
     async with (
@@ -128,7 +128,7 @@ async def test_first_session_lost_soon_was_not_taken() -> None:
 
 
 async def test_session_that_lasted_was_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("smartcam.supervisor.TAKEN_WITHIN", 0.0)
+    monkeypatch.setattr("smartcam._client.supervisor.TAKEN_WITHIN", 0.0)
     async with by_hand(reconnect=FAST) as (box, camera):
         for _ in range(3):
             await lose_and_come_back(box, camera)

@@ -48,7 +48,7 @@ from smartcam import (
     TriggerTimeoutError,
     WrongApplicationError,
 )
-from smartcam.connection import Chunk
+from smartcam._client.link import Chunk
 from smartcam.protocols import messages as m
 
 BEGUN = m.StatusReport(status=Status.RUNNING, endian=0)

@@ -14,7 +14,7 @@ from camera_scripts import FAST, SOON
 from clientkit import by_hand, gone, steps
 
 from smartcam import ConnectionLostError, FrameError
-from smartcam.protocols import unfinished
+from smartcam.protocols.framed import frame_age
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -69,7 +69,7 @@ async def test_false_length_of_a_status_ends_the_link_at_its_header(dialect: str
 async def test_false_length_of_a_result_ends_the_link_when_others_come(
     dialect: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(unfinished, "HINT_TIME", 0.0)
+    monkeypatch.setattr(frame_age, "HINT_TIME", 0.0)
     async with by_hand(box={"dialect": dialect}, reconnect=FAST) as (box, camera):
         results = camera.results()
         losing = asyncio.create_task(lost(camera))
@@ -88,7 +88,7 @@ async def test_frame_that_trickles_ends_the_link(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in {"HINT_TIME": 0.0, "FRAME_TIME": 0.0, "FRAME_RATE": float("inf")}.items():
-        monkeypatch.setattr(unfinished, name, value)
+        monkeypatch.setattr(frame_age, name, value)
     box_of: Any = {"dialect": kind} if kind != "bid" else {}
     opening: Any = by_hand if kind != "bid" else bid_by_hand
     async with opening(box=box_of, reconnect=FAST) as (box, camera):

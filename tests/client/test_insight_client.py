@@ -33,17 +33,17 @@ from smartcam import (
     TriggerTimeoutError,
     UnsupportedError,
 )
+from smartcam.doctor.probing import trials
 from smartcam.emulator.clock import ManualClock
-from smartcam.emulator.insight import EmulatedInSight
+from smartcam.emulator.insight.camera import EmulatedInSight
 from smartcam.observers import Observer
-from smartcam.probing import trials
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
 
     from smartcam import SmartCamera
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
 
     Call = Callable[[SmartCamera], Coroutine[Any, Any, object]]
 

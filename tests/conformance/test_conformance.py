@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from worlds import BVS_WORLDS, INSIGHT_WORLDS
 
-from smartcam.testing.protocols import CameraSuite
+from smartcam.testing.suites.protocols import CameraSuite
 
 pytestmark = pytest.mark.long
 

@@ -15,8 +15,8 @@ from worlds import BVS_WORLDS
 from smartcam.client import SmartCamera
 from smartcam.exceptions import SmartCamError
 from smartcam.models import Status
-from smartcam.testing.protocols import CameraSuite, Site, World
-from smartcam.testing.protocols.visits import in_a_loop
+from smartcam.testing.suites.protocols import CameraSuite, Site, World
+from smartcam.testing.suites.protocols.client_checks import in_a_loop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -7,8 +7,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from smartcam.emulator import EmulatedCamera
-from smartcam.emulator.insight import EmulatedInSight
-from smartcam.testing.protocols import COUNTER, ECHO, FREE, OTHER, SLOW, SLOW_TIME, Site, World
+from smartcam.emulator.insight.camera import EmulatedInSight
+from smartcam.testing.suites.protocols import (
+    COUNTER,
+    ECHO,
+    FREE,
+    OTHER,
+    SLOW,
+    SLOW_TIME,
+    Site,
+    World,
+)
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

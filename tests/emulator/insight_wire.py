@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.emulator.insight import EmulatedInSight
+    from smartcam.emulator.insight.camera import EmulatedInSight
 
 GREETING = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "  # derived: a record of an 8502P
 PASSWORD = b"Password: "

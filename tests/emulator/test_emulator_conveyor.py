@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import ManualClock, faults
-from smartcam.emulator.conveyor import Conveyor, Piece
-from smartcam.emulator.parcels import Cutter, Ending, Parcel, cut_datagram, mangle
+from smartcam.emulator.faults.delay_line import Conveyor, Piece
+from smartcam.emulator.faults.wire_effects import Cutter, Ending, Parcel, cut_datagram, mangle
 from smartcam.protocols.bvs import HANDBOOK, THESIS
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.framing import Frame
 
 
 class Belt:

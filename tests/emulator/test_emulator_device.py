@@ -11,7 +11,7 @@ import pytest
 from device_words import heard
 
 from smartcam.emulator import Application, Device, Quirks
-from smartcam.emulator.device import Mode
+from smartcam.emulator.bvs.device import Mode
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m

@@ -8,12 +8,13 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from smartcam.emulator import EmulatedCamera, ManualClock, fault_queue, faults
-from smartcam.emulator.fault_queue import FaultQueue
+from smartcam.emulator import EmulatedCamera, ManualClock, faults
+from smartcam.emulator.faults import matching
+from smartcam.emulator.faults.matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import HANDBOOK, MESSAGES
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.framing import Frame
 
 EXAMPLES: list[dict[str, Any]] = [
     {"kind": "delay", "seconds": 0.5, "overtaken": True},
@@ -268,7 +269,7 @@ def test_clear_forgets_all_and_keeps_the_record() -> None:
 
 
 def test_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fault_queue, "MAX_FAULTS", 3)
+    monkeypatch.setattr(matching, "MAX_FAULTS", 3)
     queue = queue_of(faults.Drop(), faults.Drop())
     with pytest.raises(ConfigurationError, match="at most 3 faults can wait"):
         queue.add([faults.Drop(), faults.Drop()])

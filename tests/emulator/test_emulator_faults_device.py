@@ -10,7 +10,7 @@ from camera_wire import RawClient, UdpClient, until
 from device_words import heard
 
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
-from smartcam.emulator.stranger import Stranger
+from smartcam.emulator.faults.second_client import Stranger
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import HANDBOOK
@@ -18,7 +18,7 @@ from smartcam.protocols.bvs import HANDBOOK
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from smartcam.emulator.parcels import Parcel
+    from smartcam.emulator.faults.wire_effects import Parcel
 
 HELLO = (wire.CONNECTED, wire.WAITING)
 

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.emulator import EmulatedCamera, ManualClock, faults
-from smartcam.emulator.parcels import Parcel, mangle
+from smartcam.emulator.faults.wire_effects import Parcel, mangle
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import HANDBOOK, MESSAGES, THESIS
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.framing import Frame
 
 SECONDS = st.sampled_from([0.0, 0.05, 1.0, 30.0])
 CAMERA = [row.type.__name__ for row in MESSAGES if row.type.sender is m.Sender.CAMERA]

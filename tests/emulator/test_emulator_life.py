@@ -146,7 +146,7 @@ async def test_start_cancelled_leaves_it_stopped(monkeypatch: pytest.MonkeyPatch
 async def test_accept_that_fails_is_tried_again(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("smartcam.accepting.ACCEPT_PAUSE", 0.001)
+    monkeypatch.setattr("smartcam._accepting.ACCEPT_PAUSE", 0.001)
     failures: list[OSError] = [OSError(24, "no descriptor left"), BlockingIOError()]
 
     class Scarce(socket.socket):
@@ -183,7 +183,7 @@ async def test_accepted_connection_that_is_lost_is_closed(
 
 
 async def test_loop_without_readers_accepts_by_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("smartcam.accepting.ACCEPT_PAUSE", 0.001)
+    monkeypatch.setattr("smartcam._accepting.ACCEPT_PAUSE", 0.001)
     loop = asyncio.get_running_loop()
     accept = loop.sock_accept
     failures: list[OSError] = [OSError(24, "no descriptor left")]

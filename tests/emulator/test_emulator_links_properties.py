@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.emulator import Application, Device, ManualClock, Quirks
-from smartcam.emulator.fault_queue import FaultQueue
+from smartcam.emulator.faults.matching import FaultQueue
 from smartcam.emulator.links import MAX_INPUT, TcpListener, _TcpLink
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import HANDBOOK
 
 if TYPE_CHECKING:
+    from smartcam.emulator.faults.wire_effects import Parcel
     from smartcam.emulator.links import Link
-    from smartcam.emulator.parcels import Parcel
 
 PIECES = st.one_of(
     st.sampled_from(

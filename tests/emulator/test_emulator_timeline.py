@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from smartcam.emulator import Cue, DeviceState, EmulatedCamera, ManualClock, RealClock
-from smartcam.emulator.timeline import MAX_AT_ONCE, MAX_PENDING, Timeline
+from smartcam.emulator.scenario.timeline import MAX_AT_ONCE, MAX_PENDING, Timeline
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m

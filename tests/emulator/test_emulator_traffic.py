@@ -14,7 +14,7 @@ from smartcam.emulator.traffic import MAX_BYTES, MAX_ENTRIES, MAX_IDS, Log, Traf
 from smartcam.exceptions import FrameError, ResponseTimeoutError
 from smartcam.protocols import messages as m
 from smartcam.protocols.bvs import HANDBOOK
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.framing import Frame
 
 QUERY = Frame(0x30, b"")
 PEER = "127.0.0.1:5"

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from smartcam.emulator.clock import ManualClock
-from smartcam.emulator.insight import EmulatedInSight
+from smartcam.emulator.insight.camera import EmulatedInSight
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

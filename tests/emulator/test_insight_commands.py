@@ -11,8 +11,8 @@ import pytest
 from insight_wire import TelnetClient
 
 from smartcam.emulator.clock import ManualClock
-from smartcam.emulator.insight import BUILTIN_JOBS, EmulatedInSight, InSightQuirks, Job
-from smartcam.protocols import insight_words as words
+from smartcam.emulator.insight.camera import BUILTIN_JOBS, EmulatedInSight, InSightQuirks, Job
+from smartcam.protocols.insight import words
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

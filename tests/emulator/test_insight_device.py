@@ -10,12 +10,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from smartcam.emulator.insight_commands import Commands
-from smartcam.emulator.insight_device import InSightDevice
-from smartcam.emulator.insight_image import bitmap, check_image, grey_pattern
-from smartcam.emulator.insight_job import Control, Job, make_job, shown
+from smartcam.emulator.insight.commands import Commands
+from smartcam.emulator.insight.device import InSightDevice
+from smartcam.emulator.insight.image import bitmap, check_image, grey_pattern
+from smartcam.emulator.insight.job import Control, Job, make_job, shown
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols.insight_words import COMMANDS, StatusCode
+from smartcam.protocols.insight.words import COMMANDS, StatusCode
 
 SECOND = 1_000_000_000
 

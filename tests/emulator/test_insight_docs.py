@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from smartcam.emulator.insight import InSightQuirks
-from smartcam.protocols.insight_words import COMMANDS, AnswerForm, StatusCode
+from smartcam.emulator.insight.camera import InSightQuirks
+from smartcam.protocols.insight.words import COMMANDS, AnswerForm, StatusCode
 
 PAGE = (Path(__file__).parents[2] / "docs" / "insight.md").read_text(encoding="utf-8")
 

@@ -12,8 +12,8 @@ import pytest
 from insight_wire import TelnetClient
 
 from smartcam.emulator.clock import ManualClock
-from smartcam.emulator.insight import EmulatedInSight, InSightQuirks
-from smartcam.emulator.insight_connection import MAX_SESSIONS, MAX_WAITING
+from smartcam.emulator.insight.camera import EmulatedInSight, InSightQuirks
+from smartcam.emulator.insight.connection import MAX_SESSIONS, MAX_WAITING
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 
 JOB = {"file": "1.job", "cells": {"A1": 5}, "acquisition_time": 0.1, "processing_time": 0.1}

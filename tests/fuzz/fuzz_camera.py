@@ -13,19 +13,19 @@ from fuzz_input import Choices
 
 from smartcam.emulator import Application, Device, Quirks
 from smartcam.emulator.application import BUILTIN_APPLICATIONS
-from smartcam.emulator.device import Mode
-from smartcam.emulator.manner import manner_of
+from smartcam.emulator.bvs.behaviour import manner_of
+from smartcam.emulator.bvs.device import Mode
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Policy, Role, Transport
 from smartcam.protocols.bvs import B16, BID, CODES, HANDBOOK, THESIS, ResultCode
-from smartcam.protocols.machine import Machine, State
+from smartcam.protocols.framed.machine import Machine, State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 __all__ = ["check"]
 

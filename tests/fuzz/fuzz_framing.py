@@ -14,13 +14,13 @@ from fuzz_input import Choices
 from machines import DIALECTS
 
 from smartcam.exceptions import FrameError
-from smartcam.protocols import framing
-from smartcam.protocols.framing import Frame, Framer, HeaderLayout
+from smartcam.protocols.framed import framing
+from smartcam.protocols.framed.framing import Frame, Framer, HeaderLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from smartcam.protocols.machine import Machine
+    from smartcam.protocols.framed.machine import Machine
 
 __all__ = ["HEADERS", "check", "write"]
 

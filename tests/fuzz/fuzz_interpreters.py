@@ -14,8 +14,8 @@ from typing import Any
 from fuzz_input import Choices
 from fuzz_layout import fitted
 
+from smartcam._client.interpretation import Interpretation
 from smartcam.exceptions import InterpretationError
-from smartcam.interpretation import Interpretation
 from smartcam.interpreters import resolve
 from smartcam.models import Localization, jsonable
 from smartcam.protocols.messages import ResultContainer

@@ -27,15 +27,15 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     UnsupportedError,
 )
-from smartcam.protocols import framing
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Policy, Role, Transport
-from smartcam.protocols.framing import Frame
-from smartcam.protocols.machine import TRANSITIONS, LinkEnded, LinkFailed, Machine, State
+from smartcam.protocols.framed import framing
+from smartcam.protocols.framed.framing import Frame
+from smartcam.protocols.framed.machine import TRANSITIONS, LinkEnded, LinkFailed, Machine, State
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
-    from smartcam.protocols.machine import Event
+    from smartcam.protocols.framed.dialect import FramedDialect
+    from smartcam.protocols.framed.machine import Event
 
 __all__ = ["check"]
 

@@ -14,11 +14,11 @@ from machines import DIALECTS
 
 from smartcam.models import jsonable
 from smartcam.protocols import messages as m
-from smartcam.protocols._layouts import view_fields
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.constructs import view_fields
+from smartcam.protocols.framed.framing import Frame
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 __all__ = ["check"]
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from smartcam.emulator import Device, ManualClock, Scenario, load_scenarios
-from smartcam.emulator.timeline import Timeline
+from smartcam.emulator.scenario.timeline import Timeline
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 

@@ -17,7 +17,7 @@ from smartcam.exceptions import LayoutError
 from smartcam.layout import Layout
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.machine import State
+from smartcam.protocols.framed.machine import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.exceptions import MessageError
 from smartcam.protocols import messages as m
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.framing import Frame
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 __all__ = ["Body", "body_of", "check_decoding"]
 

@@ -14,15 +14,15 @@ from fuzz_known import KNOWN, describe, known
 from fuzz_seeds import seeds
 from fuzz_targets import CORPUS, TARGETS, Target
 
-import smartcam.emulator.scenario_file as scenario_module
+import smartcam.emulator.scenario.file as scenario_module
 import smartcam.layout as layout_module
 from smartcam.emulator import Device
 from smartcam.interpreters.localizations import Localizations
 from smartcam.layout import Layout
 from smartcam.layout.text import parse_text
-from smartcam.protocols.framed import FramedDialect
-from smartcam.protocols.framing import Framer
-from smartcam.protocols.machine import Machine
+from smartcam.protocols.framed.dialect import FramedDialect
+from smartcam.protocols.framed.framing import Framer
+from smartcam.protocols.framed.machine import Machine
 from smartcam.settings import Address
 
 if TYPE_CHECKING:

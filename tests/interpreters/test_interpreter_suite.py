@@ -18,7 +18,7 @@ from smartcam.interpreters.record import Record
 from smartcam.interpreters.table import Table
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 from smartcam.registry import INTERPRETERS
-from smartcam.testing.interpreters import InterpreterSuite, Sample
+from smartcam.testing.suites.interpreters import InterpreterSuite, Sample
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -312,7 +312,7 @@ def test_sample_without_big_endian_skips_and_says_so() -> None:
 def test_suite_without_samples_says_what_is_missing(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
-        from smartcam.testing.interpreters import InterpreterSuite
+        from smartcam.testing.suites.interpreters import InterpreterSuite
 
         class TestNothing(InterpreterSuite):
             spec = "raw"

@@ -31,7 +31,7 @@ from timed_loop import TimedLoop
 import smartcam
 from smartcam import Backoff, LinkError, ResponseTimeoutError, SmartCamera, Status
 from smartcam.emulator import EmulatedCamera
-from smartcam.emulator.device import Mode
+from smartcam.emulator.bvs.device import Mode
 from smartcam.protocols import messages as m
 from smartcam.streams import Subscription
 

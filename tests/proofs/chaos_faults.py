@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from smartcam.emulator import faults as f
 from smartcam.models import Status
-from smartcam.testing import rules
+from smartcam.testing.proxy import rules
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence

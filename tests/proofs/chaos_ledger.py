@@ -23,7 +23,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
     from smartcam.emulator import EmulatedCamera
     from smartcam.models import CameraEvent
 

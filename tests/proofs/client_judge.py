@@ -28,7 +28,7 @@ from smartcam import (
     StatusChanged,
 )
 from smartcam.emulator import EmulatedCamera
-from smartcam.emulator.device import Mode
+from smartcam.emulator.bvs.device import Mode
 from smartcam.protocols.bvs import ResultCode
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from client_model import Run as Inspection
 
     from smartcam import CameraEvent, SmartCamera
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
     from smartcam.emulator.generators import Run
     from smartcam.settings import CameraOptions
     from smartcam.streams import Subscription

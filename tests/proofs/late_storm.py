@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
     from storm_variants import Camera, Variant
 
+    from smartcam._client.link import TraceEntry
     from smartcam.client import SmartCamera
-    from smartcam.connection import TraceEntry
     from smartcam.models import Result, Statistics
     from smartcam.streams import Subscription
 

@@ -15,7 +15,7 @@ from matrix_world import PATIENT, SHORT, Bounds, World
 from smartcam import exceptions as e
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.testing import rules
+from smartcam.testing.proxy import rules
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
     from datetime import datetime
 
+    from smartcam._client.link import TraceEntry
     from smartcam.client import SmartCamera
-    from smartcam.connection import TraceEntry
     from smartcam.emulator import LogEntry, Run
     from smartcam.models import CameraEvent, Result
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 __all__ = [
     "AWAY",

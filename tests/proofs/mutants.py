@@ -45,20 +45,13 @@ class Room(NamedTuple):
 
 
 ROOMS = {
-    "protocols": Room(("protocols/*.py",), ("tests/protocols",)),
+    "protocols": Room(("protocols/**/*.py",), ("tests/protocols",)),
     "layout": Room(
         ("layout/*.py", "interpreters/*.py"), ("tests/test_layout*", "tests/interpreters")
     ),
-    "emulator": Room(("emulator/*.py",), ("tests/emulator",)),
+    "emulator": Room(("emulator/**/*.py",), ("tests/emulator",)),
     "client": Room(
-        tuple(
-            f"{name}.py"
-            for name in (
-                *("account", "alarm", "attribution", "backoff", "client", "connection"),
-                *("conversation", "handshake", "inbox", "interpretation", "liveness", "polling"),
-                *("streams", "supervisor", "triggering", "turns"),
-            )
-        ),
+        ("client.py", "streams.py", "_client/*.py"),
         ("tests/test_*.py", "tests/client", "tests/proofs/test_cancel_sweep.py"),
     ),
     "calibration": Room(("calibration/**/*.py",), ("tests/calibration",)),

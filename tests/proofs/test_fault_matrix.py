@@ -23,12 +23,12 @@ from smartcam.client import SmartCamera
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.protocols.bvs import BVS, ResultCode
-from smartcam.testing import rules
+from smartcam.testing.proxy import rules
 
 if TYPE_CHECKING:
     from matrix_world import Bench
 
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
 
 STRIDE = 260
 """Of some 49,000 cells; the short form takes seconds."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from smartcam.protocols.machine import Counters, State
+    from smartcam.protocols.framed.machine import Counters, State
     from smartcam.protocols.messages import Message
 
 PAGE = Path(__file__).parents[2] / "docs" / "adding-a-camera.md"

@@ -13,10 +13,10 @@ from machines import BY_LABEL, one_by_one
 from smartcam.exceptions import LocalProtocolError, UnsupportedError
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import POLICIES, Role, Transport
-from smartcam.protocols.machine import LinkFailed, Machine
+from smartcam.protocols.framed.machine import LinkFailed, Machine
 
 if TYPE_CHECKING:
-    from smartcam.protocols.machine import Event
+    from smartcam.protocols.framed.machine import Event
 
 __all__ = ["Line", "Pipe", "Way", "delivery", "refused"]
 

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.machine import LinkEnded
+from smartcam.protocols.framed.machine import LinkEnded
 
 __all__ = [
     "ENDED",

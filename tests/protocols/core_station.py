@@ -10,7 +10,7 @@ from core_model import framed, meaning, surplus
 from machines import BY_LABEL
 
 from smartcam.emulator import Application, Device, Quirks
-from smartcam.emulator.manner import manner_of
+from smartcam.emulator.bvs.behaviour import manner_of
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.insight import NATIVE, InSightDialect
-from smartcam.protocols.insight_machine import InSightMachine
-from smartcam.protocols.machine import Event, State
+from smartcam.protocols.framed.machine import Event, State
+from smartcam.protocols.insight.dialect import NATIVE, InSightDialect
+from smartcam.protocols.insight.machine import InSightMachine
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framing import Frame
+    from smartcam.protocols.framed.framing import Frame
 
 GREETING = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "
 LOGIN = GREETING + b"Password: User Logged In\r\n"

@@ -25,12 +25,12 @@ from smartcam.protocols.base import (
     Verdict,
 )
 from smartcam.protocols.bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols.machine import Machine
+from smartcam.protocols.framed.machine import Machine
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.protocols.framing import Frame
+    from smartcam.protocols.framed.framing import Frame
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
 TCP, UDP = Transport.TCP, Transport.UDP

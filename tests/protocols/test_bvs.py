@@ -19,11 +19,11 @@ from smartcam.protocols.bvs import (
     THESIS,
     MessageId,
 )
-from smartcam.protocols.framing import HeaderLayout
+from smartcam.protocols.framed.framing import HeaderLayout
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
 

@@ -18,8 +18,8 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import UNDOCUMENTED, Code, RawRequest, Spelled, Verdict
 from smartcam.protocols.bvs import B16, BID, CODES, HANDBOOK, MESSAGES, THESIS, ResultCode
-from smartcam.protocols.framed import MAX_KNOWN, SWITCH_CODES, FramedDialect, StatusBits
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.dialect import MAX_KNOWN, SWITCH_CODES, FramedDialect, StatusBits
+from smartcam.protocols.framed.framing import Frame
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
 KNOWN = [(dialect, message) for dialect, message in EVERYTHING if message is not EXAMPLES[-1]]

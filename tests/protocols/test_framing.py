@@ -10,10 +10,10 @@ from machines import DIALECTS
 
 from smartcam.exceptions import FrameError
 from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
+from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 MAGIC = bytes.fromhex("50535642")
 STATUS = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from insight_lines import BITMAP, DIGITS, IMAGE_LINES, crc
 
 from smartcam.exceptions import FrameError
-from smartcam.protocols.insight_answers import MAX_IMAGE, Answer, AnswerReader
-from smartcam.protocols.insight_words import AnswerForm, hex_lines
+from smartcam.protocols.insight.answers import MAX_IMAGE, Answer, AnswerReader
+from smartcam.protocols.insight.words import AnswerForm, hex_lines
 
 FORMS = [
     (AnswerForm.CODE, b"1\r\n", Answer(1)),

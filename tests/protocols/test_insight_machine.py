@@ -21,11 +21,11 @@ from smartcam.exceptions import (
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.framing import Frame
-from smartcam.protocols.insight import INSIGHT, NATIVE
-from smartcam.protocols.insight_machine import READ_SIZE, Command, InSightMachine, Piece, Reply
-from smartcam.protocols.insight_words import MAX_LINE
-from smartcam.protocols.machine import Event, LinkEnded, LinkFailed, State
+from smartcam.protocols.framed.framing import Frame
+from smartcam.protocols.framed.machine import Event, LinkEnded, LinkFailed, State
+from smartcam.protocols.insight.dialect import INSIGHT, NATIVE
+from smartcam.protocols.insight.machine import READ_SIZE, Command, InSightMachine, Piece, Reply
+from smartcam.protocols.insight.words import MAX_LINE
 
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 WELCOME = m.ConnectAnswer(code=1, version=1)

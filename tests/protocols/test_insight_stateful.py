@@ -15,13 +15,13 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from insight_lines import LOGIN, Talk, with_cells
 
 from smartcam.emulator.clock import NANOSECONDS
-from smartcam.emulator.insight_commands import Commands
-from smartcam.emulator.insight_device import InSightDevice
+from smartcam.emulator.insight.commands import Commands
+from smartcam.emulator.insight.device import InSightDevice
 from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import messages as m
-from smartcam.protocols.insight_machine import ONLINE, Command, Reply
-from smartcam.protocols.insight_words import LineReader
-from smartcam.protocols.machine import Event, State
+from smartcam.protocols.framed.machine import Event, State
+from smartcam.protocols.insight.machine import ONLINE, Command, Reply
+from smartcam.protocols.insight.words import LineReader
 
 REQUESTS: list[m.Message] = [
     m.GetStatus(),

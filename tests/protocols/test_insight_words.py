@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameError
-from smartcam.protocols import insight_words as words
-from smartcam.protocols.insight_words import Cell, LineReader, StatusCode
+from smartcam.protocols.insight import words
+from smartcam.protocols.insight.words import Cell, LineReader, StatusCode
 
 # ---------------------------------------------------------------------- cells
 

@@ -14,12 +14,12 @@ from strategies import messages, streams
 from smartcam.exceptions import MessageError, ProtocolError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols._layouts import FieldView, frame_view, view_fields
 from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols.framing import Framer
+from smartcam.protocols.framed.constructs import FieldView, frame_view, view_fields
+from smartcam.protocols.framed.framing import Framer
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 CAMERA = m.Sender.CAMERA
 HEADER = {"magic", "length", "message_id"}

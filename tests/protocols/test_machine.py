@@ -35,8 +35,8 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Policy, Role, Transport
 from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame
-from smartcam.protocols.machine import (
+from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame
+from smartcam.protocols.framed.machine import (
     TRANSITIONS,
     Counters,
     LinkEnded,
@@ -47,8 +47,8 @@ from smartcam.protocols.machine import (
 )
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
-    from smartcam.protocols.machine import Event
+    from smartcam.protocols.framed.dialect import FramedDialect
+    from smartcam.protocols.framed.machine import Event
 
 TCP, UDP = Transport.TCP, Transport.UDP
 CLIENT, CAMERA = m.Sender.CLIENT, m.Sender.CAMERA

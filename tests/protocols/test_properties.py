@@ -15,14 +15,14 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Policy, Role, Transport
 from smartcam.protocols.bvs import HANDBOOK
-from smartcam.protocols.framing import Frame, Framer
-from smartcam.protocols.machine import LinkEnded, LinkFailed, Machine, State
+from smartcam.protocols.framed.framing import Frame, Framer
+from smartcam.protocols.framed.machine import LinkEnded, LinkFailed, Machine, State
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.protocols.framed import FramedDialect
-    from smartcam.protocols.machine import Event
+    from smartcam.protocols.framed.dialect import FramedDialect
+    from smartcam.protocols.framed.machine import Event
 
 MAX_LENGTH = 64
 STATUS = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")

@@ -16,13 +16,13 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
 from smartcam.protocols.bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols.insight import INSIGHT
-from smartcam.protocols.insight_machine import ONLINE
-from smartcam.testing.protocols import WireSuite
-from smartcam.testing.protocols.conversations import Came, Conversation, Sent, Step
+from smartcam.protocols.insight.dialect import INSIGHT
+from smartcam.protocols.insight.machine import ONLINE
+from smartcam.testing.suites.protocols import WireSuite
+from smartcam.testing.suites.protocols.conversations import Came, Conversation, Sent, Step
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 RUNNING = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 CLOCK = {"year": 2016, "month": 6, "day": 25, "hour": 10, "minute": 11, "second": 12}

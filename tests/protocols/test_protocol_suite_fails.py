@@ -18,11 +18,11 @@ from smartcam.models import Capabilities, Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Code, Protocol, Transport, Verdict
 from smartcam.protocols.bvs import HANDBOOK
-from smartcam.protocols.framed import FramedDialect
-from smartcam.protocols.framing import Frame
-from smartcam.protocols.machine import State
-from smartcam.testing.protocols import Came, Conversation, Sent, WireSuite
-from smartcam.testing.protocols.words import ABILITIES
+from smartcam.protocols.framed.dialect import FramedDialect
+from smartcam.protocols.framed.framing import Frame
+from smartcam.protocols.framed.machine import State
+from smartcam.testing.suites.protocols import Came, Conversation, Sent, WireSuite
+from smartcam.testing.suites.protocols.words import ABILITIES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -33,7 +33,7 @@ def test_page_shows_tests_that_pass(pytester: pytest.Pytester) -> None:
 def test_suite_without_what_it_needs_says_so(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
-        from smartcam.testing.protocols import ProtocolSuite
+        from smartcam.testing.suites.protocols import ProtocolSuite
 
         class TestNothing(ProtocolSuite):
             pass
@@ -48,8 +48,8 @@ def test_suite_without_conversations_or_worlds_skips_and_says_why(
 ) -> None:
     pytester.makepyfile(
         """
-        from smartcam.protocols.insight import INSIGHT
-        from smartcam.testing.protocols import ProtocolSuite
+        from smartcam.protocols.insight.dialect import INSIGHT
+        from smartcam.testing.suites.protocols import ProtocolSuite
 
         class TestBare(ProtocolSuite):
             protocol = INSIGHT

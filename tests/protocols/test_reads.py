@@ -20,19 +20,19 @@ from machines import DIALECTS, client, label, one_by_one
 
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
-from smartcam.protocols import framing, machine
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Policy
 from smartcam.protocols.bvs import HANDBOOK, THESIS
-from smartcam.protocols.framing import DEFAULT_MAX_LENGTH, Frame, Framer
-from smartcam.protocols.machine import LinkFailed, ResultBurst, State
+from smartcam.protocols.framed import framing, machine
+from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer
+from smartcam.protocols.framed.machine import LinkFailed, ResultBurst, State
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from smartcam.protocols.framed import FramedDialect
-    from smartcam.protocols.framing import HeaderLayout
-    from smartcam.protocols.machine import Machine
+    from smartcam.protocols.framed.dialect import FramedDialect
+    from smartcam.protocols.framed.framing import HeaderLayout
+    from smartcam.protocols.framed.machine import Machine
 
 LARGE, FIRST_READ, MOST_READ = 32, 32, 128
 SIZES = st.one_of(

@@ -44,7 +44,7 @@ from hypothesis.stateful import (
 )
 from machines import EXAMPLES
 
-from smartcam.emulator.device import OPERATOR_CONDITIONS
+from smartcam.emulator.bvs.device import OPERATOR_CONDITIONS
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport

@@ -11,10 +11,10 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Transport
 from smartcam.protocols.bvs import B16, HANDBOOK, THESIS
-from smartcam.protocols.framed import MAX_SURPLUS, FramedDialect
-from smartcam.protocols.framing import DEFAULT_MAX_LENGTH
-from smartcam.protocols.machine import Event, LinkFailed, Machine, State
-from smartcam.protocols.unfinished import FRAME_RATE, FRAME_TIME, HINT_TIME, Unfinished
+from smartcam.protocols.framed.dialect import MAX_SURPLUS, FramedDialect
+from smartcam.protocols.framed.frame_age import FRAME_RATE, FRAME_TIME, HINT_TIME, Unfinished
+from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH
+from smartcam.protocols.framed.machine import Event, LinkFailed, Machine, State
 
 RESULT, UNKNOWN = 0x20, 0x77
 STATUS = m.StatusReport(status=Status(0x280))

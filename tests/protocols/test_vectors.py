@@ -15,11 +15,11 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols.base import Role, Transport
 from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols.framing import Frame, Framer
-from smartcam.protocols.machine import TRANSITIONS, Machine, State
+from smartcam.protocols.framed.framing import Frame, Framer
+from smartcam.protocols.framed.machine import TRANSITIONS, Machine, State
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed import FramedDialect
+    from smartcam.protocols.framed.dialect import FramedDialect
 
 FOLDER = Path(__file__).parent.parent / "vectors"
 FILES = {

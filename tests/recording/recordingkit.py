@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import smartcam
-from smartcam.connection import TraceEntry
+from smartcam._client.link import TraceEntry
 from smartcam.models import CameraEvent, Connected
 from smartcam.recording import Recorder, load_recording
 

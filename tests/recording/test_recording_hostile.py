@@ -19,8 +19,8 @@ from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamErro
 from smartcam.models import Connected, Disconnected, Status, StatusChanged
 from smartcam.recording import Recorder, ReplayedCamera, load_recording, reader, write_pcap
 from smartcam.recording import form as forms
-from smartcam.recording import plan as plans
 from smartcam.recording import records as bounds
+from smartcam.recording import schedule as plans
 from smartcam.recording.form import FORMAT, KINDS, MAX_VALUES
 
 if TYPE_CHECKING:

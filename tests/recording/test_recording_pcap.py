@@ -10,7 +10,7 @@ import pytest
 from recordingkit import COUNTER, URL, at, container, frame, record, session, status, write
 from wireshark import TSHARK, needs_tshark
 
-from smartcam.connection import TraceEntry
+from smartcam._client.link import TraceEntry
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError, MissingExtraError, RecordingError
 from smartcam.models import Connected, Disconnected

@@ -9,12 +9,12 @@ from recordingkit import URL, at, container, frame, session, status, write
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Connected, Disconnected, Reconnected, Status
-from smartcam.recording.plan import Change, ReplayPlan, Take, plan_replay
+from smartcam.recording.schedule import Change, ReplayPlan, Take, plan_replay
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.connection import TraceEntry
+    from smartcam._client.link import TraceEntry
     from smartcam.models import CameraEvent
 
 WAITS = ("RUNNING", "WAITING_FOR_TRIGGER")

@@ -17,7 +17,7 @@ from recordingkit import COUNTER, at, frame, record, write
 
 import smartcam
 from smartcam.emulator import EmulatedCamera
-from smartcam.emulator.insight import BUILTIN_JOBS, EmulatedInSight
+from smartcam.emulator.insight.camera import BUILTIN_JOBS, EmulatedInSight
 from smartcam.exceptions import (
     ConfigurationError,
     MissingExtraError,

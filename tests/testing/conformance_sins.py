@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from smartcam.emulator import links
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.framing import Frame
+from smartcam.protocols.framed.framing import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pace import is_first, slowed
 
+from smartcam.conformance.camera import Allow, Plan, Report, judge
 from smartcam.emulator import EmulatedCamera
-from smartcam.testing.conformance import Allow, Plan, Report, judge
 from smartcam.testing.threads import LoopThread
 
 if TYPE_CHECKING:

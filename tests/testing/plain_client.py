@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.testing.clients import Task
+    from smartcam.conformance.client import Task
 
 MAGIC = bytes.fromhex("50535642")
 CONNECT, DISCONNECT, STATUS, RESULT, QUERY, SWITCH = 0x01, 0x02, 0x12, 0x20, 0x30, 0x31

@@ -15,7 +15,7 @@ from smartcam.testing import LinkProxy
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
 
-    from smartcam.testing.rules import Rule
+    from smartcam.testing.proxy.rules import Rule
 
 HOST = "127.0.0.1"
 SHORT = 0.05

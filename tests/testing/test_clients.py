@@ -12,7 +12,7 @@ from pace import at_any_pace, is_first, slowed
 from plain_client import plain_client
 
 import smartcam
-from smartcam.testing.clients import (
+from smartcam.conformance.client import (
     CHECKS,
     SCENES,
     Client,
@@ -25,7 +25,7 @@ from smartcam.testing.clients import (
     judge,
     perform,
 )
-from smartcam.testing.clients.scenes import EVERY_DIALECT
+from smartcam.conformance.client.scenes import EVERY_DIALECT
 
 pytestmark = [pytest.mark.long, pytest.mark.real_time]
 

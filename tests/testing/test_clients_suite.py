@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 
 import pytest
 
-from smartcam.testing.clients.options import ClientOptions, read_options
+from smartcam.conformance.client.pytest_options import ClientOptions, read_options
 
 HERE = Path(__file__).parent
 SECONDS = 300
@@ -20,7 +20,7 @@ WITHOUT = ("-p", "no:asyncio", "-p", "no:anyio", "-p", "no:cacheprovider")
 
 OWN = '''
 from plain_client import plain_client
-from smartcam.testing.clients import ClientConformance
+from smartcam.conformance.client import ClientConformance
 
 
 class TestSinner(ClientConformance):
@@ -113,7 +113,7 @@ def it_skips_what_the_client_cannot_do(own: Ended) -> None:
 def without_a_client_it_says_what_to_type(own: Ended) -> None:
     assert own.outcome("TestNobody::test_client[handbook-tcp-triggers") == "SKIPPED"
     assert (
-        'no client: pytest --pyargs smartcam.testing.clients --client-command "./mine {host} '
+        'no client: pytest --pyargs smartcam.conformance.client --client-command "./mine {host} '
         '{port} {task}"'
     ) in own.out
 
@@ -131,7 +131,7 @@ def test_suite_from_the_shell_judges_a_command(tmp_path: Path) -> None:
     )
     ended = run_pytest(
         tmp_path,
-        *("--pyargs", "smartcam.testing.clients", "--client-command", client),
+        *("--pyargs", "smartcam.conformance.client", "--client-command", client),
         *("-k", "switches or watches", "--client-timeout", "200", "--client-dialect", "handbook"),
     )
     assert ended.code == 0, ended.out
@@ -174,7 +174,7 @@ def test_options_that_cannot_be_are_wrong_usage(option: str, value: object, text
 
 def test_options_for_the_plugin_import_nothing_heavy() -> None:
     code = (
-        "import sys; from smartcam.testing.clients.options import add_options; "
+        "import sys; from smartcam.conformance.client.pytest_options import add_options; "
         "print(sorted({'asyncio', 'numpy', 'pydantic', 'pytest', 'smartcam.emulator'} "
         "& set(sys.modules)))"
     )

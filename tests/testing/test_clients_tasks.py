@@ -8,9 +8,9 @@ import threading
 
 import pytest
 
+from smartcam.conformance.client import CommandClient, FunctionClient, Outcome, Task
+from smartcam.conformance.client.tasks import read_results
 from smartcam.exceptions import ConfigurationError
-from smartcam.testing.clients import CommandClient, FunctionClient, Outcome, Task
-from smartcam.testing.clients.tasks import read_results
 
 pytestmark = pytest.mark.real_time
 

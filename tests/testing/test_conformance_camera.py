@@ -23,15 +23,15 @@ from conformance_world import (
 )
 from pace import at_any_pace, slowed
 
+from smartcam.conformance.camera import Allow, Plan, judge
+from smartcam.conformance.camera.items import CHECKS, ITEMS, QUESTIONS
+from smartcam.conformance.camera.judging import judge_item
+from smartcam.conformance.camera.results import Check, Outcome
+from smartcam.conformance.camera.session_under_test import Bench
 from smartcam.emulator import Quirks, Scenario, links
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.testing.conformance import Allow, Plan, judge
-from smartcam.testing.conformance.bench import Bench
-from smartcam.testing.conformance.items import CHECKS, ITEMS, QUESTIONS
-from smartcam.testing.conformance.judging import judge_item
-from smartcam.testing.conformance.verdicts import Check, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

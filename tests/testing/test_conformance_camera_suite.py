@@ -83,7 +83,7 @@ def run(folder: pytest.Pytester, *arguments: str) -> tuple[str, int]:
 
 
 def in_package(folder: pytest.Pytester, *arguments: str) -> tuple[str, int]:
-    return run(folder, "--pyargs", "smartcam.testing.conformance", *arguments)
+    return run(folder, "--pyargs", "smartcam.conformance.camera", *arguments)
 
 
 def test_suite_without_a_camera_skips_and_says_what_to_type(folder: pytest.Pytester) -> None:
@@ -91,7 +91,7 @@ def test_suite_without_a_camera_skips_and_says_what_to_type(folder: pytest.Pytes
     assert code == 0
     assert "[64] " in printed
     assert (
-        "no camera was named: pytest --pyargs smartcam.testing.conformance "
+        "no camera was named: pytest --pyargs smartcam.conformance.camera "
         "--camera-url bvs://HOST" in printed
     )
     assert "is it a BVS camera?" not in printed
@@ -109,7 +109,7 @@ def test_suite_reports_as_the_page_shows(folder: pytest.Pytester, thread: LoopTh
     with emulated(thread, _complains_of_ids, **camera) as emulator:
         process = start(
             folder,
-            *("--pyargs", "smartcam.testing.conformance", "--camera-url", emulator.url),
+            *("--pyargs", "smartcam.conformance.camera", "--camera-url", emulator.url),
             *("--camera-report", str(report), *short()),
         )
         printed, _ = process.communicate(timeout=PATIENCE)
@@ -161,7 +161,7 @@ def test_subclass_takes_its_address_from_class_or_fixture(
         folder.makepyfile(
             test_ours=f"""
 import pytest
-from smartcam.testing.conformance import CameraConformance
+from smartcam.conformance.camera import CameraConformance
 
 class TestByClass(CameraConformance):
     camera_url = {one.url!r}
@@ -215,7 +215,7 @@ def test_suite_that_is_broken_off_leaves_the_camera_as_it_was(
     with emulated(thread, running=True) as emulator:
         process = start(
             folder,
-            *("--pyargs", "smartcam.testing.conformance", "--camera-url", emulator.url),
+            *("--pyargs", "smartcam.conformance.camera", "--camera-url", emulator.url),
             *("--camera-quiet", "60", "-k", "second-stop"),
         )
         thread.wait(emulator.wait_received(m.Stop, count=2, timeout=PATIENCE), timeout=2 * PATIENCE)

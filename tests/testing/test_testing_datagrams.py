@@ -11,14 +11,15 @@ import pytest
 from proxykit import HOST, SHORT, Mailbox, mailbox, until
 
 from smartcam import ConfigurationError
-from smartcam.testing import LinkProxy, datagrams
-from smartcam.testing.journal import Entry
-from smartcam.testing.rules import Late, Lose, Reorder, Repeat
+from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import udp
+from smartcam.testing.proxy.log import Entry
+from smartcam.testing.proxy.rules import Late, Lose, Reorder, Repeat
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from smartcam.testing.rules import Direction, Rule
+    from smartcam.testing.proxy.rules import Direction, Rule
 
 FIVE = [b"1", b"2", b"3", b"4", b"5"]
 
@@ -227,7 +228,7 @@ async def test_ended_client_is_a_new_one_when_it_speaks_again(end: str) -> None:
 
 
 async def test_too_many_clients_forget_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(datagrams, "MAX_CLIENTS", 1)
+    monkeypatch.setattr(udp, "MAX_CLIENTS", 1)
     async with linked() as (proxy, client, _), mailbox(proxy.port) as other:
         for box in (client, other):
             box.send(b"a")
@@ -236,7 +237,7 @@ async def test_too_many_clients_forget_the_first(monkeypatch: pytest.MonkeyPatch
 
 
 async def test_datagrams_held_back_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(datagrams, "MAX_WAITING", 2)
+    monkeypatch.setattr(udp, "MAX_WAITING", 2)
     async with linked(Late(seconds=SHORT)) as (proxy, client, _):
         client.send(*FIVE)
         await proxy.wait_for("full", 3)

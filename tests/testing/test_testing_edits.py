@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.testing.edits import Act, Editor, Gap, Hold, Note, Send, Step
-from smartcam.testing.rules import (
+from smartcam.testing.proxy.byte_edits import Act, Editor, Gap, Hold, Note, Send, Step
+from smartcam.testing.proxy.rules import (
     Coalesce,
     Cut,
     Drip,

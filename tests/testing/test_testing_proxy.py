@@ -11,9 +11,10 @@ from proxykit import HOST, MESSAGE, SHORT, client, linked, target
 import smartcam
 from smartcam import ConfigurationError, ConnectFailedError, TriggerTimeoutError
 from smartcam.emulator import EmulatedCamera
-from smartcam.testing import LinkProxy, journal
-from smartcam.testing.journal import Entry
-from smartcam.testing.rules import Drip, Flip, Lose, Split, Stall
+from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import log
+from smartcam.testing.proxy.log import Entry
+from smartcam.testing.proxy.rules import Drip, Flip, Lose, Split, Stall
 
 CONNECT_ANSWER = 16
 """Bytes of the answer to Connect in the dialect handbook; the status behind it has 20."""
@@ -51,7 +52,7 @@ async def test_wait_ends_at_its_deadline_and_says_how_far_it_came() -> None:
 
 
 async def test_log_is_bounded_and_the_counts_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal, "MAX_ENTRIES", 2)
+    monkeypatch.setattr(log, "MAX_ENTRIES", 2)
     async with linked() as (proxy, _, _):
         proxy.resume()
         proxy.stall("up", connection=1)

@@ -9,7 +9,7 @@ import pytest
 
 from smartcam import ConfigurationError
 from smartcam.testing import LinkProxy
-from smartcam.testing.rules import (
+from smartcam.testing.proxy.rules import (
     MAX_COPY,
     MAX_HOLD,
     Coalesce,

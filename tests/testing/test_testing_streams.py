@@ -28,9 +28,10 @@ from proxykit import (
     until,
 )
 
-from smartcam.testing import LinkProxy, pipes, streams
-from smartcam.testing.journal import Entry
-from smartcam.testing.rules import (
+from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import directions, tcp
+from smartcam.testing.proxy.log import Entry
+from smartcam.testing.proxy.rules import (
     Coalesce,
     Cut,
     Delay,
@@ -48,7 +49,7 @@ from smartcam.testing.rules import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from smartcam.testing.rules import Direction, Rule
+    from smartcam.testing.proxy.rules import Direction, Rule
 
 BEHIND = b"abc"
 """What the camera says behind the message."""
@@ -66,7 +67,7 @@ def writes(monkeypatch: pytest.MonkeyPatch) -> list[Write]:
     """Every write of a proxy, and the turn of the loop it was made in, counted from the first."""
     made: list[Write] = []
     turn = 0
-    write = pipes.Pipe._write
+    write = directions.Pipe._write
 
     def next_turn() -> None:
         nonlocal turn
@@ -74,14 +75,14 @@ def writes(monkeypatch: pytest.MonkeyPatch) -> list[Write]:
         if turn < 1_000_000:
             asyncio.get_running_loop().call_soon(next_turn)
 
-    def noted(pipe: pipes.Pipe, data: memoryview) -> int:
+    def noted(pipe: directions.Pipe, data: memoryview) -> int:
         if not made:
             next_turn()
         written = write(pipe, data)
         made.append(Write(bytes(data[:written]), turn))
         return written
 
-    monkeypatch.setattr(pipes.Pipe, "_write", noted)
+    monkeypatch.setattr(directions.Pipe, "_write", noted)
     return made
 
 
@@ -168,7 +169,7 @@ async def test_target_that_refuses_resets_the_client() -> None:
 async def test_target_that_takes_no_connection_ends_at_the_deadline(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(streams, "CONNECT_TIMEOUT", SHORT)
+    monkeypatch.setattr(tcp, "CONNECT_TIMEOUT", SHORT)
     with socket.socket() as full, contextlib.ExitStack() as waiting:
         full.bind((HOST, 0))
         full.listen(0)
@@ -195,7 +196,7 @@ async def test_many_connections_keep_their_bytes_apart() -> None:
 
 
 async def test_connections_beyond_the_limit_are_reset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "MAX_CONNECTIONS", 1)
+    monkeypatch.setattr(tcp, "MAX_CONNECTIONS", 1)
     async with linked() as (proxy, _, _):
         with raw_client(proxy.port) as raw:
             assert await rest_of(raw) == (b"", "RST")
@@ -222,7 +223,7 @@ async def test_receiver_that_does_not_read_stops_the_sender() -> None:
         camera.write(sent)
         pipe = proxy._relay._connections[1]._pipes["down"]  # type: ignore[union-attr]
         await until(lambda: pipe._writing and not pipe._reading)
-        assert pipes.MAX_HELD <= pipe._held < pipes.MAX_HELD + pipes.CHUNK
+        assert directions.MAX_HELD <= pipe._held < directions.MAX_HELD + directions.CHUNK
         assert camera.transport.get_write_buffer_size() > 0
         end.transport.resume_reading()
         await proxy.wait_passed("down", len(sent), timeout=20)
@@ -294,7 +295,7 @@ async def test_cut_connection_is_let_go_where_both_answer_with_a_reset() -> None
 async def test_cut_connection_is_let_go_where_nobody_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(streams, "LINGER", SHORT)
+    monkeypatch.setattr(tcp, "LINGER", SHORT)
     async with linked(Cut()) as (proxy, end, _):
         await end.wait_eof()
         assert proxy.open_connections == 1
@@ -460,7 +461,7 @@ async def in_pieces(end: End, proxy: LinkProxy, data: bytes) -> None:
         await until(functools.partial(pipe_is_at, pipe, position))
 
 
-def pipe_is_at(pipe: pipes.Pipe, position: int) -> bool:
+def pipe_is_at(pipe: directions.Pipe, position: int) -> bool:
     return pipe._editor.position >= position
 
 
@@ -626,7 +627,7 @@ async def test_slow_rate_stops_the_sender_and_not_only_the_receiver() -> None:
         camera.write(bytes(32_000_000))
         await proxy.wait_passed("down", 60)
         pipe = proxy._relay._connections[1]._pipes["down"]  # type: ignore[union-attr]
-        assert pipe._held < pipes.MAX_HELD + pipes.CHUNK
+        assert pipe._held < directions.MAX_HELD + directions.CHUNK
         assert not pipe._reading
 
 

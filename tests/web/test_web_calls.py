@@ -17,9 +17,9 @@ from smartcam.emulator.scene import PIECES
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.web import EmulatorSite
-from smartcam.web.calls import MAX_BODY
 from smartcam.web.emulator import CALLS, MAX_PARTS
-from smartcam.web.shown import MAX_HEX, MAX_TOLD, MAX_VALUES
+from smartcam.web.routes import MAX_BODY
+from smartcam.web.serialize import MAX_HEX, MAX_TOLD, MAX_VALUES
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from processes import PATIENCE, Process
 
-from smartcam.cli.emulate import command
+from smartcam.cli.smartcam_emulator import command
 
 TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
 

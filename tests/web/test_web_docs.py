@@ -14,7 +14,7 @@ import pytest
 from sitekit import TOKEN
 
 from smartcam.emulator import EmulatedCamera
-from smartcam.web import EmulatorSite, calls, emulator, shown, streams
+from smartcam.web import EmulatorSite, emulator, routes, serialize, streams
 from smartcam.web.emulator import CALLS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "control.md").read_text(encoding="utf-8")
@@ -37,11 +37,12 @@ def test_table_has_every_call() -> None:
 
 def test_bounds_are_those_of_the_code() -> None:
     said = {
-        f"did not come within {calls.READ_TIMEOUT:g} s",
-        f"more than {calls.MAX_BODY >> 10} KiB",
+        f"did not come within {routes.READ_TIMEOUT:g} s",
+        f"more than {routes.MAX_BODY >> 10} KiB",
         f"{streams.MAX_STREAMS} event streams",
         f"nothing for {streams.SLOW:g} s",
-        f"long payloads to {shown.MAX_HEX} bytes and decode results up to {shown.MAX_VALUES}",
+        f"long payloads to {serialize.MAX_HEX} bytes "
+        f"and decode results up to {serialize.MAX_VALUES}",
     }
     assert [text for text in said if text not in PAGE] == []
     assert emulator.MAX_ENTRIES >= 100  # the example's limit

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from smartcam.emulator.scene import PIECES, TABLE_SIZE
-from smartcam.web.outlines import OUTLINES, SIDE
+from smartcam.web.shapes import OUTLINES, SIDE
 
 if TYPE_CHECKING:
-    from smartcam.web.outlines import Outline
+    from smartcam.web.shapes import Outline
 
 Point = tuple[float, float]
 

@@ -16,14 +16,14 @@ import pytest
 from sitekit import TOKEN, Raw, World, served, until
 
 import smartcam
-from smartcam.web import calls, emulator, places
-from smartcam.web.calls import MAX_BODY
+from smartcam.web import connections, emulator, routes
+from smartcam.web.connections import MAX_CONNECTIONS, MAX_HEAD
 from smartcam.web.emulator import MAX_WAITING
-from smartcam.web.places import MAX_CONNECTIONS, MAX_HEAD
+from smartcam.web.routes import MAX_BODY
 from smartcam.web.streams import MAX_STREAMS
 
 if TYPE_CHECKING:
-    from smartcam.web.places import Places
+    from smartcam.web.connections import Places
 
 HALF = b"GET /api HTTP/1.1\r\nHost: localhost\r\nX-Slow: "
 UNFINISHED = b"POST /api HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
@@ -112,7 +112,7 @@ async def test_streams_and_calls_that_wait_leave_places_free() -> None:
 async def test_where_every_place_is_taken_the_newcomer_is_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(places, "MAX_CONNECTIONS", 1)
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 1)
     async with served() as world, world.events() as events:
         await events.next("clock")
         async with Raw.connected(world.site) as raw:
@@ -128,7 +128,7 @@ async def test_where_every_place_is_taken_the_newcomer_is_told(
 async def test_head_that_does_not_come_ends_the_connection(
     data: bytes, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(places, "HEAD_TIMEOUT", 0.05)
+    monkeypatch.setattr(connections, "HEAD_TIMEOUT", 0.05)
     with caplog.at_level(logging.INFO, logger="smartcam.web"):
         async with served() as world, Raw.connected(world.site) as raw:
             raw.writer.write(data)
@@ -142,7 +142,7 @@ async def test_second_head_that_does_not_become_whole_ends_the_connection(
 ) -> None:
     async with served() as world, Raw.connected(world.site) as raw:
         assert (await raw.ask("GET /api HTTP/1.1", "Host: localhost"))[0] == 200
-        monkeypatch.setattr(places, "HEAD_TIMEOUT", 0.05)
+        monkeypatch.setattr(connections, "HEAD_TIMEOUT", 0.05)
         with caplog.at_level(logging.INFO, logger="smartcam.web"):
             raw.writer.write(HALF)
             await ended(raw)
@@ -152,7 +152,7 @@ async def test_second_head_that_does_not_become_whole_ends_the_connection(
 async def test_connection_without_another_request_ends(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(places, "KEEP_ALIVE", 0.05)
+    monkeypatch.setattr(connections, "KEEP_ALIVE", 0.05)
     with caplog.at_level(logging.INFO, logger="smartcam.web"):
         async with served() as world, Raw.connected(world.site) as raw:
             assert (await raw.ask("GET /api HTTP/1.1", "Host: localhost"))[0] == 200
@@ -164,7 +164,7 @@ async def test_answer_takes_as_long_as_it_takes(monkeypatch: pytest.MonkeyPatch)
     async with served() as world, world.events() as events:
         await events.next("clock")
         for name in ("HEAD_TIMEOUT", "KEEP_ALIVE"):
-            monkeypatch.setattr(places, name, 0.001)
+            monkeypatch.setattr(connections, name, 0.001)
         for _ in range(2):  # which come once a second
             await events.next("clock")
 
@@ -212,7 +212,7 @@ async def test_large_body_does_not_count_as_a_head(token: str) -> None:
 async def test_refused_request_whose_body_does_not_come_ends_the_connection(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(places, "HEAD_TIMEOUT", 0.1)
+    monkeypatch.setattr(connections, "HEAD_TIMEOUT", 0.1)
     with caplog.at_level(logging.INFO, logger="smartcam.web"):
         async with served(token=TOKEN) as world, Raw.connected(world.site) as raw:
             raw.writer.write(UNFINISHED)
@@ -279,7 +279,7 @@ async def test_what_is_no_http_is_no_error_of_ours(
 async def test_descriptors_that_are_used_up_are_told_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("smartcam.accepting.ACCEPT_PAUSE", 0.001)
+    monkeypatch.setattr("smartcam._accepting.ACCEPT_PAUSE", 0.001)
     failures = 100
 
     class Scarce(socket.socket):
@@ -369,6 +369,6 @@ async def test_half_requests_do_not_take_the_process_its_descriptors() -> None:
 
 
 def test_bounds_fit_each_other() -> None:
-    assert places.HEAD_TIMEOUT <= places.KEEP_ALIVE
-    assert calls.READ_TIMEOUT <= places.KEEP_ALIVE
+    assert connections.HEAD_TIMEOUT <= connections.KEEP_ALIVE
+    assert routes.READ_TIMEOUT <= connections.KEEP_ALIVE
     assert emulator.MAX_WAIT > 0

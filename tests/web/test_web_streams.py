@@ -13,8 +13,8 @@ from sitekit import Raw, World, served, until
 import smartcam
 from smartcam.models import Status
 from smartcam.web import streams
+from smartcam.web.feed import MAX_LOG_NEWS, Watcher
 from smartcam.web.streams import MAX_STREAMS, News
-from smartcam.web.watching import MAX_LOG_NEWS, Watcher
 
 if TYPE_CHECKING:
     from smartcam.emulator import EmulatedCamera

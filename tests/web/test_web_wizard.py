@@ -10,10 +10,10 @@ import aiohttp
 import pytest
 from sitekit import TOKEN
 
-from smartcam.calibration.drift import drift_wizard
-from smartcam.calibration.folder import Folder
-from smartcam.calibration.services import CalibrationService
-from smartcam.calibration.wizard import plane_wizard
+from smartcam.calibration.files.directory import Folder
+from smartcam.calibration.wizards.plane import plane_wizard
+from smartcam.calibration.wizards.services import CalibrationService
+from smartcam.calibration.wizards.verification import drift_wizard
 from smartcam.exceptions import NotRunningError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 from smartcam.web.wizard import CALLS, WizardSite

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from smartcam.calibration.folder import MAX_NAME
-from smartcam.calibration.services import JOURNALS
-from smartcam.calibration.store import BACKUPS
-from smartcam.calibration.wizard import RULER
+from smartcam.calibration.files.directory import MAX_NAME
+from smartcam.calibration.files.store import BACKUPS
+from smartcam.calibration.wizards.plane import RULER
+from smartcam.calibration.wizards.services import JOURNALS
 from smartcam.web.wizard import CALLS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "calibrating.md").read_text(encoding="utf-8")

@@ -8,15 +8,15 @@ import numpy as np
 import pytest_asyncio
 from browser import BROWSER_MARKS, new_page
 
-from smartcam.calibration.folder import Folder
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.hand_eye_wizard import hand_eye_wizard
-from smartcam.calibration.imaging.rendering import render
-from smartcam.calibration.imaging.sheet import SheetCalibration
-from smartcam.calibration.imaging.sheet_wizard import sheet_wizard
-from smartcam.calibration.imaging.targets import Checkerboard
-from smartcam.calibration.services import CalibrationService
+from smartcam.calibration.files.directory import Folder
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.sheet.calibration import SheetCalibration
+from smartcam.calibration.simulation.images import render
+from smartcam.calibration.targets import Checkerboard
+from smartcam.calibration.wizards.hand_eye import hand_eye_wizard
+from smartcam.calibration.wizards.services import CalibrationService
+from smartcam.calibration.wizards.sheet import sheet_wizard
 from smartcam.web.wizard import WizardSite
 
 if TYPE_CHECKING:

@@ -18,21 +18,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from smartcam.calibration.codes import Code
+from smartcam.calibration.files.store import replace_file
 from smartcam.calibration.formats import handeye, opencv, ros, samples, trajectories
 from smartcam.calibration.formats.opencv import PlaneMatrix
 from smartcam.calibration.formats.plain import frame_name, malformed
 from smartcam.calibration.formats.planes import PlaneFrame, plane_frame
 from smartcam.calibration.formats.robots import ROBOTS, Robot, pose_from, pose_to
 from smartcam.calibration.formats.samples import Sample
-from smartcam.calibration.store import replace_file
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Mapping, Sequence
 
-    from smartcam.calibration.frames import Transform
-    from smartcam.calibration.plane import PlaneCalibration
+    from smartcam.calibration.geometry.frames import Transform
+    from smartcam.calibration.plane.calibration import PlaneCalibration
 
 __all__ = [
     "MAX_FILE",

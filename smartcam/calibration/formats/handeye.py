@@ -25,7 +25,7 @@ from smartcam.calibration.formats.plain import (
     quoted,
     row,
 )
-from smartcam.calibration.frames import Transform
+from smartcam.calibration.geometry.frames import Transform
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -26,9 +26,9 @@ from smartcam.calibration.formats.plain import (
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from smartcam.calibration.frames import Transform
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.plane import PlaneCalibration
+    from smartcam.calibration.geometry.frames import Transform
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.plane.calibration import PlaneCalibration
 
 __all__ = [
     "HEAD",
@@ -48,7 +48,7 @@ class PlaneMatrix(NamedTuple):
 
     Attributes:
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres. A
-            :class:`~smartcam.calibration.solvers.PlaneProjection` of it maps poses.
+            :class:`~smartcam.calibration.geometry.solvers.PlaneProjection` of it maps poses.
         model: how it was fitted.
         robot_frame: where x, y and z are.
         camera_frame: where u and v are; empty where it was not said.

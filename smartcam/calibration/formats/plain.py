@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.frames import Transform
+from smartcam.calibration.geometry.frames import Transform
 from smartcam.exceptions import CalibrationError
 from smartcam.layout.yamls import BadYamlError, compose
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 __all__ = [
     "MAX_DEPTH",

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.frames import Transform
+from smartcam.calibration.geometry.frames import Transform
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from smartcam.calibration.plane import PlaneCalibration
+    from smartcam.calibration.plane.calibration import PlaneCalibration
 
 __all__ = ["PlaneFrame", "plane_frame"]
 

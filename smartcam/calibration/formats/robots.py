@@ -23,8 +23,8 @@ import numpy as np
 
 from smartcam.calibration.codes import Code
 from smartcam.calibration.formats.plain import MAX_NUMBER
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.geometry import as_vector, matrix_from_quaternion
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.geometry.rotations import as_vector, matrix_from_quaternion
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 __all__ = ["ROBOTS", "Robot", "angles_zyx", "pose_from", "pose_to", "rotation_zyx"]
 

@@ -30,7 +30,7 @@ from smartcam.calibration.formats.plain import (
     row,
 )
 from smartcam.calibration.formats.robots import angles_zyx, rotation_zyx
-from smartcam.calibration.frames import Transform
+from smartcam.calibration.geometry.frames import Transform
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -28,7 +28,7 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration.frames import Transform
+    from smartcam.calibration.geometry.frames import Transform
 
 __all__ = [
     "Sample",

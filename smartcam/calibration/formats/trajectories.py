@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from smartcam.calibration.codes import Code
 from smartcam.calibration.formats.plain import POSE, malformed, number, row
 from smartcam.calibration.formats.samples import same_frames
-from smartcam.calibration.frames import Transform
+from smartcam.calibration.geometry.frames import Transform
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.rendering import render
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation.images import render
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.targets import Target
-    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.targets import Target
+    from smartcam.calibration.views import TargetView
 
 STRAIGHT = CameraModel(
     size=(640, 480), matrix=np.array([[600, 0, 318.3], [0, 602, 241.7], [0, 0, 1]])

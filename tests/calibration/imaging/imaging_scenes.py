@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.homography import apply_homography, fit_homography
-from smartcam.calibration.imaging.simulation import HandEyeScene, hand_eye_scene
-from smartcam.calibration.imaging.targets import Checkerboard
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.geometry.homography import apply_homography, fit_homography
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation.scenes import HandEyeScene, hand_eye_scene
+from smartcam.calibration.targets import Checkerboard
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration.imaging.hand_eye_fit import Setup
-    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.calibration.hand_eye.equations import Setup
+    from smartcam.calibration.views import TargetView
 
 CAMERA = CameraModel(
     size=(1280, 960),

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging import simulation
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.targets import Checkerboard
-from smartcam.calibration.imaging.views import TargetView
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation import scenes
+from smartcam.calibration.targets import Checkerboard
+from smartcam.calibration.views import TargetView
 
 if TYPE_CHECKING:
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.targets import Target
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.targets import Target
 
 __all__ = ["BOARD", "FISHEYE", "LEFT", "RIG", "RIGHT", "TURNED", "WIDE", "pairs", "poses", "seen"]
 
@@ -60,7 +60,7 @@ def poses(
     count: int, *, seed: int = 0, tilt: float = 0.6, distance: float = 0.35, name: str = "camera"
 ) -> list[Transform]:
     """Return poses of a target before a camera."""
-    around = simulation.around(
+    around = scenes.around(
         BOARD, count, tilt=tilt, distance=distance, random=np.random.default_rng(seed)
     )
     found = [one.inverse() for one in around]

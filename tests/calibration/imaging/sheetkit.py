@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.rendering import render
-from smartcam.calibration.imaging.sheet_wizard import sheet_wizard
-from smartcam.calibration.imaging.targets import Checkerboard
-from smartcam.calibration.journal import Journal
-from smartcam.calibration.sequence import Session
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation.images import render
+from smartcam.calibration.targets import Checkerboard
+from smartcam.calibration.wizards.journal import Journal
+from smartcam.calibration.wizards.sequence import Session
+from smartcam.calibration.wizards.sheet import sheet_wizard
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.targets import Target
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.targets import Target
 
 CAMERA = CameraModel(
     size=(800, 600),

@@ -8,7 +8,7 @@ import pytest
 from lenskit import LEFT, RIG, RIGHT, pairs, poses, seen
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration.imaging.bundle import (
+from smartcam.calibration.lens.bundle import (
     IDENTITY,
     Bundle,
     Motion,

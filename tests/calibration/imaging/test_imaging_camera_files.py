@@ -11,7 +11,7 @@ from lenskit import FISHEYE, LEFT, RIG, RIGHT, WIDE, poses, seen
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
-from smartcam.calibration.imaging.camera_files import (
+from smartcam.calibration.formats.cameras import (
     FORMS,
     CameraChain,
     CameraForm,
@@ -25,13 +25,13 @@ from smartcam.calibration.imaging.camera_files import (
     write_camera_info,
     write_cameras,
 )
-from smartcam.calibration.imaging.intrinsics import calibrate_intrinsics
-from smartcam.calibration.imaging.rectification import rectify
+from smartcam.calibration.lens.intrinsics import calibrate_intrinsics
+from smartcam.calibration.stereo.rectification import rectify
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.lens.model import CameraModel
 
 FOUR = dataclasses.replace(LEFT, distortion=np.array([-0.28, 0.07, 1e-3, -5e-4, 0.0]))
 ONE = CameraChain(cameras=(FOUR,), names=("camera",))

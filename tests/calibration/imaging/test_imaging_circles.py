@@ -9,12 +9,12 @@ from drawnkit import STRAIGHT, drawn
 from imaging_scenes import refused
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.homography import apply_homography, fit_homography
-from smartcam.calibration.imaging.lattices import lattices
-from smartcam.calibration.imaging.sheets import make_sheet
-from smartcam.calibration.imaging.spots import dark_spots
-from smartcam.calibration.imaging.targets import CircleGrid
+from smartcam.calibration.detection.blobs import dark_spots
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.detection.grid_growing import lattices
+from smartcam.calibration.geometry.homography import apply_homography, fit_homography
+from smartcam.calibration.printing.sheets import make_sheet
+from smartcam.calibration.targets import CircleGrid
 
 ROUND = CircleGrid(columns=7, rows=6, spacing=0.015, diameter=0.0075, origin_diameter=0.011)
 SHIFTED = CircleGrid(columns=4, rows=11, spacing=0.04, diameter=0.015, asymmetric=True)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from drawnkit import STRAIGHT, drawn
 
-from smartcam.calibration.imaging.corners import UNREFINED, refine_corners
-from smartcam.calibration.imaging.grey import grey_image
-from smartcam.calibration.imaging.targets import Checkerboard
+from smartcam.calibration.detection.corners import UNREFINED, refine_corners
+from smartcam.calibration.detection.image import grey_image
+from smartcam.calibration.targets import Checkerboard
 
 BOARD = Checkerboard(columns=9, rows=6, square=0.025)
 STEP = 600 * 0.025 / 0.45

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from smartcam.calibration.imaging.coverage import Coverage, coverage
+from smartcam.calibration.lens.coverage import Coverage, coverage
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 

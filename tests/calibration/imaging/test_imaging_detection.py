@@ -11,8 +11,8 @@ from drawnkit import STRAIGHT, drawn
 from imaging_scenes import refused
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.targets import Charuco, Checkerboard, CircleGrid, Target
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.targets import Charuco, Checkerboard, CircleGrid, Target
 from smartcam.exceptions import CalibrationError
 
 PLAIN = Checkerboard(columns=9, rows=6, square=0.025)

@@ -8,12 +8,12 @@ from drawnkit import BENT, STRAIGHT, drawn, facing
 from imaging_scenes import refused
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.dots import UNREFINED, GridMap, refine_dots
-from smartcam.calibration.imaging.grey import grey_image
-from smartcam.calibration.imaging.homography import apply_homography, fit_homography
-from smartcam.calibration.imaging.targets import CircleGrid
+from smartcam.calibration.detection.dots import UNREFINED, GridMap, refine_dots
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.detection.image import grey_image
+from smartcam.calibration.geometry.homography import apply_homography, fit_homography
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.targets import CircleGrid
 
 GRID = CircleGrid(columns=8, rows=6, spacing=0.03, diameter=0.02)
 FLAT = GRID.points[:, :2]

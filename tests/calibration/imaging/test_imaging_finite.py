@@ -13,21 +13,21 @@ from lenskit import pairs
 from sheetkit import CAMERA, LIES, SEEN, TARGET, field, localized
 
 from smartcam.calibration import fit_plane
-from smartcam.calibration.imaging import simulation
-from smartcam.calibration.imaging.hand_eye import calibrate_hand_eye
-from smartcam.calibration.imaging.hand_eye_fit import RobotSigmas
-from smartcam.calibration.imaging.sheet import SheetCalibration, calibrate_sheet, fit_corners
-from smartcam.calibration.imaging.stereo import StereoCalibration, calibrate_stereo
-from smartcam.calibration.plane import PlaneCalibration
-from smartcam.calibration.solvers import CameraPosition2D, Chain, PlaneProjection, chain_of
-from smartcam.calibration.store import write
+from smartcam.calibration.files.store import write
+from smartcam.calibration.geometry.solvers import CameraPosition2D, Chain, PlaneProjection, chain_of
+from smartcam.calibration.hand_eye.calibration import calibrate_hand_eye
+from smartcam.calibration.hand_eye.equations import RobotSigmas
+from smartcam.calibration.plane.calibration import PlaneCalibration
+from smartcam.calibration.sheet.calibration import SheetCalibration, calibrate_sheet, fit_corners
+from smartcam.calibration.simulation import scenes
+from smartcam.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
-    from smartcam.calibration.imaging.hand_eye_result import HandEyeCalibration
+    from smartcam.calibration.hand_eye.result import HandEyeCalibration
     from smartcam.models import Localization
 
 GRID = np.stack(np.meshgrid([0.0, 0.15, 0.3], [0.0, 0.12, 0.24]), axis=-1).reshape(-1, 2)
@@ -77,7 +77,7 @@ def plane_gives(found: PlaneCalibration) -> list[np.ndarray]:
 
 @functools.cache
 def sheet() -> SheetCalibration:
-    view = simulation.view(TARGET, CAMERA, SEEN, sigma=0.0, random=np.random.default_rng(1))
+    view = scenes.view(TARGET, CAMERA, SEEN, sigma=0.0, random=np.random.default_rng(1))
     corners = [0, 8, 45, 53, 22]
     return calibrate_sheet(
         view, fit_corners(TARGET, corners, LIES.apply(TARGET.points[corners])), camera=CAMERA

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartcam.calibration.imaging.grey import grey_image, scaled
-from smartcam.calibration.imaging.sampling import mean_level
+from smartcam.calibration.detection.image import grey_image, scaled
+from smartcam.calibration.detection.sampling import mean_level
 
 
 def test_grey_image_of_bytes_keeps_them() -> None:

@@ -14,23 +14,23 @@ import pytest
 from imaging_scenes import CAMERA, SHEET, refused, scene
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.hand_eye import (
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.hand_eye.calibration import (
     HandEyeCalibration,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration.imaging.hand_eye_fit import RobotSigmas, Setup, exp_rotation
-from smartcam.calibration.imaging.simulation import hand_eye_scene
-from smartcam.calibration.imaging.targets import Checkerboard
+from smartcam.calibration.hand_eye.equations import RobotSigmas, Setup, exp_rotation
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation.scenes import hand_eye_scene
+from smartcam.calibration.targets import Checkerboard
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.calibration.views import TargetView
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
 ONE_LONG = ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.long)]

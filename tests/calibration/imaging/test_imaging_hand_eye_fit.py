@@ -12,7 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from imaging_scenes import CAMERA, SHEET, refused, scene
 
-from smartcam.calibration.imaging.hand_eye_fit import (
+from smartcam.calibration.hand_eye.closed_forms import (
+    LINEAR,
+    check_motion,
+    solve_linear,
+)
+from smartcam.calibration.hand_eye.equations import (
     Observations,
     PixelObservations,
     PoseObservations,
@@ -26,15 +31,10 @@ from smartcam.calibration.imaging.hand_eye_fit import (
     log_rotation,
     sums,
 )
-from smartcam.calibration.imaging.hand_eye_linear import (
-    LINEAR,
-    check_motion,
-    solve_linear,
-)
-from smartcam.calibration.imaging.hand_eye_noise import adjust_noisy
+from smartcam.calibration.hand_eye.robot_noise import adjust_noisy
 
 if TYPE_CHECKING:
-    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.lens.model import CameraModel
 
 vectors = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(np.array)
 

@@ -7,13 +7,13 @@ import pytest
 
 from benchmarks.hand_eye import RECORDED, Recorded, find, read_poses, read_set
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.hand_eye import (
+from smartcam.calibration.hand_eye.calibration import (
     HandEyeCalibration,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration.imaging.hand_eye_linear import LINEAR
+from smartcam.calibration.hand_eye.closed_forms import LINEAR
+from smartcam.calibration.lens.model import CameraModel
 
 pytestmark = pytest.mark.long
 

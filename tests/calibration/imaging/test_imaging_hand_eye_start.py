@@ -11,15 +11,15 @@ import pytest
 from imaging_scenes import CAMERA, SHEET, refused, scene
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.hand_eye import (
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.hand_eye.calibration import (
     HandEyeCalibration,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration.imaging.hand_eye_choice import Problem
-from smartcam.calibration.imaging.hand_eye_fit import PoseObservations, Rigid, Robot, RobotSigmas
-from smartcam.calibration.imaging.hand_eye_start import (
+from smartcam.calibration.hand_eye.equations import PoseObservations, Rigid, Robot, RobotSigmas
+from smartcam.calibration.hand_eye.model_selection import Problem
+from smartcam.calibration.hand_eye.validation import (
     agreement,
     check_poses,
     expected_error,
@@ -27,8 +27,8 @@ from smartcam.calibration.imaging.hand_eye_start import (
 )
 
 if TYPE_CHECKING:
-    from smartcam.calibration.imaging.hand_eye_fit import Setup
-    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.calibration.hand_eye.equations import Setup
+    from smartcam.calibration.views import TargetView
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
 ONE_LONG = [pytest.param("eye-in-hand", marks=pytest.mark.long), "eye-to-hand"]

@@ -9,17 +9,17 @@ import numpy as np
 from imaging_scenes import SHEET, scene
 
 from smartcam.calibration.formats.robots import ROBOTS, pose_to
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.hand_eye import HandEyeCalibration
-from smartcam.calibration.imaging.hand_eye_wizard import SUGGESTIONS, hand_eye_wizard
-from smartcam.calibration.imaging.rendering import render
-from smartcam.calibration.journal import Journal
-from smartcam.calibration.sequence import Session
+from smartcam.calibration.hand_eye.calibration import HandEyeCalibration
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation.images import render
+from smartcam.calibration.wizards.hand_eye import SUGGESTIONS, hand_eye_wizard
+from smartcam.calibration.wizards.journal import Journal
+from smartcam.calibration.wizards.sequence import Session
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.calibration.frames import Transform
+    from smartcam.calibration.geometry.frames import Transform
 
 CAMERA = CameraModel(size=(480, 360), matrix=np.array([[450.0, 0, 240], [0, 447, 176], [0, 0, 1]]))
 TRUTH = scene("eye-in-hand", poses=6, seed=7)

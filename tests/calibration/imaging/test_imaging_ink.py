@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.ink import Box, ink, outlines, quartered
-from smartcam.calibration.imaging.targets import Charuco, Checkerboard, CircleGrid, Target
-from smartcam.calibration.imaging.vector import Disc, Polygon
+from smartcam.calibration.printing.page import Disc, Polygon
+from smartcam.calibration.printing.shapes import Box, ink, outlines, quartered
+from smartcam.calibration.targets import Charuco, Checkerboard, CircleGrid, Target
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

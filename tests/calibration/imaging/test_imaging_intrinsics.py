@@ -11,15 +11,15 @@ from lenskit import BOARD, FISHEYE, LEFT, WIDE, poses, seen
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.bundle import lens_values
-from smartcam.calibration.imaging.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-from smartcam.calibration.imaging.targets import Charuco, Checkerboard
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.bundle import lens_values
+from smartcam.calibration.lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
+from smartcam.calibration.targets import Charuco, Checkerboard
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.calibration.views import TargetView
 
 
 @functools.cache

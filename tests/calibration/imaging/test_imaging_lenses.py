@@ -8,11 +8,11 @@ from lenskit import FISHEYE, LEFT, WIDE, poses, seen
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
-from smartcam.calibration.imaging.bundle import lens_values
-from smartcam.calibration.imaging.lenses import fit_lens, lens_basis, parameter_names
+from smartcam.calibration.lens.bundle import lens_values
+from smartcam.calibration.lens.start import fit_lens, lens_basis, parameter_names
 
 if TYPE_CHECKING:
-    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.lens.model import CameraModel
 
 
 @pytest.mark.parametrize(

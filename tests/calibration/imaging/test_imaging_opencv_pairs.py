@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from imaging_scenes import PAIRS_BOARD, check_pair
 
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.intrinsics import calibrate_intrinsics
-from smartcam.calibration.imaging.stereo import calibrate_stereo
-from smartcam.calibration.imaging.views import TargetView
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.lens.intrinsics import calibrate_intrinsics
+from smartcam.calibration.stereo.calibration import calibrate_stereo
+from smartcam.calibration.views import TargetView
 
 FOLDER = Path(os.environ.get("SMARTCAM_PAIRS", "/usr/share/doc/opencv-doc/examples/data"))
 NUMBERS = [number for number in range(1, 15) if number != 10]

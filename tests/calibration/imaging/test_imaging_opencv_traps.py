@@ -10,12 +10,12 @@ from imaging_scenes import CAMERA, refused, scene
 
 from smartcam.calibration import fit_plane
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.hand_eye import calibrate_hand_eye
-from smartcam.calibration.imaging.hand_eye_fit import RobotSigmas
-from smartcam.calibration.imaging.homography import fit_homography
+from smartcam.calibration.geometry.homography import fit_homography
+from smartcam.calibration.hand_eye.calibration import calibrate_hand_eye
+from smartcam.calibration.hand_eye.equations import RobotSigmas
 
 if TYPE_CHECKING:
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 SIGMAS = RobotSigmas(1e-4, 1e-4)
 METHODS = ("tsai", "park", "horaud", "andreff", "daniilidis")

@@ -10,20 +10,20 @@ from drawnkit import drawn
 from imaging_scenes import refused
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.lattices import lattices
-from smartcam.calibration.imaging.ordering import (
+from smartcam.calibration.detection.grid_growing import lattices
+from smartcam.calibration.detection.ordering import (
     Arrangement,
     arrangements,
     leftmost,
     marked,
     rows_of,
 )
-from smartcam.calibration.imaging.targets import Checkerboard, CircleGrid
+from smartcam.calibration.targets import Checkerboard, CircleGrid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration.geometry import Array
+    from smartcam.calibration.geometry.rotations import Array
 
 GRIDS = [
     (CircleGrid(columns=6, rows=4, spacing=0.02, diameter=0.01), 4, 2),

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from imaging_scenes import refused
 
-from smartcam.calibration.extra import load
-from smartcam.calibration.imaging import pictures
-from smartcam.calibration.imaging.pictures import PictureFolder, decode_picture
+from smartcam.calibration.optional_imports import load
+from smartcam.calibration.wizards import pictures
+from smartcam.calibration.wizards.pictures import PictureFolder, decode_picture
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.poses import locate
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.poses import locate
 
 if TYPE_CHECKING:
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.lens.model import CameraModel
 
 NEAR = Transform("camera", "target", TURNED, np.array([-0.1, 0.06, 0.5]))
 

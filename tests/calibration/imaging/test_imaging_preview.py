@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.preview import MAX_SIDE, cell_counts, draw
-from smartcam.calibration.imaging.targets import Checkerboard
-from smartcam.calibration.imaging.views import TargetView
+from smartcam.calibration.targets import Checkerboard
+from smartcam.calibration.views import TargetView
+from smartcam.calibration.wizards.target_drawing import MAX_SIDE, cell_counts, draw
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.sheets import Rays, Sheet, make_sheet
-from smartcam.calibration.imaging.targets import Charuco, Checkerboard, CircleGrid, Target
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.printing.sheets import Rays, Sheet, make_sheet
+from smartcam.calibration.targets import Charuco, Checkerboard, CircleGrid, Target
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

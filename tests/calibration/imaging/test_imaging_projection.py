@@ -7,7 +7,7 @@ import pytest
 from lenskit import FISHEYE, LEFT, WIDE
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration.imaging.projection import (
+from smartcam.calibration.lens.projection import (
     excess,
     linearize,
     pose_changes,
@@ -16,7 +16,7 @@ from smartcam.calibration.imaging.projection import (
 )
 
 if TYPE_CHECKING:
-    from smartcam.calibration.imaging.cameras import CameraModel
+    from smartcam.calibration.lens.model import CameraModel
 
 POINTS = np.array([[0.05, -0.04, 0.4], [-0.1, 0.08, 0.5], [0.0, 0.0, 0.3], [0.12, 0.1, 0.6]])
 STEP = 1e-6
@@ -35,7 +35,7 @@ def test_linearize_of_each_model_gives_the_derivatives(camera: CameraModel) -> N
 
 @pytest.mark.parametrize("camera", [LEFT, WIDE, FISHEYE], ids=lambda one: one.distortion_model)
 def test_linearize_of_each_model_gives_the_derivatives_by_the_lens(camera: CameraModel) -> None:
-    from smartcam.calibration.imaging.bundle import lens_values, with_lens
+    from smartcam.calibration.lens.bundle import lens_values, with_lens
 
     found, values = linearize(POINTS, camera).by_lens, lens_values(camera)
     for number, step in enumerate(STEP * np.eye(len(values))):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from imaging_scenes import off_plane
 
-from smartcam.calibration.imaging.detection import find_target
-from smartcam.calibration.imaging.targets import Charuco, CircleGrid
+from smartcam.calibration.detection.find import find_target
+from smartcam.calibration.targets import Charuco, CircleGrid
 
 DATA = os.environ.get("SMARTCAM_DATA")
 

@@ -10,13 +10,13 @@ from lenskit import FISHEYE, LEFT, RIG, RIGHT
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.rectification import rectify
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.stereo.rectification import rectify
 
 if TYPE_CHECKING:
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.cameras import CameraModel
-    from smartcam.calibration.imaging.rectification import Rectification
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.lens.model import CameraModel
+    from smartcam.calibration.stereo.rectification import Rectification
 
 POINTS = np.array([[0.05, -0.04, 0.4], [-0.05, 0.08, 0.5], [0.02, 0.01, 0.6]])
 

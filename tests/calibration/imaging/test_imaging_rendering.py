@@ -8,11 +8,11 @@ from drawnkit import BENT, FACING, STRAIGHT, facing
 from imaging_scenes import refused
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.cameras import CameraModel
-from smartcam.calibration.imaging.charucos import charuco_board
-from smartcam.calibration.imaging.rendering import render
-from smartcam.calibration.imaging.targets import Charuco, Checkerboard, CircleGrid
+from smartcam.calibration.detection.charucos import charuco_board
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.model import CameraModel
+from smartcam.calibration.simulation.images import render
+from smartcam.calibration.targets import Charuco, Checkerboard, CircleGrid
 
 UNIT = CameraModel(size=(60, 50), matrix=np.array([[1000, 0, 0], [0, 1000, 0], [0, 0, 1.0]]))
 """A pixel is a millimetre at a metre."""

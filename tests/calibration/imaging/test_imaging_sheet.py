@@ -24,26 +24,26 @@ from sheetkit import (
 )
 
 import smartcam
-from smartcam.calibration.imaging import simulation
-from smartcam.calibration.imaging.sheet import SheetCalibration, calibrate_sheet, fit_corners
-from smartcam.calibration.kinds import load_calibration
-from smartcam.calibration.services import CalibrationService
-from smartcam.calibration.store import write
+from smartcam.calibration.files.load import load_calibration
+from smartcam.calibration.files.store import write
+from smartcam.calibration.sheet.calibration import SheetCalibration, calibrate_sheet, fit_corners
+from smartcam.calibration.simulation import scenes
+from smartcam.calibration.wizards.services import CalibrationService
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.cameras import CameraModel
-    from smartcam.calibration.imaging.views import TargetView
-    from smartcam.calibration.plane import PlaneCalibration
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.lens.model import CameraModel
+    from smartcam.calibration.plane.calibration import PlaneCalibration
+    from smartcam.calibration.views import TargetView
 
 CORNERS = [0, 8, 45, 53, 22]
 
 
 def seen(camera: CameraModel = CAMERA, sigma: float = 0.0, seed: int = 1) -> TargetView:
-    return simulation.view(TARGET, camera, SEEN, sigma=sigma, random=np.random.default_rng(seed))
+    return scenes.view(TARGET, camera, SEEN, sigma=sigma, random=np.random.default_rng(seed))
 
 
 def touched(sigma: float = 0.0, seed: int = 1, scale: float = 1.0) -> PlaneCalibration:

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from lenskit import BOARD, LEFT, poses, seen
 
-from smartcam.calibration.imaging.bundle import Sight
-from smartcam.calibration.imaging.lenses import fit_lens
-from smartcam.calibration.imaging.sheet_shape import (
+from smartcam.calibration.lens.bundle import Sight
+from smartcam.calibration.lens.sheet_shape import (
     adjust_shape,
     as_meant,
     held_out_residuals,
     leave_out,
 )
+from smartcam.calibration.lens.start import fit_lens
 
 RANDOM = np.random.default_rng(11)
 OFF = BOARD.points + 2e-4 * RANDOM.normal(size=(54, 3))

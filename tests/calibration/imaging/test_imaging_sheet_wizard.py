@@ -13,10 +13,10 @@ import pytest
 import sheetkit
 from sheetkit import CAMERA, LIES, TARGET, Cell, begin, field, next_answer, say, truth
 
-from smartcam.calibration.imaging.rendering import render
-from smartcam.calibration.imaging.sheet import SheetCalibration
-from smartcam.calibration.imaging.targets import Checkerboard
-from smartcam.calibration.store import read_document
+from smartcam.calibration.files.store import read_document
+from smartcam.calibration.sheet.calibration import SheetCalibration
+from smartcam.calibration.simulation.images import render
+from smartcam.calibration.targets import Checkerboard
 
 
 async def go_to(session: Any, cell: Cell, step: str) -> dict[str, Any]:

@@ -13,16 +13,23 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.imaging.sheet_layout import BORDER
-from smartcam.calibration.imaging.sheets import Rays, Sheet, make_sheet, on_paper, page_size, scaled
-from smartcam.calibration.imaging.targets import (
+from smartcam.calibration.printing.page import Disc, Polygon, Text
+from smartcam.calibration.printing.page_layout import BORDER
+from smartcam.calibration.printing.sheets import (
+    Rays,
+    Sheet,
+    make_sheet,
+    on_paper,
+    page_size,
+    scaled,
+)
+from smartcam.calibration.targets import (
     Charuco,
     Checkerboard,
     CircleGrid,
     Target,
     target_from_data,
 )
-from smartcam.calibration.imaging.vector import Disc, Polygon, Text
 from smartcam.exceptions import CalibrationError
 
 GOLDEN = Path(__file__).parents[3] / "docs" / "sheet.svg"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from imaging_scenes import CAMERA, SHEET, refused, scene
 
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.hand_eye_fit import RobotSigmas, Setup
-from smartcam.calibration.imaging.simulation import around, view
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.hand_eye.equations import RobotSigmas, Setup
+from smartcam.calibration.simulation.scenes import around, view
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
 EXACT = RobotSigmas(0.0, 0.0)

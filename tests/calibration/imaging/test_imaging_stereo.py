@@ -12,19 +12,19 @@ from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.stereo import (
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.stereo.calibration import (
     StereoCalibration,
     calibrate_stereo,
     spacing_errors,
 )
-from smartcam.calibration.imaging.targets import Checkerboard, CircleGrid
+from smartcam.calibration.targets import Checkerboard, CircleGrid
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.calibration.geometry import Array
-    from smartcam.calibration.imaging.views import TargetView
+    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration.views import TargetView
 
 Views = list["TargetView | None"]
 

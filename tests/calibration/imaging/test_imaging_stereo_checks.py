@@ -7,9 +7,9 @@ from lenskit import pairs
 from scipy.spatial.transform import Rotation
 
 from smartcam.calibration.codes import Code
-from smartcam.calibration.frames import Transform
-from smartcam.calibration.imaging.bundle import Sight
-from smartcam.calibration.imaging.stereo_checks import check_fit, remark_sides
+from smartcam.calibration.geometry.frames import Transform
+from smartcam.calibration.lens.bundle import Sight
+from smartcam.calibration.stereo.checks import check_fit, remark_sides
 
 
 def test_check_fit_of_more_pixels_than_can_be_names_the_worst_views() -> None:

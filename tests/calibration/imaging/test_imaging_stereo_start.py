@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 from lenskit import LEFT, RIG, RIGHT, pairs
 
-from smartcam.calibration.imaging.stereo_start import Lenses, as_moments, start
+from smartcam.calibration.stereo.start import Lenses, as_moments, start
 
 
 def test_start_is_near_the_truth() -> None:

@@ -10,9 +10,9 @@ from lenskit import BOARD, LEFT, pairs, poses, seen
 
 from smartcam import CalibrationError
 from smartcam.calibration import Code
-from smartcam.calibration.imaging.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-from smartcam.calibration.imaging.stereo import StereoCalibration, calibrate_stereo
-from smartcam.calibration.imaging.stored_cameras import camera_from_data, camera_to_data
+from smartcam.calibration.files.cameras import camera_from_data, camera_to_data
+from smartcam.calibration.lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
+from smartcam.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
 
 if TYPE_CHECKING:
     from pathlib import Path

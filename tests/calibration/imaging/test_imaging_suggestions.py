@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartcam.calibration.imaging.suggestions import LOOKS, Look, outline
-from smartcam.calibration.imaging.targets import Checkerboard
+from smartcam.calibration.targets import Checkerboard
+from smartcam.calibration.wizards.view_suggestions import LOOKS, Look, outline
 
 TARGET = Checkerboard(columns=9, rows=6, square=0.025)
 SIZE = (640, 480)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from lenskit import FISHEYE, LEFT, RIG, RIGHT
 
-from smartcam.calibration.geometry import Array
-from smartcam.calibration.imaging.triangulation import epipolar_distances, triangulate
+from smartcam.calibration.geometry.rotations import Array
+from smartcam.calibration.stereo.triangulation import epipolar_distances, triangulate
 
 POINTS = np.array(
     [[0.05, -0.04, 0.4], [-0.1, 0.08, 0.5], [0.0, 0.0, 0.3], [0.12, 0.1, 0.6], [0.1, -0.1, 1.5]]

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from smartcam.calibration.imaging.vector import Disc, Page, Polygon, Text, pdf, rectangle, svg
+from smartcam.calibration.printing.page import Disc, Page, Polygon, Text, pdf, rectangle, svg
 
 SHAPES = (
     rectangle(10, 20, 30, 5),

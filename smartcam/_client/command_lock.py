@@ -1,0 +1,299 @@
+"""Whose turn it is: one command at a time, and going back after a temporary switch.
+
+Going back to the application before is a job of the session's task group: it is finished even
+when the caller was cancelled, it is bounded, and every later command waits for it. One that a lost
+link prevented is done first thing in the next session; so is restoring what was wanted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import LinkError, ResponseTimeoutError, SmartCamError
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Coroutine
+    from types import TracebackType
+    from typing import Any
+
+    from smartcam._client.requests import Conversation
+
+__all__ = ["Before", "Turn", "Turns"]
+
+logger: logging.Logger = logging.getLogger("smartcam.client")
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """What to go back to.
+
+    Attributes:
+        application: id of the application that was active.
+        running: whether it ran.
+        expected: the application that was named, if any.
+        wants_running: the run state that was asked for, if any.
+    """
+
+    application: int
+    running: bool
+    expected: int | None
+    wants_running: bool | None
+
+
+class Turn:
+    """One command's turn: ``async with turns.hold(timeout) as deadline``."""
+
+    __slots__ = ("_timeout", "_turns")
+
+    def __init__(self, turns: Turns, timeout: float) -> None:
+        self._turns = turns
+        self._timeout = timeout
+
+    def __aenter__(self) -> Coroutine[Any, Any, float]:
+        return self._turns.take(self._timeout)
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        self._turns.give_back()
+
+
+class Turns:
+    """Gives commands their turn.
+
+    Args:
+        talk: the conversation that the turn is about.
+        switch_timeout: bound of each switch, seconds.
+    """
+
+    def __init__(self, talk: Conversation, switch_timeout: float) -> None:
+        self._jobs: asyncio.TaskGroup | None = None  # of the session, None between two
+        self._owed: Before | None = None  # to go back to in the next session
+        self._talk = talk
+        self._switch_timeout = switch_timeout
+        self._lock = asyncio.Lock()
+        self._in_line = 0  # commands that wait for the lock
+        self._leaving: set[asyncio.Task[None]] = set()
+        self._failed: SmartCamError | None = None
+
+    # ------------------------------------------------------------------ for the supervisor
+
+    @contextlib.asynccontextmanager
+    async def session(self, *, restore: bool) -> AsyncGenerator[asyncio.TaskGroup]:
+        """A session is there as long as the body runs; ends when its jobs have.
+
+        Gives the group of the session's tasks.
+
+        Args:
+            restore: have the application and the run state again that were wanted.
+        """
+        async with asyncio.TaskGroup() as jobs:
+            self._jobs = jobs
+            try:
+                owed, self._owed = self._owed, None
+                if owed is not None:
+                    self._start_job("going_back", self._go_back(owed))
+                elif restore:
+                    self._start_job("restoring", self._restore())
+                yield jobs
+            finally:
+                self._jobs = None
+
+    async def vacated(self) -> None:
+        """Wait until every command of the session that is over has noticed; bounded."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._switch_timeout), self._lock:
+                pass
+
+    # ------------------------------------------------------------------ for commands
+
+    def hold(self, timeout: float) -> Turn:
+        """Hold the turn with ``async with``; it gives the deadline, the wait for it included.
+
+        Raises:
+            ResponseTimeoutError: others had it for ``timeout`` seconds.
+            SmartCamError: going back failed before this command, and why.
+        """
+        return Turn(self, timeout)
+
+    @contextlib.asynccontextmanager
+    async def hold_in(self, application: int, timeout: float) -> AsyncGenerator[float]:
+        """Hold the turn with ``application`` running; gives the deadline.
+
+        Afterwards the application before is back; after an error or a cancellation that goes on
+        behind the caller's back.
+        """
+        self._talk.deadline(timeout)  # a wrong one is refused before anything is switched
+        async with self.hold(self._switch_timeout) as switch_deadline:
+            before = await self.enter(application, switch_deadline)
+            try:
+                yield self._talk.deadline(timeout)
+            finally:
+                going_back = self.leave(before)
+        if going_back is not None:
+            await asyncio.wait({going_back})
+
+    async def take(self, timeout: float) -> float:
+        """Take the turn and return the deadline; for :class:`Turn`, which gives it back."""
+        talk = self._talk
+        deadline = talk.deadline(timeout)
+        talk.require_link()
+        if self._lock.locked() or self._in_line or self._leaving:
+            await self._take_in_line(deadline, timeout)
+        else:
+            await self._lock.acquire()  # it is free
+        try:
+            talk.require_link()  # it may have been lost meanwhile
+            self._raise_failed()
+            if talk.unconfirmed:
+                await talk.catch_up(deadline)
+        except BaseException:
+            self._lock.release()
+            raise
+        return deadline
+
+    def give_back(self) -> None:
+        """Give the turn to the next in line."""
+        self._lock.release()
+
+    async def _take_in_line(self, deadline: float, timeout: float) -> None:
+        self._in_line += 1
+        try:
+            async with asyncio.timeout_at(deadline):
+                await self._acquire()
+        except TimeoutError as exc:
+            raise ResponseTimeoutError(
+                f"{self._talk.name}: another command had the camera for {timeout:g} s",
+                waited=timeout,
+            ) from exc
+        finally:
+            self._in_line -= 1
+
+    async def enter(self, application: int, deadline: float) -> Before:
+        """Have ``application`` running; the turn is held. Goes back where that fails."""
+        talk = self._talk
+        active = await talk.query_loaded(deadline)
+        running = talk.runs
+        before = Before(active, running, talk.inbox.expected, talk.wants_running)
+        try:
+            await talk.ensure(application, deadline)
+        except BaseException:
+            self.leave(before)
+            raise
+        return before
+
+    def leave(self, before: Before) -> asyncio.Task[None] | None:
+        """Go back as soon as the turn is free; in the next session, and None, where there is none.
+
+        Whoever left first is done last: of several that are owed the outermost counts.
+        """
+        if self._jobs is None or self._talk.inbox.end is not None:
+            self._owe(before)
+            return None
+        return self._start_job("going_back", self._go_back(before))
+
+    def _start_job(self, what: str, job: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
+        if self._jobs is None:
+            job.close()
+            return None
+        task = self._jobs.create_task(job, name=f"smartcam[{self._talk.name}].{what}")
+        self._leaving.add(task)
+        task.add_done_callback(self._leaving.discard)
+        return task
+
+    async def leave_and_wait(self, before: Before) -> None:
+        """Go back, and raise what stood in the way.
+
+        Cancellation: going back is finished nevertheless.
+        """
+        job = self.leave(before)
+        if job is not None:
+            await asyncio.wait({job})
+            self._raise_failed()
+
+    async def settle(self) -> None:
+        """Wait until every job that goes back is done.
+
+        Each is bounded by the switch timeout once it has the turn; who had it before may take
+        longer, so the caller has a deadline of its own.
+        """
+        while self._leaving:
+            await asyncio.wait(self._leaving)
+
+    def _owe(self, before: Before) -> None:
+        """Keep what the next session is to go back to."""
+        self._owed = before
+        self._talk.inbox.expected = before.expected
+        self._talk.wants_running = before.wants_running
+
+    async def _go_back(self, before: Before) -> None:
+        """Restore application and run state; never raises."""
+        talk = self._talk
+        async with self._lock:
+            try:
+                await self._have(before.application, before.running)
+            except SmartCamError as error:
+                logger.warning("%s ! going back failed: %s", talk.name, error)
+                if self._is_loss(error):
+                    self._owe(before)
+                else:
+                    self._failed = error
+            finally:
+                talk.inbox.expected = before.expected
+                talk.wants_running = before.wants_running
+
+    async def _restore(self) -> None:
+        """Have the application that was named, and the run state that was asked for; never raises.
+
+        Where the link is lost again the next session does it.
+        """
+        talk = self._talk
+        wanted = talk.inbox.expected, talk.wants_running
+        async with self._lock:
+            try:
+                await self._have(*wanted)
+            except SmartCamError as error:
+                logger.warning("%s ! restoring failed: %s", talk.name, error)
+                if not self._is_loss(error):
+                    self._failed = error
+            finally:
+                talk.inbox.expected, talk.wants_running = wanted
+
+    def _is_loss(self, error: SmartCamError) -> bool:
+        """Whether the link is lost, an answer that did not come included: it costs the link."""
+        link = self._talk.link
+        return isinstance(error, LinkError) or (link is not None and link.lost)
+
+    async def _have(self, application: int | None, running: bool | None) -> None:
+        """Have an application and a run state, by the least that is needed; None: as it is."""
+        talk = self._talk
+        deadline = talk.deadline(self._switch_timeout)
+        active = await talk.query_loaded(deadline)
+        if application is not None and active != application:
+            await talk.switch(application, deadline, start=running is True)
+        elif running and Status.RUNNING not in talk.status:
+            await talk.start(deadline)
+        elif running is False and Status.RUNNING in talk.status:
+            await talk.stop(deadline)
+
+    async def _acquire(self) -> None:
+        """Take the lock, but behind every job that goes back.
+
+        Who had the turn before may have left such a job behind while this command was in line.
+        """
+        while True:
+            await self.settle()
+            await self._lock.acquire()
+            if not self._leaving:
+                return
+            self._lock.release()
+
+    def _raise_failed(self) -> None:
+        error, self._failed = self._failed, None
+        if error is not None:
+            raise error

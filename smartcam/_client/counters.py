@@ -1,0 +1,122 @@
+"""What a client counts, over all its sessions."""
+
+from __future__ import annotations
+
+import bisect
+import collections
+import dataclasses
+from typing import TYPE_CHECKING
+
+from smartcam.models import HISTOGRAM_BOUNDS, Histogram, Statistics
+from smartcam.protocols.framed.machine import Counters
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from smartcam.models import SubscriberStatistics
+
+__all__ = ["Account", "Times"]
+
+
+class Times:
+    """Collects times for a :class:`~smartcam.models.Histogram`."""
+
+    __slots__ = ("_counts", "_longest", "_shortest", "_total")
+
+    def __init__(self) -> None:
+        self._counts = [0] * (len(HISTOGRAM_BOUNDS) + 1)
+        self._total = 0.0
+        self._shortest = float("inf")
+        self._longest = float("-inf")
+
+    def add(self, seconds: float) -> None:
+        """Count one."""
+        self._counts[bisect.bisect_left(HISTOGRAM_BOUNDS, seconds)] += 1
+        self._total += seconds
+        if seconds < self._shortest:
+            self._shortest = seconds
+        if seconds > self._longest:
+            self._longest = seconds
+
+    def histogram(self) -> Histogram:
+        """Return what was counted so far."""
+        some = self._longest >= self._shortest
+        return Histogram(
+            HISTOGRAM_BOUNDS,
+            tuple(self._counts),
+            self._total,
+            self._shortest if some else None,
+            self._longest if some else None,
+        )
+
+
+class Account:
+    """The account of one client.
+
+    Attributes:
+        fates: what became of result containers; their sum is ``received``.
+        received: containers that came.
+        empty_slots: all-zero records that interpreters skipped.
+        extra_results: containers for a trigger that had its results already.
+        inspections_by_others: inspections that something else has triggered.
+        overtriggers: times the Overtriggered bit rose.
+        sessions: sessions made.
+        last_error: text of the last error of a link.
+        round_trip: request to answer, seconds.
+        processing: trigger to result, seconds.
+    """
+
+    def __init__(self) -> None:
+        self.fates: collections.Counter[str] = collections.Counter()
+        self.received: int = 0
+        self.empty_slots: int = 0
+        self.extra_results: int = 0
+        self.inspections_by_others: int = 0
+        self.overtriggers: int = 0
+        self.sessions: int = 0
+        self.last_error: str | None = None
+        self.round_trip: Times = Times()
+        self.processing: Times = Times()
+        self._wire = Counters()  # of the links that are over
+        self._open: Counters | None = None
+
+    def count(self, fate: str, containers: int = 1) -> None:
+        """Count containers with what became of them, in one step: the sum always holds."""
+        self.received += containers
+        self.fates[fate] += containers
+
+    def begin(self, wire: Counters) -> None:
+        """Count a session, and what goes over its link from now on."""
+        self.end()
+        self.sessions += 1
+        self._open = wire
+
+    def end(self) -> None:
+        """The link is over; its counters are kept."""
+        self._wire, self._open = self._wire_total(), None
+
+    def statistics(self, subscribers: Iterable[SubscriberStatistics]) -> Statistics:
+        """Return everything counted so far."""
+        wire = dataclasses.asdict(self._wire_total())
+        wire["ignored_datagrams"] = wire.pop("ignored_frames")
+        return Statistics(
+            received=self.received,
+            **self.fates,
+            **wire,
+            empty_slots=self.empty_slots,
+            extra_results=self.extra_results,
+            inspections_by_others=self.inspections_by_others,
+            overtriggers=self.overtriggers,
+            sessions=self.sessions,
+            reconnects=max(0, self.sessions - 1),
+            last_error=self.last_error,
+            round_trip=self.round_trip.histogram(),
+            processing=self.processing.histogram(),
+            subscribers=list(subscribers),
+        )
+
+    def _wire_total(self) -> Counters:
+        if self._open is None:
+            return self._wire
+        both = zip(dataclasses.astuple(self._wire), dataclasses.astuple(self._open), strict=True)
+        return Counters(*(one + other for one, other in both))

@@ -1,0 +1,436 @@
+"""Making a session: fresh links, one after the other, until one answers as a camera does.
+
+Each attempt sends Disconnect (harmless without a session; old sessions confuse the camera, thesis
+3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
+Query. Anything unexpected, silence included, ends the attempt: close, fresh link, next attempt. To
+a camera that hangs up without a byte, the next attempt is made without the Disconnect.
+Where no dialect is pinned, attempts take turns through the protocol's dialects. Those that begin a
+session alike share an attempt: the answer to Connect, and what follows, tells them apart.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import operator
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam._client.link import Chunk, Link, open_link
+from smartcam.exceptions import (
+    CommandRejectedError,
+    ConfigurationError,
+    ConnectFailedError,
+    RemoteProtocolError,
+    SmartCamError,
+)
+from smartcam.protocols.base import Dialect, Protocol, Transport, Verdict
+from smartcam.protocols.framed.machine import LinkEnded, LinkFailed
+from smartcam.protocols.messages import (
+    Connect,
+    ConnectAnswer,
+    Disconnect,
+    GetStatus,
+    Query,
+    QueryAnswer,
+    ResultContainer,
+    StatusReport,
+    UnknownMessage,
+)
+from smartcam.registry import PROTOCOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from smartcam._client.link import TraceEntry
+    from smartcam.protocols.messages import Message
+    from smartcam.settings import Address, CameraSettings
+
+__all__ = [
+    "Session",
+    "Try",
+    "attempt",
+    "code_text",
+    "establish",
+    "load_protocol",
+    "names_of",
+    "tries_for",
+]
+
+logger: logging.Logger = logging.getLogger("smartcam.handshake")
+
+DETECTION_SHARE = 0.5
+"""Seconds for the answer to Connect in the first round while other dialects are still untried. A
+camera answers in milliseconds, one that speaks another dialect is silent; later rounds have the
+rest of the time, for slow links."""
+
+TELLING_ROUNDS = 3
+"""Questions for the status that a camera must have answered, each, to be one that answers them."""
+
+BUSY_PAUSE = 0.05
+"""Seconds until a camera that was too busy to name its application is asked again."""
+
+
+MAX_EARLY = 1 << 20
+"""Bytes that may come while a session is made, beside one frame of ``max_length``. Making one takes
+a few round trips, and the fastest camera sends a fraction of it meanwhile."""
+
+
+OPENING = "opening the link"
+CONNECTING = "waiting for the answer to Connect"
+
+
+class Session(NamedTuple):
+    """A link with a session on it.
+
+    Attributes:
+        link: the link.
+        address: where it leads, with the dialect pinned.
+        dialect: what is spoken.
+        version: protocol version from the Connect answer.
+        early: every chunk that came meanwhile, in order: the first status, and whatever else the
+            camera had to say.
+    """
+
+    link: Link
+    address: Address
+    dialect: Dialect
+    version: int
+    early: list[Chunk]
+
+
+@dataclass(slots=True)
+class Try:
+    """One attempt: what was tried and how far it came.
+
+    Attributes:
+        dialect: that was spoken; those that begin a session alike until it is known which.
+        transport: ``tcp`` or ``udp``.
+        step: what was waited for at last.
+        outcome: what came of it.
+        received: bytes that came.
+        hung_up: the other side ended the link without a byte.
+        on_step: called with each new step.
+    """
+
+    dialect: str
+    transport: str
+    step: str = OPENING
+    outcome: str = ""
+    received: int = 0
+    hung_up: bool = False
+    on_step: Callable[[str], None] | None = None
+
+    def reach(self, step: str) -> None:
+        """Note that this is what is waited for now."""
+        self.step = step
+        if self.on_step is not None:
+            self.on_step(step)
+
+    def end(self, error: Exception, waited: float) -> None:
+        """Note what it ended with; ``UnicodeError`` stands for what is no host name."""
+        timeout = isinstance(error, TimeoutError)
+        self.hung_up = self.step == CONNECTING and not timeout and not self.received
+        if isinstance(error, TimeoutError) and not isinstance(error, SmartCamError):
+            what = f"{self.received} bytes, then silence" if self.received else "silence"
+            self.outcome = f"{what} for {waited:.1f} s"
+        elif isinstance(error, OSError) and error.errno is not None and error.errno > 0:
+            self.outcome = os.strerror(error.errno)  # asyncio's own text is "Connect call failed"
+        else:
+            self.outcome = str(error)
+
+    def __str__(self) -> str:
+        """One line for an error text."""
+        return f"{self.dialect} over {self.transport.upper()}: {self.step}: {self.outcome}"
+
+
+@dataclass(slots=True)
+class _Collector:
+    """Takes events until a wanted one is there; keeps the rest for the client.
+
+    Attributes:
+        link: where they come from.
+        most: bytes that may come meanwhile.
+    """
+
+    link: Link
+    most: int
+    early: list[Chunk] = field(default_factory=list[Chunk])
+    version: int | None = None
+    statuses: int = 0
+    answers: int = 0  # to Query, whatever they say
+    application: int | None = None
+
+    async def take(self) -> None:
+        chunk = await self.link.receive()
+        received = self.link.machine.counters.bytes_received
+        if received > self.most:
+            raise RemoteProtocolError(
+                f"{received} bytes came before there was a session; {self.most} are accepted"
+            )
+        self.early.append(chunk)
+        dialect = self.link.machine.dialect
+        for event in chunk.events:
+            match event:
+                case ConnectAnswer(code=code, version=version):
+                    if dialect.code(code, Connect).verdict is not Verdict.DONE:
+                        said = "the camera refused the session: "
+                        said += code_text(dialect, code, Connect)
+                        if dialect.has_login:
+                            raise CommandRejectedError(said, code=code)
+                        raise RemoteProtocolError(said)
+                    if version < 1:
+                        raise RemoteProtocolError(f"the camera speaks protocol version {version}")
+                    self.version = version
+                case StatusReport():
+                    self.statuses += 1
+                case QueryAnswer(code=code, application=application):
+                    self.answers += 1
+                    done = dialect.code(code).verdict is Verdict.DONE
+                    self.application = application if done else None
+                case ResultContainer():
+                    pass
+                case LinkFailed(error=error):
+                    raise error
+                case LinkEnded(pending=pending):
+                    more = f" in the middle of a frame ({pending} bytes of it)" if pending else ""
+                    raise RemoteProtocolError(f"the other side closed the connection{more}")
+                case _:
+                    logger.debug("%s ! %s during connect", self.link.name, type(event).__name__)
+
+    async def ask(self, *first: Message) -> None:
+        """Send a Query behind ``first`` and wait for its answer."""
+        before = self.answers
+        self.link.send(*first, answered=False)
+        self.link.send(Query())
+        while self.answers == before:
+            await self.take()
+
+    async def tell_apart(self) -> None:
+        """Find out which of its kin the camera speaks: who answers Get status, or not.
+
+        A status may also come by itself, so it must come to each of several questions.
+        """
+        machine, reader = self.link.machine, self.link.machine.dialect
+        asking = [dialect for dialect in machine.kin if dialect.has(GetStatus)]
+        others = [dialect for dialect in machine.kin if not dialect.has(GetStatus)]
+        if asking and others:
+            # one that goes on without an answer is certain where no message is lost
+            certain = 1 if machine.transport is Transport.TCP else 2
+            number = asking[0].message_id(GetStatus)
+            known = reader.has(GetStatus)
+            question = GetStatus() if known else UnknownMessage(message_id=number, payload=b"")
+            answered = unanswered = 0
+            while answered < TELLING_ROUNDS and unanswered < certain:
+                before = self.statuses
+                await self.ask(question)
+                told = self.statuses > before
+                answered, unanswered = answered + told, 0 if told else unanswered + 1
+            machine.adopt((others if unanswered else asking)[0])
+        else:
+            machine.adopt(machine.kin[0])
+        for chunk in self.early:
+            chunk.events[:] = [
+                machine.dialect.restate(event, reader) if isinstance(event, StatusReport) else event
+                for event in chunk.events
+            ]
+
+
+def code_text(dialect: Dialect, code: int, request: type[Message] | None = None) -> str:
+    """Return what a result code says in the answer to a request."""
+    number = f"{code:#04x}" if code >= 0 else str(code)
+    return f"code {number} ({dialect.code(code, request).text})"
+
+
+def load_protocol(name: str) -> Protocol:
+    """Return the protocol of this name.
+
+    Raises:
+        PluginError: unknown, or it failed to load.
+        ConfigurationError: the entry point gives something else.
+    """
+    protocol = PROTOCOLS.load(name)
+    if not isinstance(protocol, Protocol):
+        raise ConfigurationError(f"entry point {name!r} gives {protocol!r}, not a Protocol")
+    return protocol
+
+
+async def attempt(
+    address: Address,
+    dialects: Sequence[Dialect],
+    transport: Transport,
+    *,
+    progress: Try,
+    name: str,
+    max_length: int,
+    trace: Callable[[TraceEntry], None] | None = None,
+    disconnect_first: bool = True,
+    liveness_timeout: float | None = None,
+) -> Session:
+    """Make a session over one fresh link; bounded by the caller's deadline.
+
+    Args:
+        address: where the camera is.
+        dialects: one, or several that begin a session alike.
+        transport: TCP or UDP.
+        progress: is told how far it came.
+        name: of the camera, for logs.
+        max_length: largest payload accepted, bytes.
+        trace: called with every frame.
+        disconnect_first: send Disconnect before Connect.
+        liveness_timeout: see :class:`~smartcam._client.link.Link`.
+
+    Raises:
+        OSError: no link.
+        SmartCamError: the link ended, or what came was no camera's answer.
+    """
+    link = await open_link(
+        load_protocol(address.protocol),
+        dialects,
+        transport,
+        address.host,
+        address.port,
+        name=name,
+        max_length=max_length,
+        trace=trace,
+        liveness_timeout=liveness_timeout,
+    )
+    collector = _Collector(link, MAX_EARLY + max_length)
+    try:
+        link.send(*([Disconnect()] if disconnect_first else []), Connect())
+        progress.reach(CONNECTING)
+        while collector.version is None:
+            await collector.take()
+        if len(link.machine.kin) > 1:
+            progress.reach("finding out the dialect")
+            await collector.tell_apart()
+        dialect = link.machine.dialect
+        progress.dialect = dialect.label
+        progress.reach("waiting for the first status")
+        if not collector.statuses and not dialect.capabilities.status_by_itself:
+            link.send(GetStatus(), answered=False)
+        while not collector.statuses:
+            await collector.take()
+        progress.reach("waiting for the answer to Query")
+        await collector.ask()
+        while collector.application is None:
+            await asyncio.sleep(BUSY_PAUSE)
+            await collector.ask()
+    except BaseException as exc:
+        link.give_up(exc)
+        raise
+    finally:
+        progress.received = link.machine.counters.bytes_received
+    if collector.version > 1:
+        logger.warning("%s ! protocol version %d is newer than 1", name, collector.version)
+    pinned = address._replace(dialect=dialect.name, quirks=dialect.quirks)
+    return Session(link, pinned, dialect, collector.version, collector.early)
+
+
+def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
+    """Return what to try at an address, each on a fresh link."""
+    protocol = load_protocol(address.protocol)
+    return protocol.tries(
+        protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
+    )
+
+
+def names_of(dialects: Sequence[Dialect]) -> str:
+    """Return the names of dialects that begin a session alike."""
+    return " or ".join(dict.fromkeys(dialect.name for dialect in dialects))
+
+
+async def establish(
+    settings: CameraSettings, trace: Callable[[TraceEntry], None] | None = None
+) -> Session:
+    """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.
+
+    Raises:
+        ConnectFailedError: names each attempt and what came.
+
+    Cancellation: the link that was being made is dropped.
+    """
+    address = settings.address
+    protocol = load_protocol(address.protocol)
+    transport = protocol.schemes[address.scheme]
+    groups = tries_for(address)
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + settings.connect_timeout
+    tries: list[Try] = []
+    cause: BaseException | None = None
+    disconnect_first = True
+    for left in range(settings.connect_attempts, 0, -1):
+        end = loop.time() + (deadline - loop.time()) / left
+        hurried = len(groups) > 1 and left == settings.connect_attempts > 1
+        for position, dialects in enumerate(groups):
+            begin, untried = loop.time(), len(groups) - position
+            progress = Try(names_of(dialects), transport.value)
+            tries.append(progress)
+            try:
+                async with asyncio.timeout_at(end) as limit:
+                    progress.on_step = _sharer(limit, end, untried, hurried=hurried)
+                    return await attempt(
+                        address,
+                        dialects,
+                        transport,
+                        progress=progress,
+                        name=settings.name,
+                        max_length=settings.max_length,
+                        trace=trace,
+                        disconnect_first=disconnect_first,
+                        liveness_timeout=settings.liveness_timeout,
+                    )
+            except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
+                progress.end(exc, loop.time() - begin)
+                cause = exc
+            if progress.hung_up:
+                # perhaps at the Disconnect: then the next link does without, and so by turns
+                disconnect_first = not disconnect_first
+            logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
+            if isinstance(cause, CommandRejectedError):
+                groups = []  # it said no, and would again
+                break
+            if progress.step == OPENING:
+                break  # no link, so another dialect would fare no better in this round
+            if progress.step != CONNECTING:
+                groups = [dialects]  # it answered the Connect: that is its dialect
+                break
+    raise ConnectFailedError(
+        f"{settings.name}: no session with {address.url}: {_folded(tries)}",
+        host=address.host,
+        port=address.port,
+        attempts=tuple(f"attempt {number}: {one}" for number, one in enumerate(tries, 1)),
+    ) from cause
+
+
+def _sharer(
+    limit: asyncio.Timeout, end: float, untried: int, *, hurried: bool
+) -> Callable[[str], None]:
+    """Return what gives each step of an attempt its time, in a round that is over at ``end``.
+
+    Only the answer to Connect has to leave time for the dialects that are untried, this one
+    included: no link is none for any of them, and who answered speaks this one.
+    """
+    loop = asyncio.get_running_loop()
+
+    def on_step(step: str) -> None:
+        when = end
+        if step == CONNECTING:
+            share = (end - loop.time()) / untried
+            when = loop.time() + (min(share, DETECTION_SHARE) if hurried else share)
+        limit.reschedule(when)
+
+    return on_step
+
+
+def _folded(tries: list[Try]) -> str:
+    """Return what came of all attempts, those with the same outcome in a row as one."""
+    parts: list[str] = []
+    numbered = enumerate(map(str, tries), 1)
+    for text, group in itertools.groupby(numbered, key=operator.itemgetter(1)):
+        first, *more = [number for number, _ in group]
+        which = f"attempts {first} to {more[-1]}" if more else f"attempt {first}"
+        parts.append(f"{which}: {text}")
+    return "; ".join(parts)

@@ -1,0 +1,486 @@
+"""One TCP or UDP link to a camera, used once.
+
+The transport hands bytes to the machine of ``protocols/``. What comes out waits in a bounded queue,
+a chunk of events a delivery, for the receive task, which takes one chunk in a turn of the event
+loop (:meth:`Link.receive`). So nothing that a chunk causes runs in the transport's callbacks, and a
+camera that floods takes no more of a turn than others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import logging
+import socket
+from datetime import UTC, datetime
+from time import thread_time
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._client.doorbell import Doorbell
+from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
+from smartcam.protocols.base import Dialect, Role, Transport
+from smartcam.protocols.framed.machine import Event, LinkFailed, LinkMachine, ResultBurst, State
+from smartcam.protocols.messages import Disconnect, Message, Sender
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from smartcam.protocols.base import Protocol
+    from smartcam.protocols.framed.framing import Frame
+
+__all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
+
+logger: logging.Logger = logging.getLogger("smartcam.connection")
+
+MAX_CHUNKS = 2
+"""Chunks that wait for the receive task before TCP stops reading; it does so sooner where one is
+more than the task takes in a turn. It reads on when none is left: a camera that is faster than its
+results can be told has to wait itself."""
+
+MAX_DATAGRAMS = 256
+"""Datagrams that wait for it, where one is normal; beyond this they are dropped and counted."""
+
+TURN = 0.0002
+"""Seconds of the processor that the receive task takes in one turn of the event loop, about: from
+how long a chunk took follows how much the next one holds."""
+
+LEAST_CHUNK = 8
+"""Frames of a chunk that are worth to be cut."""
+
+FIRST_CHUNK = 64
+"""Frames of a chunk as long as it is not known how long they take."""
+
+LARGEST_CHUNK = 512
+"""Frames of a chunk, however fast they are worked off: the next ones may take longer."""
+
+MAX_REST = 256
+"""Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
+
+
+class Chunk(NamedTuple):
+    """Events that one delivery of bytes gave, or some of them.
+
+    Attributes:
+        received_at: loop time when it came.
+        events: what it gave, in order.
+        frames: in how many frames the events came; an event may be made of many (In-Sight).
+    """
+
+    received_at: float
+    events: list[Event]
+    frames: int = 1
+
+
+class TraceEntry(NamedTuple):
+    """One frame as ``--trace`` writes it.
+
+    Attributes:
+        at: when, UTC.
+        camera: name of the camera.
+        direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
+            unfinished frame when the link ended.
+        message_id: id on the wire, None for broken bytes and where there are no such ids.
+        message: name of the message, or the error's text for broken bytes.
+        fields: decoded body, None where it cannot be decoded.
+        hex: the bytes.
+    """
+
+    at: datetime
+    camera: str
+    direction: str
+    message_id: int | None
+    message: str
+    fields: Any
+    hex: str
+
+
+class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
+    """One link. Made by :func:`open_link`; when it ends, a new one is made.
+
+    Args:
+        machine: the protocol's client side.
+        name: the camera's name, for logs and errors.
+        host: address of the camera.
+        port: its port.
+        liveness_timeout: seconds after which the system, too, gives up a peer that acknowledges
+            nothing (TCP keep-alive and user timeout, where it has them); None for its own default.
+
+    Attributes:
+        heard_at: loop time of the last byte received.
+    """
+
+    def __init__(
+        self,
+        machine: LinkMachine,
+        *,
+        name: str,
+        host: str,
+        port: int,
+        liveness_timeout: float | None = None,
+    ) -> None:
+        self.machine = machine
+        self.name = name
+        self.host = host
+        self.port = port
+        self._liveness_timeout = liveness_timeout
+        self._loop = asyncio.get_running_loop()
+        self.heard_at: float = self._loop.time()
+        self._transport: Any = None
+        self._replies = machine.replies
+        self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
+        self._chunks: collections.deque[Chunk] = collections.deque()
+        self._frames = 0  # that came until the last chunk
+        self._most = FIRST_CHUNK  # frames of the next chunk
+        self._busy_since: float | None = None  # with the last chunk, where it was a large one
+        self._busy_with = 0
+        self._doorbell = Doorbell(self._loop)  # of the task that receives
+        self._closed: asyncio.Future[None] = self._loop.create_future()
+        self._loss: BaseException | None = None
+        self._writable = asyncio.Event()
+        self._writable.set()
+        self._closing = False
+        self._paused = False
+
+    # ------------------------------------------------------------------ for the client
+
+    def send(self, *messages: Message, answered: bool | None = None) -> None:
+        """Write messages at once: one write on TCP, a datagram each on UDP.
+
+        Args:
+            *messages: what to say.
+            answered: whether they are answered, where the protocol does not know.
+
+        Raises:
+            LocalProtocolError: the protocol's state forbids one; those before it were written.
+            ConnectionLostError: the link is gone.
+        """
+        if self._closed.done() or self._loss is not None:
+            raise self.lost_error()
+        try:
+            for message in messages:
+                self.machine.send(message, answered=answered)
+        finally:
+            self._flush()
+
+    @property
+    def writable(self) -> bool:
+        """Whether the transport takes more at once: :meth:`drain` would not wait."""
+        return self._writable.is_set()
+
+    async def drain(self) -> None:
+        """Wait until the transport takes more; bounded by the caller's deadline."""
+        await self._writable.wait()
+
+    async def receive(self) -> Chunk:
+        """Return the next chunk, one in a turn of the event loop; waits as long as the link lives.
+
+        Raises:
+            ConnectionLostError: the link is gone and every chunk was taken.
+
+        Cancellation: safe, nothing is lost.
+        """
+        if self._busy_since is not None:
+            self._adapt(self._busy_since)
+        if self._chunks:
+            await asyncio.sleep(0)  # others have their turn
+        while not self._chunks:
+            if self._loss is not None:
+                raise self.lost_error()
+            await self._doorbell
+        chunk = self._chunks.popleft()
+        if chunk.frames > self._most:
+            chunk, rest = split(chunk, self._most)
+            if rest.events:
+                self._chunks.appendleft(rest)
+        if chunk.frames >= LEAST_CHUNK:
+            self._busy_since, self._busy_with = thread_time(), chunk.frames
+        if self._paused and not self._chunks:
+            self._resume()
+        return chunk
+
+    async def close(self, timeout: float) -> None:
+        """Send Disconnect, end the link in order, within ``timeout`` seconds; else abort it.
+
+        On TCP the sending side is closed first and the camera's end awaited: closing a socket with
+        unread bytes in it sends a reset, which can overtake the Disconnect.
+        Cancellation: aborts the link.
+        """
+        self._closing = True
+        try:
+            if self._transport is None or self._closed.done():
+                return
+            self._say_goodbye()
+            if self.machine.transport is Transport.UDP:
+                self._transport.close()
+            elif not self._transport.is_closing():
+                self._resume()
+                with contextlib.suppress(OSError):  # it was reset just now
+                    self._transport.write_eof()
+            await asyncio.wait({self._closed}, timeout=timeout)
+        finally:
+            self.abort()
+
+    def abort(self, reason: BaseException | None = None) -> None:
+        """Drop the link at once; ``reason`` is what the receive task and writers are told."""
+        self._lose(reason or ConnectionAbortedError("closed by this side"))
+        if self._transport is not None:
+            self._transport.abort()
+
+    def give_up(self, reason: BaseException) -> None:
+        """Drop the link at once, but say Disconnect first where there is a session."""
+        if self._transport is not None and not self._transport.is_closing():
+            self._say_goodbye()
+        self.abort(reason)
+
+    def lost_error(self) -> ConnectionLostError:
+        """Return what the receive task and writers are told when the link is gone."""
+        where = "" if self.name == self.peer else f" to {self.peer}"
+        error = ConnectionLostError(
+            f"{self.name}: the link{where} is gone: {self._loss}",
+            host=self.host,
+            port=self.port,
+        )
+        error.__cause__ = self._loss
+        return error
+
+    async def wait_closed(self, timeout: float) -> None:
+        """Wait until the link is over, ``timeout`` seconds at most."""
+        await asyncio.wait({self._closed}, timeout=timeout)
+
+    @property
+    def lost(self) -> bool:
+        """Whether it is gone; chunks that came before may still wait to be taken."""
+        return self._loss is not None
+
+    @property
+    def peer(self) -> str:
+        """``host:port`` of the camera."""
+        return f"{self.host}:{self.port}"
+
+    # ------------------------------------------------------------------ transport callbacks
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """asyncio: the link is open."""
+        self._transport = transport
+        sock = transport.get_extra_info("socket")
+        if sock is not None and self.machine.transport is Transport.TCP:
+            # the camera sets it and advises it (SC manual p. 40: published)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if self._liveness_timeout is not None:
+                _keep_alive(sock, self._liveness_timeout)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """asyncio: where the next bytes of a TCP link go."""
+        return self.machine.room()
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """asyncio: bytes of a TCP link."""
+        self.heard_at = self._loop.time()
+        if self.machine.filled(nbytes, self.heard_at):
+            self._hand_on()
+        if self._replies and self._loss is None:
+            self._flush()
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        """asyncio: a datagram of a UDP link."""
+        self.heard_at = self._loop.time()
+        if len(self._chunks) >= MAX_DATAGRAMS:
+            self.machine.counters.ignored_frames += 1
+            return
+        self.machine.receive_data(data)
+        self._hand_on()
+
+    def eof_received(self) -> None:
+        """asyncio: the camera will send no more."""
+        self._show_rest()
+        self.machine.receive_eof()
+        self._hand_on()
+        self._lose(ConnectionResetError("the camera closed the connection"))
+
+    def error_received(self, exc: Exception) -> None:
+        """asyncio: the system refused a datagram: nothing listens there."""
+        self._lose(exc)
+        self._transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """asyncio: the link is over."""
+        self._lose(exc or ConnectionResetError("the camera closed the connection"))
+        if not self._closed.done():
+            self._closed.set_result(None)
+
+    def pause_writing(self) -> None:
+        """asyncio: the send buffer is full."""
+        self._writable.clear()
+
+    def resume_writing(self) -> None:
+        """asyncio: the send buffer has room again."""
+        self._writable.set()
+
+    # ------------------------------------------------------------------ inside
+
+    def _flush(self) -> None:
+        frames = self.machine.data_to_send()
+        if not frames:
+            return
+        if self.machine.transport is Transport.UDP:
+            for frame in frames:
+                self._transport.sendto(frame)
+        else:
+            self._transport.write(b"".join(frames))
+
+    def _say_goodbye(self) -> None:
+        if self.machine.state in {State.CONNECTED, State.CONNECTING}:
+            self.machine.send(Disconnect())
+            self._flush()
+
+    def _hand_on(self) -> None:
+        """Queue what the last bytes gave for the receive task."""
+        events = self.machine.events()
+        if not events or self._closing:
+            return
+        received = self.machine.counters.frames_received
+        frames, self._frames = received - self._frames, received
+        self._chunks.append(Chunk(self.heard_at, events, frames))
+        last = events[-1]
+        if isinstance(last, LinkFailed):
+            self._lose(last.error)
+            self._transport.abort()
+        elif not self._paused and self.machine.transport is Transport.TCP:
+            self._paused = frames > self._most or len(self._chunks) >= MAX_CHUNKS
+            if self._paused:
+                self._transport.pause_reading()
+        self._doorbell.ring()
+
+    def _adapt(self, since: float) -> None:
+        """Have the next chunks hold as much as one turn takes, by how long the last one took."""
+        self._busy_since = None
+        took = thread_time() - since
+        frames = int(self._busy_with * TURN / max(took, 1e-9))
+        frames = max(frames, self._most // 2)  # once is no rule
+        self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
+
+    def _resume(self) -> None:
+        if self._paused:
+            self._paused = False
+            self._transport.resume_reading()
+
+    def _show_rest(self) -> None:
+        show, self.on_rest = self.on_rest, None
+        rest = self.machine.pending if show is not None else b""
+        if show is not None and rest:
+            show(rest)
+
+    def _lose(self, reason: BaseException) -> None:
+        if self._loss is None:
+            self._loss = reason
+            self._show_rest()
+        self._writable.set()
+        self._doorbell.ring()
+
+
+def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
+    """Return a chunk of so many frames from a larger one, and its rest; a burst may be cut."""
+    some, left = list[Event](), frames
+    rest = collections.deque(chunk.events)
+    while left > 0 and rest:
+        event = rest.popleft()
+        if type(event) is ResultBurst:
+            if len(event.data) > left:
+                event, behind = event.cut(left)
+                rest.appendleft(behind)
+            left -= len(event.data)
+        else:
+            left -= 1
+        some.append(event)
+    taken = frames - left
+    first = chunk._replace(events=some, frames=taken)
+    return first, chunk._replace(events=list(rest), frames=chunk.frames - taken)
+
+
+async def open_link(
+    protocol: Protocol,
+    dialects: Sequence[Dialect],
+    transport: Transport,
+    host: str,
+    port: int,
+    *,
+    name: str,
+    max_length: int,
+    trace: Callable[[TraceEntry], None] | None = None,
+    liveness_timeout: float | None = None,
+) -> Link:
+    """Open a link; bounded by the caller's deadline.
+
+    Args:
+        protocol: makes the machine.
+        dialects: one, or several that begin a session alike.
+        transport: TCP or UDP.
+        host: the camera's name or address.
+        port: its port.
+        name: of the camera, for logs.
+        max_length: largest payload accepted, bytes.
+        trace: called with every frame.
+        liveness_timeout: see :class:`Link`.
+
+    Raises:
+        OSError: the name does not resolve, nothing listens, no way to the host.
+    """
+    loop = asyncio.get_running_loop()
+    machine: LinkMachine
+
+    def note(entry: TraceEntry) -> None:
+        logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
+        if trace is not None:
+            trace(entry)
+
+    def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
+        note(_trace_entry(name, machine.dialect, sender, frame))
+
+    def on_rest(rest: bytes) -> None:
+        text, shown = f"{len(rest)} bytes that make no whole frame", rest[:MAX_REST].hex()
+        note(TraceEntry(datetime.now(UTC), name, "!", None, text, None, shown))
+
+    traced = trace is not None or logger.isEnabledFor(logging.DEBUG)
+    machine = protocol.machine(
+        dialects[0],
+        Role.CLIENT,
+        transport,
+        max_length=max_length,
+        trace=on_frame if traced else None,
+        kin=tuple(dialects),
+    )
+    link = Link(machine, name=name, host=host, port=port, liveness_timeout=liveness_timeout)
+    link.on_rest = on_rest if traced else None
+    if transport is Transport.TCP:
+        await loop.create_connection(lambda: link, host, port)
+    else:
+        await loop.create_datagram_endpoint(lambda: link, remote_addr=(host, port))
+    return link
+
+
+def _keep_alive(sock: socket.socket, timeout: float) -> None:
+    """Have the system end a link whose peer acknowledges nothing for ``timeout`` seconds."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    probe = max(1, round(timeout / 3))  # whole seconds, after that long and that often
+    options = {
+        "TCP_KEEPIDLE": probe,
+        "TCP_KEEPALIVE": probe,  # the same, where it is called so
+        "TCP_KEEPINTVL": probe,
+        "TCP_KEEPCNT": 2,
+        "TCP_USER_TIMEOUT": max(1, round(timeout * 1000)),  # milliseconds
+    }
+    for name, value in options.items():
+        if hasattr(socket, name):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+def _trace_entry(
+    name: str, dialect: Dialect, sender: Sender, frame: Frame | RemoteProtocolError
+) -> TraceEntry:
+    at = datetime.now(UTC)
+    if isinstance(frame, RemoteProtocolError):
+        return TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
+    message_id, message, fields, data = dialect.spell(sender, frame)
+    direction = ">" if sender is Sender.CLIENT else "<"
+    return TraceEntry(at, name, direction, message_id, message, fields, data.hex())

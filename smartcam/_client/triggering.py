@@ -1,0 +1,396 @@
+"""Triggers: from the camera's readiness to the results, or to the reason why there are none.
+
+What is left over from earlier triggers is settled first, and a fence goes out in front of each, so
+that no older result passes for the next one's (:mod:`smartcam._client.correlation`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam._client.correlation import Run
+from smartcam._client.deadline import Alarm
+from smartcam._client.dispatch import PendingTrigger
+from smartcam._client.requests import is_ready
+from smartcam.exceptions import (
+    CameraBusyError,
+    CameraFaultError,
+    CommandRejectedError,
+    InputContainerError,
+    NotRunningError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+    UnsupportedError,
+    WrongApplicationError,
+)
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+    from typing import Any
+
+    from smartcam._client.dispatch import Inbox
+    from smartcam._client.interpretation import Interpretation
+    from smartcam._client.link import Link
+    from smartcam._client.requests import Conversation
+    from smartcam.models import Result
+
+__all__ = ["TriggerRequest", "Triggers"]
+
+_WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
+_SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
+_SPEAKS_AGAINST = int(
+    Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
+)  # of these Waiting alone is to be set before a trigger
+
+LATE_GRACE = 0.25
+"""Seconds that a late result is waited for before it is made impossible: most are only a little
+late, and stopping and starting an application costs more."""
+
+
+OVERTRIGGERED_GRACE = 1.0
+"""Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set it
+cannot tell that ours was dropped; a camera on which it stays set must not stop the line."""
+
+_WHY_READY = "; it does not while it inspects, and an application that runs free never does"
+
+
+_FENCE, _TRIGGER = m.Query(), m.Trigger()
+
+
+class TriggerRequest(NamedTuple):
+    """What a trigger is to do.
+
+    Attributes:
+        interpretation: how to read its results.
+        input_data: sent right before it, None for none.
+        results: how many results it is to have.
+        wait: wait until the camera takes a trigger; else refuse where it does not.
+    """
+
+    interpretation: Interpretation
+    input_data: bytes | None
+    results: int
+    wait: bool
+
+
+def is_stopped(status: Status) -> bool:
+    """Neither Running nor BUSY."""
+    return not status & (Status.RUNNING | Status.BUSY)
+
+
+def takes_trigger(status: Status) -> bool:
+    """The camera waits for a trigger and is not BUSY."""
+    return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
+
+
+class Triggers:
+    """Triggers a camera, one trigger at a time; whose turn it is, is the client's business.
+
+    Args:
+        talk: what is said to the camera.
+    """
+
+    def __init__(self, talk: Conversation) -> None:
+        self._talk = talk
+        self.inbox: Inbox = talk.inbox
+        self.name: str = talk.name
+        self._doubtful: Link | None = None  # over UDP: a status may have been lost on it
+        self._alarm = Alarm(self._expire)
+        talk.at_end.append(self._alarm.cancel)
+
+    def trigger(
+        self, request: TriggerRequest, deadline: float
+    ) -> Coroutine[Any, Any, list[Result]]:
+        """Wait until the camera takes a trigger, send it, return its results.
+
+        Raises:
+            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
+        """
+        if self._talk.acknowledged:
+            return self._trigger_until_taken(request, deadline)
+        return self._trigger_once(request, deadline)
+
+    async def _trigger_until_taken(self, request: TriggerRequest, deadline: float) -> list[Result]:
+        """Trigger again where the camera says that it was too busy for it."""
+        busy: CameraBusyError | None = None
+        while True:
+            try:
+                if busy is not None:
+                    await self._talk.pause(deadline, "the camera to take a trigger")
+                return await self._trigger_once(request, deadline)
+            except CameraBusyError as exc:
+                if not request.wait:
+                    raise
+                busy = exc
+            except (ResponseTimeoutError, TriggerTimeoutError) as exc:
+                if busy is None:
+                    raise
+                raise TriggerTimeoutError(f"{exc}; {busy}", waited=exc.waited) from busy
+
+    async def _trigger_once(self, request: TriggerRequest, deadline: float) -> list[Result]:
+        """Send one trigger as soon as the camera takes it, return its results.
+
+        Raises:
+            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
+        """
+        talk, attribution = self._talk, self.inbox.attribution
+        if talk.poll is not None:
+            await talk.refresh_status(deadline)
+            attribution.heard()
+        self._raise_fault()
+        cleared = False
+        if request.input_data is not None and self.inbox.input_in_doubt:
+            raise InputContainerError(
+                f"{self.name}: input data of an earlier trigger, which had no result, may still be "
+                "queued in the camera and would be taken for this one's; switch_application() "
+                "empties the queue"
+            )
+        if self.inbox.expected is not None and self.inbox.active != self.inbox.expected:
+            await self._check_application(deadline)
+        if self._doubtful is not None and self._doubtful is talk.link:
+            await talk.ask_for_status(deadline)
+            await talk.fence(deadline)  # it has come by then, or is lost again
+            self._doubtful = None
+            attribution.heard()
+        interpretation = request.interpretation
+        numbering = interpretation.numbering(self.inbox.active) if talk.numbered else None
+        # an older result shows by its number where each container has one
+        decided = numbering is not None and numbering.always
+        if attribution.doubted:  # the trigger before may not show in the status yet
+            await talk.fence(deadline)
+            attribution.heard()
+        if talk.halted_at is not None or attribution.debt is not None:
+            await self._settle_debt(deadline, wait=request.wait, decided=decided)
+        while True:
+            status = int(talk.status)
+            if status & _SPEAKS_AGAINST != _WAITING:
+                await self._wait_for_trigger(deadline, wait=request.wait)
+            elif status & _OVERTRIGGERED and not cleared:
+                cleared = True
+                await self._clear_overtriggered(deadline)
+            elif talk.fences and talk.owes(m.QueryAnswer):  # one can be open
+                await talk.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+            else:
+                break
+        number, certain = None, False
+        if numbering is not None:
+            number, certain = attribution.take_number(numbering.highest)
+        fenced = talk.fences and not (certain and decided)
+        loop = talk.loop or asyncio.get_running_loop()
+        pending = PendingTrigger(
+            outcome=loop.create_future(),
+            interpretation=interpretation,
+            has_input=request.input_data is not None,
+            sent_at=loop.time(),
+            triggered_at=datetime.now(UTC),
+            wanted=request.results,
+            number=number,
+            certain=certain,
+            # where each application has its own interpreter none is read with another's layout
+            application=None if interpretation.by_application else self.inbox.active,
+            run=Run(reached=not fenced, confirmed=not talk.confirms),
+        )
+        return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
+
+    async def _await_results(
+        self, pending: PendingTrigger, input_data: bytes | None, deadline: float, *, fenced: bool
+    ) -> list[Result]:
+        inbox, outcome, link = self.inbox, pending.outcome, self._talk.require_link()
+        words: list[m.Message] = [_FENCE] if fenced else []
+        if pending.number is not None:
+            words.append(m.SetSequenceNumber(number=pending.number))
+        if self._talk.acknowledged:
+            await self._talk.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
+        if input_data is not None and link.machine.dialect.answers(m.SetInput):
+            due = self._talk.due_after(deadline)
+            await self._talk.command(m.SetInput(data=input_data), deadline, due=due)
+            if fenced and self._talk.owes(m.QueryAnswer):
+                await self._talk.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+        elif input_data is not None:
+            words.append(m.SetInput(data=input_data))
+        inbox.begin_trigger(pending)
+        self._alarm.set(deadline)
+        try:
+            link.send(*words, _TRIGGER)
+            if fenced:
+                self._talk.expect_fence(pending.sent_at, deadline)
+            if self._talk.acknowledged:
+                self._expect_acknowledgement(pending, deadline)
+            else:
+                inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
+            if self._talk.poll is not None:
+                self._talk.poll.wanted()
+            if not link.writable:
+                with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
+                    async with asyncio.timeout_at(deadline):
+                        await link.drain()
+            return await outcome
+        except TimeoutError as exc:
+            inbox.attribution.give_up(pending)
+            # it may have been stopped: then Waiting did not drop for this trigger
+            certain = self._talk.ordered or pending.run.begun
+            self._doubtful = None if certain else link
+            waited = max(0.0, deadline - pending.sent_at)
+            came = f"{len(pending.results)} of {pending.wanted} results"
+            raise TriggerTimeoutError(
+                f"{self.name}: {came if pending.results else 'no result'} within "
+                f"{round(waited, 2):g} s of the trigger; status: {self._talk.status}"
+                f"{_told_of_fence(pending)}",
+                waited=waited,
+            ) from exc
+        except asyncio.CancelledError:
+            if not outcome.done() or outcome.cancelled():
+                inbox.attribution.give_up(pending)
+            else:
+                outcome.exception()  # nobody will look at it
+            raise
+        finally:
+            self._alarm.clear()
+            inbox.end_trigger()
+
+    def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
+        """Have the trigger end at once where the camera says that it took none."""
+
+        def on_answer(answer: asyncio.Future[m.Message | SmartCamError]) -> None:
+            got = answer.result()
+            if isinstance(got, SmartCamError) or pending.outcome.done():
+                return
+            try:
+                self._talk.check(m.Trigger, got)
+            except (CommandRejectedError, UnsupportedError) as exc:
+                busy = isinstance(got, m.Acknowledgement) and self._talk.is_busy(got)
+                if not self._talk.ordered:  # it may be the answer to an earlier one
+                    self.inbox.attribution.give_up(pending)
+                pending.fail(CameraBusyError(str(exc)) if busy else exc)
+            except SmartCamError as exc:  # the link is over
+                pending.fail(exc)
+
+        due = self._talk.due_after(deadline)
+        self._talk.expect(m.TriggerAnswer, due).add_done_callback(on_answer)
+
+    def _expire(self) -> None:
+        """The trigger's deadline: from this moment on its result is late."""
+        pending = self.inbox.pending
+        if pending is not None:
+            self.inbox.attribution.give_up(pending)
+            pending.fail(TimeoutError())
+
+    async def _check_application(self, deadline: float) -> None:
+        """See to it that the application that was named is the active one.
+
+        Raises:
+            WrongApplicationError: somebody else has switched; nothing was sent but a Query.
+        """
+        inbox = self.inbox
+        await self._talk.fence(deadline)  # what is known may be old
+        if inbox.active != inbox.expected:
+            raise WrongApplicationError(
+                f"{self.name}: application {inbox.active} is active, somebody else has switched; "
+                f"{inbox.expected} was expected",
+                expected=inbox.expected,
+                got=inbox.active,
+            )
+
+    async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
+        """Wait until the camera takes a trigger, or say why it never will."""
+        begin = asyncio.get_running_loop().time()
+        while True:
+            self._raise_fault()
+            status = self._talk.status
+            if takes_trigger(status):
+                return
+            if is_stopped(status):
+                raise NotRunningError(
+                    f"{self.name}: application {self.inbox.active} is stopped: start it, or name "
+                    f"it so that it is started; status: {status}"
+                )
+            if not wait:
+                raise CameraBusyError(
+                    f"{self.name}: the camera does not wait for a trigger: {status}"
+                )
+            try:
+                await self._talk.wait_status(_is_decided, deadline)
+            except TimeoutError as exc:
+                free = _WHY_READY if is_ready(status) else ""
+                waited = max(0.0, deadline - begin)
+                raise TriggerTimeoutError(
+                    f"{self.name}: the camera did not wait for a trigger within "
+                    f"{round(waited, 2):g} s; status: {self._talk.status}{free}",
+                    waited=waited,
+                ) from exc
+
+    def _raise_fault(self) -> None:
+        if int(self._talk.status) & _SYSTEM_ERROR:
+            raise CameraFaultError(f"{self.name}: the camera reports System Error")
+
+    async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:
+        """Await the result of an earlier trigger, or make it impossible, unless a number decides.
+
+        Stop voids the inspection under way, a Query is the fence: what comes before its answer
+        came from before. Without a Stop the inspection's end is awaited: the camera waits for a
+        trigger again. A camera that does one thing after the other needs the fence only.
+        Source: that Stop voids the inspection is inferred.
+        """
+        attribution = self.inbox.attribution
+        if not self._talk.halted and (decided or attribution.debt is None):
+            return
+        if self._talk.dialect.in_order or not self._talk.dialect.has(m.Stop):
+            await self._wait_for_trigger(deadline, wait=wait)
+            await self._talk.fence(deadline)
+            attribution.settled()
+            return
+        now = asyncio.get_running_loop().time()
+        if not self._talk.halted and Status.RUNNING in self._talk.status:
+            grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
+            with contextlib.suppress(TimeoutError):
+                await self.inbox.wait_status(_is_decided, grace)
+            if attribution.debt is None:
+                return
+        if self._talk.runs:
+            # interrupted here, the next trigger does all of it again
+            self._talk.halted_at = self.inbox.loads_by_others
+            await self._talk.halt(deadline)
+            await self._talk.fence(deadline)
+            await self._talk.enter_run_mode(deadline)
+        attribution.settled()
+
+    async def _clear_overtriggered(self, deadline: float) -> None:
+        """Reset Overtriggered, or wait a moment for it to fall: only then can it rise for ours.
+
+        Source: it falls by itself (SC manual p. 30, published), when is unknown; on BVS ID it stays
+        until it is reset (BVS ID guide p. 227, published).
+        """
+        if self._talk.dialect.has(m.ResetErrors):
+            await self._talk.command(m.ResetErrors(), deadline, due=self._talk.due_after(deadline))
+            await self._talk.refresh_status(deadline)
+            return
+        now = asyncio.get_running_loop().time()
+        grace = now + min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))
+        with contextlib.suppress(TimeoutError):
+            await self.inbox.wait_status(_is_not_overtriggered, grace)
+
+
+def _is_not_overtriggered(status: Status) -> bool:
+    return Status.OVERTRIGGERED not in status
+
+
+def _told_of_fence(pending: PendingTrigger) -> str:
+    """Return what an error text says of the fence, and of containers that came before it."""
+    if not pending.run.reached:
+        return "; the question in front of the trigger was not answered"
+    if not pending.run.confirmed:
+        return "; no status came that tells whether the trigger was taken"
+    if pending.early:
+        what = "result came" if pending.early == 1 else "results came"
+        return f"; {pending.early} {what} before the trigger had reached the camera, from before it"
+    return ""
+
+
+def _is_decided(status: Status) -> bool:
+    return takes_trigger(status) or is_stopped(status) or Status.SYSTEM_ERROR in status

@@ -1,0 +1,1 @@
+"""Printed targets in images: found, refined, numbered."""

@@ -1,0 +1,1 @@
+"""A camera's lens: its model, and its calibration from views."""

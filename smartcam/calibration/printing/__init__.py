@@ -1,0 +1,1 @@
+"""Sheets with targets, to print."""

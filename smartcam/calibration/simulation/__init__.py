@@ -1,0 +1,1 @@
+"""Images and scenes whose truth is known, for tests."""

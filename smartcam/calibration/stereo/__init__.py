@@ -1,0 +1,1 @@
+"""Two cameras that look at the same place."""

@@ -1,0 +1,1 @@
+"""Wizards: calibrations step by step, for any front-end."""

@@ -1,0 +1,11 @@
+"""What ``pytest --pyargs smartcam.conformance.camera`` runs."""
+
+from __future__ import annotations
+
+from smartcam.conformance.camera.suite import CameraConformance
+
+__all__ = ["TestCamera"]
+
+
+class TestCamera(CameraConformance):
+    """The camera of ``--camera-url``."""

@@ -1,0 +1,11 @@
+"""What ``pytest --pyargs smartcam.conformance.client --client-command ...`` runs."""
+
+from __future__ import annotations
+
+from smartcam.conformance.client.suite import ClientConformance
+
+__all__ = ["TestClient"]
+
+
+class TestClient(ClientConformance):
+    """The client of ``--client-command``."""

@@ -1,0 +1,1 @@
+"""The emulated BVS camera: the device without its sockets."""

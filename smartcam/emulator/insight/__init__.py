@@ -1,0 +1,1 @@
+"""The emulated In-Sight camera."""

@@ -1,0 +1,1 @@
+"""An emulated camera as data, and what happens to it in the course of time."""

@@ -1,0 +1,1 @@
+"""Protocols of binary frames: magic number, length, message id."""

@@ -1,0 +1,563 @@
+"""Dialects of binary frames, as data.
+
+A :class:`FramedDialect` joins a header layout and a message table and compiles them to codecs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import struct
+import sys
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from smartcam.exceptions import (
+    ConfigurationError,
+    LocalProtocolError,
+    MessageError,
+    RemoteProtocolError,
+    UnsupportedError,
+    hex_excerpt,
+)
+from smartcam.models import Capabilities, Status, as_status, jsonable
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import UNDOCUMENTED, Code, Dialect, RawRequest, Spelled, Verdict
+from smartcam.protocols.framed.framing import Buffer, Frame, HeaderLayout
+from smartcam.protocols.messages import (
+    Acknowledgement,
+    ConnectAnswer,
+    MalformedMessage,
+    Message,
+    Request,
+    Sender,
+    StatusReport,
+    TriggerAnswer,
+    UnknownMessage,
+    Wire,
+    wire_fields,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+__all__ = ["Codec", "FramedDialect", "MessageRow", "StatusBits", "WireQuirk"]
+
+
+class MessageRow(NamedTuple):
+    """One row of a dialect's message table.
+
+    Attributes:
+        message_id: id on the wire.
+        type: the message.
+        title: the manual's name.
+        source: where it stands, with its grade.
+        omits: fields of the message that are not on this dialect's wire; they have defaults.
+        byte_order: ``struct`` code of the body's byte order.
+    """
+
+    message_id: int
+    type: type[Message]
+    title: str
+    source: str
+    omits: tuple[str, ...] = ()
+    byte_order: Literal["<", ">"] = "<"
+
+    @property
+    def fields(self) -> tuple[tuple[str, Wire], ...]:
+        """Name and wire type of each field of the body, in order."""
+        return tuple(pair for pair in wire_fields(self.type) if pair[0] not in self.omits)
+
+
+NO_STATUS = Status(0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusBits:
+    """What the bits of a dialect's status word are; without any, they are those of Status.
+
+    Attributes:
+        named: bit on the wire to the status bit that means the same.
+        without: bit on the wire to the status bit that means its absence.
+        always: status bits that no bit on the wire tells.
+        others: how many bits higher the rest of the wire's bits stand.
+    """
+
+    named: Mapping[int, Status] = field(default_factory=dict[int, Status])
+    without: Mapping[int, Status] = field(default_factory=dict[int, Status])
+    always: Status = NO_STATUS
+    others: int = 0
+
+    def read(self, word: int) -> Status:
+        """Return the status that a word on the wire is."""
+        if not self.others:
+            return as_status(word)
+        status, rest = int(self.always), word
+        for bit, meaning in self.named.items():
+            status |= meaning if word & bit else 0
+            rest &= ~bit
+        for bit, meaning in self.without.items():
+            status |= 0 if word & bit else meaning
+            rest &= ~bit
+        return Status(status | rest << self.others)
+
+    def write(self, status: Status) -> int:
+        """Return the word on the wire; bits that it has no place for are left out."""
+        if not self.others:
+            return int(status)
+        bits = int(status)
+        word = bits >> self.others
+        for bit, meaning in self.named.items():
+            word = word & ~bit | (bit if bits & meaning else 0)
+        for bit, meaning in self.without.items():
+            word = word & ~bit | (0 if bits & meaning else bit)
+        return word
+
+
+MAX_KNOWN = 256
+"""Messages kept of each kind; statuses and answers are few, and a peer could send any."""
+
+
+MAX_SURPLUS = 1 << 12
+"""Bytes that a body may be longer than documented, where that is a matter of a fixed length: newer
+firmware may append fields, which are a few words. More is a length that is wrong."""
+
+
+class Codec:
+    """One message of one dialect, compiled.
+
+    Attributes:
+        type: the message.
+        message_id: its id.
+        size: of the fields that have one, bytes.
+        has_data: whether every byte behind them is a field.
+    """
+
+    __slots__ = (
+        *("_body", "_code", "_data", "_fields", "_fill", "_header_size"),
+        *("_known", "_meaning", "_omitted", "_status"),
+        *("has_data", "message_id", "size", "type"),
+    )
+
+    def __init__(self, row: MessageRow, dialect: FramedDialect) -> None:
+        fields = row.fields
+        codes = {Wire.WORD: dialect.word, Wire.UINT32: "I"}
+        self.type: type[Message] = row.type
+        self.message_id: int = row.message_id
+        self._header_size = dialect.header.size
+        self._status = dialect.status_bits if row.type is StatusReport else None
+        self._fields = tuple(name for name, wire in fields if wire is not Wire.DATA)
+        self._data = next((name for name, wire in fields if wire is Wire.DATA), None)
+        self._body = struct.Struct(
+            row.byte_order + "".join(codes[wire] for _, wire in fields if wire is not Wire.DATA)
+        )
+        self.size: int = self._body.size
+        self.has_data: bool = self._data is not None
+        # where each answer begins with a code, one that refuses may have nothing else; but two
+        # bytes in answer to Connect are the version in another dialect
+        answers = issubclass(row.type, Acknowledgement) and row.type is not ConnectAnswer
+        coded = answers and dialect.coded and "code" in self._fields
+        self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
+        self._meaning = dialect.code
+        self._known: dict[bytes, Message] = {}  # bodies that came before: messages are immutable
+        # what fills the slots of a frozen message, in half the time of its own constructor
+        self._fill = [vars(_owner(row.type, name))[name].__set__ for name, _ in fields]
+        on_the_wire = {name for name, _ in fields}
+        self._omitted = [
+            (vars(_owner(row.type, one.name))[one.name].__set__, one.default)
+            for one in dataclasses.fields(row.type)
+            if one.name not in on_the_wire
+        ]
+
+    @property
+    def may_be_a_code(self) -> bool:
+        """Whether a result code that refuses may come alone."""
+        return self._code is not None and self._code.size < self.size
+
+    @property
+    def lengths(self) -> range:
+        """The lengths of a body that are accepted."""
+        least = self.size if self._code is None else min(self._code.size, self.size)
+        return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS + 1)
+
+    def fits(self, size: int) -> bool:
+        """Whether a body has the documented length."""
+        return size >= self.size if self.has_data else size == self.size
+
+    def _refuses(self, payload: bytes) -> bool:
+        """Whether a body that is too short is a result code that is not good."""
+        code = self._code
+        if code is None or len(payload) != code.size:
+            return False
+        return self._meaning(code.unpack(payload)[0]).verdict is not Verdict.DONE
+
+    def encode(self, message: Message) -> bytes:
+        """Return a message's body."""
+        values = [getattr(message, name) for name in self._fields]
+        if self._status is not None:
+            values[0] = self._status.write(values[0])
+        body = self._body.pack(*values)
+        return body + getattr(message, self._data) if self._data is not None else body
+
+    def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
+        """Return the message whose body is at a place; bytes behind it are ignored.
+
+        An answer that is nothing but a refusing code is taken as such: the rest is 0.
+
+        Raises:
+            MessageError: the body is shorter than its message.
+        """
+        if end - begin < self.size:
+            payload = bytes(buffer[begin:end])
+            if not self._refuses(payload):
+                raise MessageError(
+                    f"{self.type.__name__} ({self.message_id:#04x}) came with {len(payload)} bytes,"
+                    f" it needs {self.size}: {hex_excerpt(payload)}",
+                    offset=self._header_size,
+                    data=payload,
+                )
+            buffer, begin, end = payload.ljust(self.size, b"\0"), 0, self.size
+        behind = begin + self.size
+        if self.has_data:
+            data = bytes(buffer[behind:end])
+            return self._make((*self._body.unpack_from(buffer, begin), data))
+        body = bytes(buffer[begin:behind])
+        message = self._known.get(body)
+        if message is None:
+            values = self._body.unpack(body)
+            if self._status is not None:
+                values = (self._status.read(values[0]), *values[1:])
+            message = self._make(values)
+            if len(self._known) < MAX_KNOWN:
+                self._known[body] = message
+        return message
+
+    def _make(self, values: tuple[Any, ...]) -> Message:
+        message = object.__new__(self.type)
+        for fill, value in zip(self._fill, values, strict=True):
+            fill(message, value)
+        for fill, value in self._omitted:
+            fill(message, value)
+        return message
+
+
+def _owner(message_type: type[Message], name: str) -> type[Message]:
+    """Return the class of the slot: slots of a base class stand there."""
+    return next(one for one in message_type.__mro__ if name in vars(one))
+
+
+class WireQuirk(NamedTuple):
+    """A deviation from a dialect that the documents leave open.
+
+    Attributes:
+        about: one line for people.
+        source: where it comes from, with its grade.
+        rows: the messages that look different.
+        codes: what result codes mean, where that differs.
+    """
+
+    about: str
+    source: str
+    rows: tuple[MessageRow, ...]
+    codes: Mapping[int, Code] | None = None
+
+
+_ABILITIES: Mapping[str, type[Message]] = {
+    "switch": m.SwitchApplication,
+    "load_file": m.LoadFile,
+    "start_stop": m.Start,
+    "reboot": m.Reboot,
+    "get_clock": m.GetClock,
+    "set_clock": m.SetClock,
+    "input_data": m.SetInput,
+    "sequence_number": m.SetSequenceNumber,
+    "get_status": m.GetStatus,
+    "reset_errors": m.ResetErrors,
+    "read_image": m.ReadImage,
+}
+"""The message that each ability rests on."""
+
+SWITCH_CODES: Mapping[int, Code] = {
+    0: Code("done", Verdict.DONE),
+    1: Code("id invalid", Verdict.REFUSED),
+}
+"""What the answer to a switch says where no other has a code (SC manual p. 34, published)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FramedDialect(Dialect):
+    """A dialect of binary frames, as data.
+
+    Args:
+        name: as in ``?dialect=``.
+        about: one line for people.
+        source: where it is described, with its grade.
+        header: what a frame's header looks like.
+        word: ``struct`` code of the bodies' ordinary integers: ``I`` or ``H``.
+        table: its messages.
+        status_bits: what the bits of its status word are.
+        codes: what the codes of its answers mean.
+        status_by_itself: the status comes with the session and at every change.
+        wire_quirks: deviations by their names.
+        applied: names of those that this one has.
+    """
+
+    header: HeaderLayout
+    word: Literal["I", "H"]
+    table: tuple[MessageRow, ...]
+    status_bits: StatusBits = StatusBits()
+    codes: Mapping[int, Code] = field(default_factory=lambda: SWITCH_CODES)
+    status_by_itself: bool = True
+    wire_quirks: Mapping[str, WireQuirk] = field(default_factory=dict[str, WireQuirk])
+    applied: tuple[str, ...] = ()
+    _encoders: dict[type[Message], Codec] = field(
+        init=False, repr=False, default_factory=dict[type[Message], Codec]
+    )
+    _decoders: dict[tuple[Sender, int], Codec] = field(
+        init=False, repr=False, default_factory=dict[tuple[Sender, int], Codec]
+    )
+
+    _answers: dict[int, int | None] = field(
+        init=False, repr=False, default_factory=dict[int, int | None]
+    )
+    # of the messages that have no body: whole frame, id, id of the answer
+    constant: dict[type[Message], tuple[bytes, int, int | None]] = field(
+        init=False, repr=False, default_factory=dict[type[Message], Any]
+    )
+    _variants: dict[tuple[str, ...], FramedDialect] = field(
+        init=False, repr=False, default_factory=dict[tuple[str, ...], Any]
+    )
+
+    def __post_init__(self) -> None:
+        for row in self.table:
+            codec = Codec(row, self)
+            self._encoders[row.type] = codec
+            self._decoders[row.type.sender, row.message_id] = codec
+        for row in self.table:
+            if issubclass(row.type, Request):
+                answer = self._encoders.get(row.type.answer) if row.type.answer else None
+                self._answers[row.message_id] = None if answer is None else answer.message_id
+        for row in self.table:
+            if not row.fields:
+                frame = self.encode(row.type())
+                self.constant[row.type] = frame, row.message_id, self.answer_id(row.message_id)
+
+    @property
+    def quirks(self) -> tuple[str, ...]:
+        """Names of the deviations from the dialect that this one has, as in ``?quirks=``."""
+        return self.applied
+
+    def with_quirks(self, names: Iterable[str]) -> FramedDialect:
+        """Return the dialect with these deviations, always the same one for the same names.
+
+        Raises:
+            ConfigurationError: it knows no such deviation.
+        """
+        key = tuple(sorted({*names, *self.applied}))
+        unknown = [name for name in key if name not in self.wire_quirks]
+        if unknown:
+            known = ", ".join(self.wire_quirks) or "none"
+            raise ConfigurationError(
+                f"dialect {self.name} has no quirk {unknown[0]!r}; it has {known}"
+            )
+        if key == self.applied:
+            return self
+        variant = self._variants.get(key)
+        if variant is None:
+            changes = [self.wire_quirks[name] for name in key]
+            other = {row.type: row for quirk in changes for row in quirk.rows}
+            codes = [quirk.codes for quirk in changes if quirk.codes is not None]
+            variant = self._variants[key] = dataclasses.replace(
+                self,
+                table=tuple(other.get(row.type, row) for row in self.table),
+                codes=codes[0] if codes else self.codes,
+                applied=key,
+            )
+            object.__setattr__(variant, "_variants", self._variants)  # one for all of them
+        return variant
+
+    @property
+    def coded(self) -> bool:
+        """Whether each answer begins with a result code."""
+        return any(row.type is ConnectAnswer and "code" not in row.omits for row in self.table)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a camera can do in it."""
+        return Capabilities(
+            dialect=self.name,
+            status_by_itself=self.status_by_itself,
+            unasked_results=True,
+            result_codes=self.has(TriggerAnswer),
+            **{name: self.has(message_type) for name, message_type in _ABILITIES.items()},
+        )
+
+    @property
+    def application_ids(self) -> range:
+        """The ids that applications may have: 0 is not allowed (SC manual p. 34, published)."""
+        return range(1, 1 << 8 * struct.calcsize("<" + self.word))
+
+    def code(self, code: int, request: type[Message] | None = None) -> Code:
+        """Return what a result code means; one that is not documented refuses."""
+        return self.codes.get(code, UNDOCUMENTED)
+
+    def has(self, message_type: type[Message]) -> bool:
+        """Whether there is such a message."""
+        return message_type in self._encoders
+
+    def fields(self, message_type: type[Message]) -> tuple[str, ...]:
+        """Return the names of the fields that a message has on the wire."""
+        for row in self.table:
+            if row.type is message_type:
+                return tuple(name for name, _ in row.fields)
+        return ()
+
+    def message_id(self, message: Message | type[Message]) -> int:
+        """Return the id of a message in this dialect.
+
+        Raises:
+            UnsupportedError: it has no such message.
+        """
+        if isinstance(message, (UnknownMessage, MalformedMessage)):
+            return message.message_id
+        return self.encoder(message if isinstance(message, type) else type(message)).message_id
+
+    def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
+        """Return a status that another dialect has read as this one reads it."""
+        if not isinstance(reader, FramedDialect):
+            return report
+        word = reader.status_bits.write(report.status)
+        return dataclasses.replace(report, status=self.status_bits.read(word))
+
+    def spell(self, sender: Sender, frame: Frame) -> Spelled:
+        """Return a frame in words, for a trace; it never raises."""
+        fields: dict[str, Any] | None = None
+        with contextlib.suppress(RemoteProtocolError):  # its error follows in the trace
+            message = self.decode(sender, frame)
+            names = self.fields(type(message))
+            fields = {name: jsonable(getattr(message, name)) for name in names}
+        name = self.message_type(sender, frame.message_id).__name__
+        return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
+
+    def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
+        """Return any request by its id, for who knows better.
+
+        Raises:
+            LocalProtocolError: Connect and Disconnect.
+            UnsupportedError: the id is no number.
+        """
+        if isinstance(message_id, str):
+            raise UnsupportedError(f"dialect {self.name}: a message id is a number: {message_id!r}")
+        known = self.message_type(Sender.CLIENT, message_id)
+        if known in {m.Connect, m.Disconnect}:
+            raise LocalProtocolError("the session is the client's own")
+        answer = self.message_type(Sender.CAMERA, message_id)
+        return RawRequest(
+            self._as_named(Frame(message_id, payload)),
+            message_id if answer is UnknownMessage else answer,
+            answered=self.answer_id(message_id) is not None,
+            known=known is not UnknownMessage,
+        )
+
+    def _as_named(self, frame: Frame) -> Message:
+        """Return the message that a frame is; an unnamed one where that would change its bytes."""
+        with contextlib.suppress(RemoteProtocolError):
+            message = self.decode(Sender.CLIENT, frame)
+            if self.to_frame(message) == frame:
+                return message
+        return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
+
+    def body(self, answer: Message) -> bytes:
+        """Return an answer's bytes behind the header."""
+        return self.to_frame(answer).payload
+
+    def message_type(self, sender: Sender, message_id: int) -> type[Message]:
+        """Return the message with this id from this sender, :class:`UnknownMessage` if none."""
+        codec = self._decoders.get((sender, message_id))
+        return codec.type if codec is not None else UnknownMessage
+
+    def encoder(self, message_type: type[Message]) -> Codec:
+        """Return what encodes a message.
+
+        Raises:
+            UnsupportedError: the dialect has no such message.
+        """
+        codec = self._encoders.get(message_type)
+        if codec is None:
+            raise self.unsupported(message_type)
+        return codec
+
+    def decoders(self, sender: Sender) -> dict[int, Codec]:
+        """Return what decodes the messages of one sender, by their ids."""
+        return {
+            row.message_id: self._encoders[row.type]
+            for row in self.table
+            if row.type.sender is sender
+        }
+
+    def lengths(self, sender: Sender) -> dict[int, range]:
+        """Return the lengths that the bodies of one sender's messages may have, by their ids."""
+        return {number: codec.lengths for number, codec in self.decoders(sender).items()}
+
+    def knows(self, sender: Sender, message_id: int) -> bool:
+        """Whether there is a message with this id from this sender."""
+        return (sender, message_id) in self._decoders
+
+    def answer_id(self, request_id: int) -> int | None:
+        """Return the id of the answer to a request, None if the camera never answers it.
+
+        An unknown request is expected to be answered under its own id.
+        """
+        return self._answers.get(request_id, request_id)
+
+    def encode_frame(self, frame: Frame) -> bytes:
+        """Return a frame's bytes.
+
+        Raises:
+            LocalProtocolError: id or payload do not fit the header.
+        """
+        try:
+            return self.header.pack(frame.message_id, len(frame.payload)) + frame.payload
+        except struct.error as exc:
+            raise LocalProtocolError(
+                f"message {frame.message_id:#x} with {len(frame.payload)} bytes of payload does not"
+                f" fit the {self.name} header: {exc}"
+            ) from exc
+
+    def to_frame(self, message: Message) -> Frame:
+        """Return a message as a frame.
+
+        Raises:
+            UnsupportedError: the dialect has no such message.
+            LocalProtocolError: a field does not fit.
+        """
+        if isinstance(message, (UnknownMessage, MalformedMessage)):
+            return Frame(message.message_id, message.payload)
+        codec = self.encoder(type(message))
+        try:
+            return Frame(codec.message_id, codec.encode(message))
+        except (struct.error, TypeError) as exc:
+            raise LocalProtocolError(f"{message} does not fit its fields: {exc}") from exc
+
+    def encode(self, message: Message) -> bytes:
+        """Return a message's bytes on the wire; raises as :meth:`to_frame`."""
+        constant = self.constant.get(type(message))
+        return self.encode_frame(self.to_frame(message)) if constant is None else constant[0]
+
+    def surplus(self, sender: Sender, frame: Frame) -> int:
+        """Return how many bytes a known message's body is longer than documented."""
+        codec = self._decoders.get((sender, frame.message_id))
+        if codec is None or codec.has_data:
+            return 0
+        return len(frame.payload) - codec.size
+
+    def decode(self, sender: Sender, frame: Frame) -> Message:
+        """Return a frame's message; a longer body than documented is cut.
+
+        Raises:
+            MessageError: the body is shorter than its message.
+        """
+        codec = self._decoders.get((sender, frame.message_id))
+        if codec is None:
+            return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
+        return codec.decode(frame.payload, 0, len(frame.payload))

@@ -1,0 +1,655 @@
+"""The state machine of one link, in either role.
+
+Bytes go in, events come out; it imports no socket, loop or clock. Two rules: what is not in
+:data:`TRANSITIONS` is illegal, and bad input never raises out of ``receive_*``: by the role's
+:class:`~smartcam.protocols.base.Policy` it ends the link with a :class:`LinkFailed` event, or is
+dropped and counted.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from smartcam.exceptions import (
+    FrameError,
+    LocalProtocolError,
+    MessageError,
+    RemoteProtocolError,
+    hex_excerpt,
+)
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import POLICIES, Policy, Role, Transport
+from smartcam.protocols.framed import frame_age
+from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from smartcam.protocols.base import Dialect
+    from smartcam.protocols.framed.dialect import Codec, FramedDialect
+    from smartcam.protocols.messages import Message
+
+__all__ = [
+    "TRANSITIONS",
+    "Counters",
+    "Event",
+    "LinkEnded",
+    "LinkFailed",
+    "LinkMachine",
+    "Machine",
+    "ResultBurst",
+    "State",
+]
+
+
+MANY_EVENTS = 64
+"""Events of one read beyond which the next one takes fewer bytes: cutting frames, and making
+messages of them, must not hold up other cameras."""
+
+MANY_FRAMES = 512
+"""Frames of one read beyond which it is the same, though they be one burst of results: more than
+the receive task takes in a turn, so that reading would have to pause after each."""
+
+
+class State(enum.Enum):
+    """Where a link is."""
+
+    IDLE = "idle"
+    """Open, without a session."""
+    CONNECTING = "connecting"
+    """Connect was sent, its answer has not come."""
+    CONNECTED = "connected"
+    """In a session."""
+    DISCONNECTED = "disconnected"
+    """Disconnect was sent; what the camera had under way may still come."""
+    CLOSED = "closed"
+    """The peer closed the link."""
+    FAILED = "failed"
+    """The peer broke the protocol; nothing is read any more."""
+
+
+_SESSION_REQUESTS = (
+    m.Query,
+    m.SwitchApplication,
+    m.GetClock,
+    m.SetClock,
+    m.SetInput,
+    m.SetSequenceNumber,
+    m.Trigger,
+    m.Start,
+    m.Stop,
+    m.Reboot,
+    m.GetStatus,
+    m.ResetErrors,
+)
+_SESSION_REPORTS = (
+    m.StatusReport,
+    m.ResultContainer,
+    m.QueryAnswer,
+    m.SwitchAnswer,
+    m.ClockAnswer,
+    m.TriggerAnswer,
+    m.SetClockAnswer,
+    m.SetInputAnswer,
+    m.ResetErrorsAnswer,
+)
+
+
+# What the camera sends unasked. A Disconnect may be answered or not, and nobody waits for it.
+_BY_ITSELF = frozenset((m.StatusReport, m.ResultContainer, m.DisconnectAnswer))
+
+
+def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
+    client, camera = m.Sender.CLIENT, m.Sender.CAMERA
+    idle, connecting, connected = State.IDLE, State.CONNECTING, State.CONNECTED
+    table: dict[tuple[State, m.Sender, type[Message]], State] = {
+        # without a session it is harmless, and it ends one that a dead client left behind
+        (idle, client, m.Disconnect): idle,
+        (idle, client, m.Connect): connecting,
+        (connecting, client, m.Disconnect): State.DISCONNECTED,
+        (connecting, client, m.Connect): connecting,
+        (connecting, camera, m.ConnectAnswer): connected,
+        # what was asked before it in the same bytes is still answered
+        (connected, client, m.Connect): connected,
+        (connected, client, m.Disconnect): State.DISCONNECTED,
+        (State.DISCONNECTED, client, m.Disconnect): State.DISCONNECTED,
+        (State.DISCONNECTED, client, m.Connect): connecting,
+        (State.DISCONNECTED, camera, m.ConnectAnswer): State.DISCONNECTED,
+        # the answer to a second Connect that came in the same bytes as the first
+        (connected, camera, m.ConnectAnswer): connected,
+    }
+    for state in (idle, connecting, connected, State.DISCONNECTED):
+        # to the Disconnect that went before a Connect, or ended the session
+        table[state, camera, m.DisconnectAnswer] = state
+    for request in (*_SESSION_REQUESTS, m.UnknownMessage, m.MalformedMessage):
+        table[connected, client, request] = connected
+        # right behind a Connect, before its answer is out: it is answered after that
+        table[connecting, client, request] = connecting
+    for report in (*_SESSION_REPORTS, m.UnknownMessage):
+        table[connected, camera, report] = connected
+        table[State.DISCONNECTED, camera, report] = State.DISCONNECTED
+    return table
+
+
+TRANSITIONS: Mapping[tuple[State, m.Sender, type[Message]], State] = _transitions()
+"""``{(state, sender, message type): next state}``, for both roles. What is not here is illegal."""
+
+
+_SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
+    (state, sender): {
+        kind: following
+        for (before, who, kind), following in TRANSITIONS.items()
+        if (before, who) == (state, sender)
+    }
+    for state in State
+    for sender in m.Sender
+}
+"""The same by state and sender, for the way of every message."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultBurst:
+    """Result containers of one application, one right after the other; two or more as they come.
+
+    The client's machine gives it for containers that came in one delivery, so that a camera that
+    runs free costs no object for each. Iterating gives them one by one.
+
+    Attributes:
+        application: whose they are.
+        data: what each has behind the id.
+        size: bytes of all data.
+    """
+
+    application: int
+    data: list[bytes]
+    size: int
+
+    def __iter__(self) -> Iterator[m.ResultContainer]:
+        return (m.ResultContainer(application=self.application, data=one) for one in self.data)
+
+    def cut(self, count: int) -> tuple[ResultBurst, ResultBurst]:
+        """Return the first ``count`` containers and the others."""
+        data, rest = self.data[:count], self.data[count:]
+        size = sum(map(len, data))
+        return (
+            ResultBurst(application=self.application, data=data, size=size),
+            ResultBurst(application=self.application, data=rest, size=self.size - size),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkFailed:
+    """The peer broke the protocol: close the link. Always the last event."""
+
+    error: RemoteProtocolError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkEnded:
+    """The peer closed the link; ``pending`` bytes of an unfinished frame were left."""
+
+    pending: int
+
+
+Event = m.Message | ResultBurst | LinkFailed | LinkEnded
+
+
+class LinkMachine(Protocol):
+    """What a link needs of the machine that speaks over it, in the client's role.
+
+    :class:`Machine` speaks in frames; a protocol of another kind brings its own. What comes goes in
+    by :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram), and out by
+    :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever the wire looks like.
+    """
+
+    @property
+    def dialect(self) -> Dialect:
+        """What is spoken."""
+        ...
+
+    @property
+    def kin(self) -> Sequence[Dialect]:
+        """What it may be: more than one until :meth:`adopt` says which."""
+        ...
+
+    @property
+    def transport(self) -> Transport:
+        """What carries it."""
+        ...
+
+    @property
+    def replies(self) -> bool:
+        """Whether what comes may make it say something by itself."""
+        ...
+
+    @property
+    def counters(self) -> Counters:
+        """What went through."""
+        ...
+
+    @property
+    def state(self) -> State:
+        """Where the link is."""
+        ...
+
+    @property
+    def pending(self) -> bytes:
+        """What came and still waits for its rest."""
+        ...
+
+    def adopt(self, dialect: Dialect) -> None:
+        """It is this one of its kin."""
+        ...
+
+    def room(self) -> memoryview:
+        """Return where a stream's next bytes may be written; call :meth:`filled` next."""
+        ...
+
+    def filled(self, count: int, now: float) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`; False for no events yet.
+
+        ``now`` is for who bounds the time that a frame may take: seconds since any beginning.
+        """
+        ...
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes of a stream, or one whole datagram; never raises for what is in them."""
+        ...
+
+    def receive_eof(self) -> None:
+        """The peer will send no more."""
+        ...
+
+    def events(self) -> list[Event]:
+        """Return what came since the last call, in order; the caller owns the list."""
+        ...
+
+    def send(self, message: Message, *, answered: bool | None = None) -> None:
+        """Say something; write :meth:`data_to_send` next.
+
+        Raises:
+            LocalProtocolError: not now. Nothing has changed.
+            UnsupportedError: the dialect has no such message.
+        """
+        ...
+
+    def data_to_send(self) -> list[bytes]:
+        """Return what is to be written, in order."""
+        ...
+
+
+@dataclass(slots=True)
+class Counters:
+    """What went through a machine."""
+
+    frames_received: int = 0
+    frames_sent: int = 0
+    bytes_received: int = 0
+    bytes_sent: int = 0
+    ignored_frames: int = 0
+    unknown_ids: int = 0
+    unexpected_messages: int = 0
+    long_bodies: int = 0
+
+
+class Machine:
+    """One link's protocol: bytes to events and messages to bytes.
+
+    Feed what the socket gives to :meth:`receive_data`, take :meth:`events`; give what is to be said
+    to :meth:`send` and write :meth:`data_to_send`.
+
+    Args:
+        dialect: the wire variant.
+        role: which side this is.
+        transport: stream or datagrams.
+        max_length: largest payload accepted, bytes.
+        policy: other than the role's own; the emulator's quirks use it.
+        trace: called with the sender and each whole frame, in both directions, and with the error
+            for bytes that make none.
+        kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
+            that the answer to Connect does not fit are left out when it comes; where several are
+            left, :meth:`adopt` decides.
+    """
+
+    def __init__(
+        self,
+        dialect: FramedDialect,
+        role: Role,
+        transport: Transport,
+        *,
+        max_length: int = DEFAULT_MAX_LENGTH,
+        policy: Policy | None = None,
+        trace: Callable[[m.Sender, Frame | RemoteProtocolError], None] | None = None,
+        kin: Sequence[FramedDialect] = (),
+    ) -> None:
+        self.dialect: FramedDialect = dialect
+        self.kin: Sequence[FramedDialect] = kin or (dialect,)
+        self.role = role
+        self.transport = transport
+        self.replies: bool = False
+        self.error: RemoteProtocolError | None = None
+        self.counters: Counters = Counters()
+        self._policy = policy or POLICIES[role, transport]
+        self._bounded = self._policy.bounded
+        self._framer = Framer(dialect.header, max_length)
+        self._begun, self._begun_at = -1, 0.0  # number of the unfinished frame, when it was seen
+        self._unfinished = frame_age.Unfinished()
+        self._trace = trace
+        self._events: list[Event] = []
+        self._outbox: list[bytes] = []
+        self._open: set[int] = set()  # ids of the answers the camera owes (client role)
+        self._sender, self._sends = role.receives, role.sends
+        self._decoders: dict[int, Codec] = {}
+        self._take_up(dialect)
+        self.state = State.IDLE
+
+    def adopt(self, dialect: Dialect) -> None:
+        """It is this one of :attr:`kin`; statuses that :meth:`events` gave before are not redone.
+
+        Raises:
+            LocalProtocolError: it is none of them.
+        """
+        found = [one for one in self.kin if one is dialect]
+        if not found:
+            raise LocalProtocolError(f"{dialect.name} is none of {[d.name for d in self.kin]}")
+        self.kin = found
+        self._take_up(found[0])
+
+    def _take_up(self, dialect: FramedDialect) -> None:
+        self.dialect = dialect
+        self._decoders = dialect.decoders(self._sender)
+        if self._bounded:
+            self._framer.expect(dialect.lengths(self._sender))
+        result = dialect.encoder(m.ResultContainer)
+        self._burst_size = result.size
+        self._burst_reader = dialect.header.reader(result.size)
+        plain = self.role is Role.CLIENT and self._trace is None
+        self._takes_bursts = plain and result.size > 0
+
+    @property
+    def state(self) -> State:
+        """Where the link is."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state = state
+        self._deaf = state is State.FAILED or state is State.CLOSED
+        self._may_come = _SAID[state, self._sender]
+        self._may_go = _SAID[state, self._sends]
+
+    # ------------------------------------------------------------------ bytes in
+
+    @property
+    def buffered(self) -> int:
+        """Bytes of an unfinished frame that are kept; at most one header and one payload."""
+        return self._framer.buffered
+
+    @property
+    def pending(self) -> bytes:
+        """Copy of those bytes."""
+        return self._framer.pending
+
+    def receive_data(self, data: bytes | bytearray | memoryview) -> None:
+        """Take bytes from a stream, or one whole datagram; call :meth:`events` next.
+
+        Never raises for what is in the bytes. In state FAILED or CLOSED they are dropped.
+        """
+        if self._deaf:
+            return
+        self.counters.bytes_received += len(data)
+        self._framer.feed(data)
+        if self.transport is Transport.UDP:
+            self._receive_datagram()
+        else:
+            self._receive_frames()
+
+    def room(self) -> memoryview:
+        """Return where a stream's next bytes may be written; call :meth:`filled` next."""
+        return self._framer.room()
+
+    def filled(self, count: int, now: float = 0.0) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
+
+        A frame that does not become whole in time is broken, as the policy says.
+
+        Args:
+            count: of the bytes.
+            now: when they came, in seconds since any beginning.
+
+        Returns:
+            False where a large frame goes on, so that there are no events yet.
+        """
+        if self._deaf:
+            return False
+        self.counters.bytes_received += count
+        cut = self._framer.filled(count)
+        if cut:
+            before = self.counters.frames_received
+            self._receive_frames()
+            came = self.counters.frames_received - before
+            if came > MANY_FRAMES or len(self._events) > MANY_EVENTS:
+                self._framer.read_less()
+        if self._bounded and self._framer.buffered:
+            number = self.counters.frames_received
+            if number != self._begun:
+                self._begun, self._begun_at = number, now
+            else:
+                return self._is_overdue(now) or cut
+        return cut
+
+    def receive_eof(self) -> None:
+        """The peer will send no more; call :meth:`events` next."""
+        if self._deaf:
+            return
+        self._events.append(LinkEnded(pending=self._framer.buffered))
+        self._framer.clear()
+        self.state = State.CLOSED
+
+    def events(self) -> list[Event]:
+        """Return what came since the last call, in order; the caller owns the list."""
+        events, self._events = self._events, []
+        return events
+
+    # ------------------------------------------------------------------ messages out
+
+    def send(self, message: Message, *, answered: bool | None = None) -> None:
+        """Say something; write :meth:`data_to_send` next.
+
+        Args:
+            message: what to say.
+            answered: for an :class:`~smartcam.protocols.messages.UnknownMessage`, whether an
+                answer is expected; by default what the table says, True for an unknown id.
+
+        Raises:
+            LocalProtocolError: this state forbids it, it does not fit its fields, or an answer of
+                the same id is still owed (answers carry no correlation). Nothing has changed.
+        """
+        following = self._may_go.get(type(message))
+        if following is None:
+            raise LocalProtocolError(
+                f"{type(message).__name__} cannot be sent by the {self.role.value} "
+                f"in state {self.state.value}"
+            )
+        constant = self.dialect.constant.get(type(message))
+        if constant is not None:
+            data, message_id, owed = constant
+        else:
+            data, message_id = self.dialect.encode(message), self.dialect.message_id(message)
+            owed = self.dialect.answer_id(message_id)
+        if self.role is Role.CAMERA or answered is False:
+            owed = None
+        elif answered:
+            owed = message_id
+        if owed in self._open:
+            raise LocalProtocolError(
+                f"an answer to message {message_id:#04x} is still owed; one request of an id "
+                "can be open"
+            )
+        if owed is not None:
+            self._open.add(owed)
+        if following is not self._state:
+            self.state = following
+        self._outbox.append(data)
+        self.counters.frames_sent += 1
+        self.counters.bytes_sent += len(data)
+        if self._trace is not None:
+            self._trace(self._sends, Frame(message_id, data[self.dialect.header.size :]))
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the frames to write, in order: one write each on UDP, any on TCP."""
+        outbox, self._outbox = self._outbox, []
+        return outbox
+
+    # ------------------------------------------------------------------ inside
+
+    def _receive_frames(self) -> None:
+        framer = self._framer
+        while True:
+            try:
+                found = framer.cut()
+            except RemoteProtocolError as error:
+                if self._reject(error):
+                    return
+                framer.resync()
+                continue
+            if found is None:
+                return
+            self._receive_frame(*found)
+            if self._deaf:
+                return
+
+    def _is_overdue(self, now: float) -> bool:
+        """Whether the frame that is begun will not become whole; then it is rejected."""
+        framer, begun = self._framer, self._unfinished
+        age = begun.age(self._begun, self._begun_at, now)
+        if age < frame_age.HINT_TIME:
+            return False
+        header = self.dialect.header
+        message_id, size = framer.unfinished() or (None, header.size)
+        which = "a header" if message_id is None else f"a frame of message {message_id:#04x}"
+        there = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
+        other = framer.header_within(begun.searched)
+        if other is not None:
+            text = f"{which} holds another header at byte {other}; {there}"
+        elif age > frame_age.FRAME_TIME + size / frame_age.FRAME_RATE:
+            text = f"{which} does not become whole: {there}"
+        else:
+            begun.searched = max(framer.buffered - header.size + 1, 0)
+            return False
+        self._reject(FrameError(text, offset=other or 0, data=framer.pending[: header.size]))
+        return True
+
+    def _receive_datagram(self) -> None:
+        framer = self._framer
+        try:
+            found = framer.cut()
+            if found is None or framer.buffered:
+                raise MessageError(
+                    f"a datagram is not one whole frame: {hex_excerpt(framer.pending)}",
+                    data=framer.pending,
+                )
+        except RemoteProtocolError as error:
+            self._reject(error)
+        else:
+            self._receive_frame(*found)
+        framer.clear()
+
+    def _receive_frame(self, message_id: int, begin: int, end: int) -> None:
+        """Make a message of a frame whose payload is at a place of the framer's."""
+        counters, framer = self.counters, self._framer
+        counters.frames_received += 1
+        if len(self.kin) > 1 and self._state is State.CONNECTING:
+            self._narrow(message_id, end - begin)
+        if self._trace is not None:
+            self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
+        codec = self._decoders.get(message_id)
+        surplus = 0
+        message: Message
+        try:
+            if codec is None:
+                payload = framer.take(begin, end)
+                message = m.UnknownMessage(message_id=message_id, payload=payload)
+            elif self._policy.tells and not codec.fits(end - begin):
+                payload = framer.take(begin, end)
+                message = m.MalformedMessage(message_id=message_id, payload=payload)
+            else:
+                if not codec.has_data:
+                    surplus = end - begin - codec.size
+                if surplus > 0 and self._policy.exact_length:
+                    raise MessageError(
+                        f"message {message_id:#04x} is {surplus} bytes too long",
+                        data=framer.take(begin, end),
+                    )
+                message = codec.decode(framer.buffer, begin, end)
+            kind = type(message)
+            following = self._may_come.get(kind)
+            if following is None:
+                raise MessageError(
+                    f"{type(message).__name__} ({message_id:#04x}) came in state "
+                    f"{self._state.value}, where it is not expected",
+                    data=framer.take(begin, end),
+                )
+        except RemoteProtocolError as error:
+            self._reject(error)
+            return
+        if surplus > 0:
+            counters.long_bodies += 1
+        if following is not self._state:
+            self.state = following
+        if kind in _BY_ITSELF:
+            self._open.discard(message_id)  # asked for, in a dialect or by a raw request
+        elif self.role is Role.CLIENT and not self._wanted(message_id, known=codec is not None):
+            return
+        self._events.append(message)
+        if self._takes_bursts and isinstance(message, m.ResultContainer) and framer.buffered:
+            self._receive_burst(message, begin)
+
+    def _narrow(self, message_id: int, size: int) -> None:
+        """Leave out the kin that have no such message, or another length of it."""
+        decoders = [dialect.decoders(self._sender).get(message_id) for dialect in self.kin]
+        fitting = tuple(
+            dialect
+            for dialect, codec in zip(self.kin, decoders, strict=True)
+            if codec is not None and codec.fits(size)
+        )
+        if fitting and fitting != self.kin:
+            self.kin = fitting
+            self._take_up(fitting[0])
+
+    def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
+        """Take the result containers of the same application that come next in these bytes."""
+        like = begin - self.dialect.header.size
+        framer = self._framer
+        before = framer.buffered
+        more = framer.following(self._burst_reader, like, self._burst_size)
+        if more:
+            self.counters.frames_received += len(more)
+            size = before - framer.buffered - len(more) * (begin - like + self._burst_size)
+            size += len(first.data)
+            more.insert(0, first.data)
+            self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
+
+    def _wanted(self, message_id: int, *, known: bool) -> bool:
+        """Whether the client shall see it: an answer that nothing asked for is counted only."""
+        self.counters.unknown_ids += not known
+        if message_id in self._open:
+            self._open.remove(message_id)
+            return True
+        self.counters.unexpected_messages += known
+        return not known
+
+    def _reject(self, error: RemoteProtocolError) -> bool:
+        """Fail the link (True) or drop and count, as the policy says."""
+        if self._trace is not None:
+            self._trace(self._sender, error)
+        if not isinstance(error, self._policy.fatal):
+            self.counters.ignored_frames += 1
+            return False
+        self.state = State.FAILED
+        self.error = error
+        self._framer.clear()
+        self._events.append(LinkFailed(error=error))
+        return True

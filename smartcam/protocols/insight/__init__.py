@@ -1,0 +1,1 @@
+"""In-Sight's native mode: commands and answers are lines of text."""

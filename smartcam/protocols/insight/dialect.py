@@ -1,0 +1,263 @@
+"""The native mode of Cognex In-Sight cameras: text over telnet.
+
+What the library says (:mod:`smartcam.protocols.messages`) becomes command lines, one after the
+other, each answered before the next is sent; what comes back becomes the library's messages. So the
+client knows nothing of commands. What is known of the camera, and who says so, stands in
+``docs/insight.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import (
+    CommandRejectedError,
+    ConfigurationError,
+    LocalProtocolError,
+    UnsupportedError,
+)
+from smartcam.models import Capabilities
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import (
+    Code,
+    Dialect,
+    Protocol,
+    RawRequest,
+    Spelled,
+    Transport,
+    Verdict,
+)
+from smartcam.protocols.insight.machine import Command, InSightMachine, Piece, Reply, unsendable
+from smartcam.protocols.insight.words import (
+    COMMANDS,
+    DEFAULT_PORT,
+    ENCODING,
+    LAST_JOB_ID,
+    LINE_END,
+    MAX_CELLS,
+    StatusCode,
+    code_text,
+    parse_cells,
+    parse_tag,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.protocols.framed.framing import Frame
+
+__all__ = ["INSIGHT", "NATIVE", "InSightDialect"]
+
+MAX_LOGIN = 255
+"""Characters of a user's name or password; the camera's own bound is not published."""
+
+_VERDICTS: Mapping[int, Verdict] = {
+    StatusCode.DONE: Verdict.DONE,
+    StatusCode.UNRECOGNIZED: Verdict.UNKNOWN,
+}
+"""What codes say; the others refuse."""
+
+_LOGIN = Code("the user or the password is wrong", Verdict.REFUSED)
+
+_MNEMONICS: Mapping[type[m.Message], str] = {
+    m.GetStatus: "GO",
+    m.Query: "GJ",
+    m.SwitchApplication: "SJ",
+    m.LoadFile: "LF",
+    m.Start: "SO",
+    m.Stop: "SO",
+    m.Trigger: "SW",
+    m.ReadImage: "RI",
+}
+"""The command behind each of the library's requests."""
+
+_REQUESTS = frozenset({m.Connect, m.Disconnect, Command, *_MNEMONICS})
+_REPORTS = frozenset(
+    {m.ResultContainer, *(one.answer for one in _REQUESTS if issubclass(one, m.Request))}
+) - {None}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InSightDialect(Dialect):
+    """In-Sight native mode.
+
+    Args:
+        name: as in ``?dialect=``.
+        about: one line for people.
+        source: where it is described, with its grade.
+        user: who logs in.
+        password: the user's.
+        cells: cells that are read after each trigger, in order, as commands name them.
+        counter: a cell that counts runs, read before and after them; "" for none.
+    """
+
+    user: str = "admin"
+    password: str = field(default="", repr=False)
+    cells: tuple[str, ...] = ()
+    counter: str = ""
+
+    def with_parameters(self, parameters: Mapping[str, str]) -> InSightDialect:
+        """Return the dialect with user, password, cells and counter of a URL.
+
+        Raises:
+            ConfigurationError: a cell is none, or a text cannot be sent.
+        """
+        for key in ("user", "password"):
+            problem = unsendable(parameters.get(key, ""), MAX_LOGIN)
+            if problem is not None:
+                raise ConfigurationError(f"{key}: {problem}")
+        counter = _cell_names(parameters.get("counter", ""))
+        if len(counter) > 1:
+            raise ConfigurationError(f"counter: one cell, not {len(counter)}")
+        return replace(
+            self,
+            user=parameters.get("user", self.user),
+            password=parameters.get("password", self.password),
+            cells=tuple(_cell_names(parameters.get("cells", ""))),
+            counter="".join(counter),
+        )
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a camera can do in it."""
+        return Capabilities(
+            dialect=self.name,
+            switch=True,
+            load_file=True,
+            start_stop=True,
+            result_codes=True,
+            get_status=True,
+            read_image=True,
+        )
+
+    @property
+    def application_ids(self) -> range:
+        """Ids of jobs: 0 to 999 (published)."""
+        return range(LAST_JOB_ID + 1)
+
+    @property
+    def in_order(self) -> bool:
+        """A connection's commands are done one after the other."""
+        return True
+
+    @property
+    def exclusive(self) -> bool:
+        """Several users may be connected at a time (published)."""
+        return False
+
+    @property
+    def has_login(self) -> bool:
+        """A user logs in."""
+        return True
+
+    def code(self, code: int, request: type[m.Message] | None = None) -> Code:
+        """Return what a status code means in the answer to a request."""
+        if request is m.Connect and code != StatusCode.DONE:
+            return _LOGIN
+        mnemonic = _MNEMONICS.get(request, "") if request is not None else ""
+        return Code(code_text(mnemonic, code), _VERDICTS.get(code, Verdict.REFUSED))
+
+    def has(self, message_type: type[m.Message]) -> bool:
+        """Whether there is such a message."""
+        return message_type in _REQUESTS or message_type in _REPORTS
+
+    def message_id(self, message: m.Message | type[m.Message]) -> int:
+        """Return 0: commands have no numbers.
+
+        Raises:
+            UnsupportedError: it has no such message.
+        """
+        kind = message if isinstance(message, type) else type(message)
+        if not self.has(kind):
+            raise self.unsupported(kind)
+        return 0
+
+    def called(self, message: m.Message) -> str:
+        """Return what an error calls a message: its name, and its command."""
+        kind = type(message)
+        command = message.line if isinstance(message, Command) else _MNEMONICS.get(kind, "")
+        return f"{kind.__name__} ({command[:32]})"
+
+    def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
+        """Return a line in words; the password is not shown."""
+        text = frame.payload.decode(ENCODING)
+        if frame.message_id == Piece.PASSWORD:
+            return Spelled(None, "password", {"text": "***"}, b"")
+        if frame.message_id == Piece.TEXT:
+            return Spelled(None, "text", {"text": text}, frame.payload)
+        what = "command" if sender is m.Sender.CLIENT else "line"
+        return Spelled(None, what, {"text": text}, frame.payload + LINE_END)
+
+    def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
+        """Return a command of one's own, such as ``GVA001``; the payload stands behind it.
+
+        Raises:
+            UnsupportedError: the form of its answer is not known.
+            ConfigurationError: it is no line.
+        """
+        line = f"{message_id}{payload.decode(ENCODING)}"
+        if not isinstance(message_id, str) or line[:2].upper() not in COMMANDS:
+            known = ", ".join(COMMANDS)
+            raise UnsupportedError(
+                f"dialect {self.name}: {line[:32]!r} begins with no command that is known: {known}"
+            )
+        return RawRequest(Command(line=line), Reply, answered=True, known=True)
+
+    def body(self, answer: m.Message) -> bytes:
+        """Return the data behind the code.
+
+        Raises:
+            UnsupportedError: the code says that the camera does not know the command.
+            CommandRejectedError: the code says that the command was not done.
+        """
+        if not isinstance(answer, Reply):
+            raise LocalProtocolError(f"{type(answer).__name__} is no answer to a command")
+        if answer.code == StatusCode.DONE:
+            return answer.data
+        said = f"{answer.line}: the camera answered {answer.code}"
+        said = f"{said}: {code_text(answer.line, answer.code)}"
+        if answer.code == StatusCode.UNRECOGNIZED:
+            raise UnsupportedError(said)
+        raise CommandRejectedError(said, code=answer.code)
+
+
+def _cell_names(text: str) -> list[str]:
+    """Return the cells that a URL names, as commands name them.
+
+    Raises:
+        ConfigurationError: one is neither a cell, a range, nor a name; or there are too many.
+    """
+    names: list[str] = []
+    for part in filter(None, (one.strip() for one in text.split(","))):
+        if ":" in part or part[1:2].isdecimal():
+            names += [cell.wire for cell in parse_cells(part)]
+        else:
+            parse_tag(part)
+            names.append(part)
+        if len(names) > MAX_CELLS:
+            raise ConfigurationError(f"cells: more than {MAX_CELLS}")
+    return names
+
+
+NATIVE = InSightDialect(
+    name="native",
+    about="native mode: text over telnet; ?cells= names what is read after a trigger",
+    source="docs/insight.md, published and derived",
+)
+
+INSIGHT = Protocol(
+    name="insight",
+    schemes={"insight": Transport.TCP},
+    default_port=DEFAULT_PORT,
+    models=("IN-SIGHT",),
+    dialects={NATIVE.name: NATIVE},
+    machine=InSightMachine,
+    parameters={
+        "user": "who logs in; default admin",
+        "password": "the user's; default none",
+        "cells": "cells that are a result's values, such as B2,C2,D4:F6",
+        "counter": "a cell that counts runs: values of several runs are told by it",
+    },
+)
+"""What the entry point ``insight`` gives."""

@@ -1,0 +1,458 @@
+"""One connection to an In-Sight camera, as a link sees it: the client's side of native mode.
+
+Commands have no numbers and answers do not name them, so one is sent when the one before it is
+answered. What the library asks for is a script (:class:`InSightMachine`): the commands that it
+takes, one after the other, and the messages that come of their answers.
+"""
+
+from __future__ import annotations
+
+import collections
+import enum
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameError,
+    LocalProtocolError,
+    RemoteProtocolError,
+)
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols.base import Dialect, Role, Transport
+from smartcam.protocols.framed.framing import Frame
+from smartcam.protocols.framed.machine import Counters, Event, LinkEnded, LinkFailed, State
+from smartcam.protocols.insight.answers import Answer, AnswerReader
+from smartcam.protocols.insight.words import (
+    COMMANDS,
+    ENCODING,
+    ERROR_VALUE,
+    INVALID_PASSWORD,
+    LAST_JOB_ID,
+    LINE_END,
+    LOGGED_IN,
+    MAX_LINE,
+    PASSWORD_PROMPT,
+    TRIGGER_EVENT,
+    USER_PROMPT,
+    WELCOME,
+    StatusCode,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator, Sequence
+
+    from smartcam.protocols.insight.dialect import InSightDialect
+
+    Script = Generator[str, Answer, None]
+    """Yields command lines and is sent their answers; what it finds out it tells as messages."""
+
+__all__ = ["Command", "InSightMachine", "Piece", "Reply"]
+
+ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+"""Status of a camera that is online: an event 8 is taken. It tells no more of itself."""
+
+READ_SIZE = 1 << 15
+"""Bytes that one read takes at most."""
+
+
+class Piece(enum.IntEnum):
+    """What a frame of a trace is; it stands where other protocols have the message id."""
+
+    LINE = 0
+    """A line, without its end."""
+    TEXT = 1
+    """Bytes without a line end: a prompt, or a counted text."""
+    PASSWORD = 2
+    """The line with the password, which is not shown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reply(m.Acknowledgement):
+    """The answer to a :class:`Command`: its code, and the data behind it."""
+
+    line: str
+    data: bytes = b""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command(m.Request):
+    """A command line of any kind that the library knows the answer's form of.
+
+    Raises:
+        ConfigurationError: it is none, or it cannot be sent.
+    """
+
+    answer: ClassVar[type[m.Message] | None] = Reply
+
+    line: str
+
+    def __post_init__(self) -> None:
+        problem = unsendable(self.line, MAX_LINE)
+        if problem is None and self.line[:2].upper() not in COMMANDS:
+            problem = f"it begins with none of {', '.join(COMMANDS)}"
+        if problem is not None:
+            raise ConfigurationError(f"command {self.line[:64]!r}: {problem}")
+
+
+def unsendable(text: str, limit: int) -> str | None:
+    """Return why a text cannot be a line to the camera, None if it can.
+
+    Args:
+        text: without its end.
+        limit: bytes that it may have.
+    """
+    if not all(ord(char) < 256 and char not in "\r\n\0" for char in text):
+        return "only Latin-1 without line ends can be sent"
+    return None if len(text) <= limit else f"at most {limit} bytes can be sent"
+
+
+class _Job(NamedTuple):
+    """A request under way, or in line."""
+
+    kind: type[m.Message]
+    script: Script
+
+
+class InSightMachine:
+    """One connection's native mode, in the client's role; what a link needs.
+
+    See :class:`~smartcam.protocols.framed.machine.LinkMachine`. An answer belongs to the command
+    before it, and nothing else may come: a line that nothing was asked for ends the link.
+
+    Args:
+        dialect: user, password and cells.
+        role: the client's.
+        transport: TCP.
+        max_length: longest data of an answer, bytes; of an image 64 MiB.
+        trace: called with each piece in both directions, see :class:`Piece`, and with the error for
+            what broke the protocol; never with the password.
+        kin: unused, there is one dialect.
+
+    Raises:
+        ConfigurationError: another role or transport.
+    """
+
+    def __init__(
+        self,
+        dialect: InSightDialect,
+        role: Role,
+        transport: Transport,
+        *,
+        max_length: int,
+        trace: Callable[[m.Sender, Frame | RemoteProtocolError], None] | None = None,
+        kin: Sequence[Dialect] = (),
+    ) -> None:
+        if role is not Role.CLIENT or transport is not Transport.TCP:
+            raise ConfigurationError("In-Sight native mode: the client's side of TCP only")
+        self.dialect: InSightDialect = dialect
+        self.kin: Sequence[Dialect] = (dialect,)
+        self.transport: Transport = transport
+        self.replies: bool = True
+        self.counters: Counters = Counters()
+        self.state: State = State.IDLE
+        self._trace = trace
+        self._reader = AnswerReader(max_length=max_length, on_piece=self._on_piece)
+        self._store = memoryview(bytearray(READ_SIZE))
+        self._events: list[Event] = []
+        self._outbox: list[bytes] = []
+        self._login: Iterator[None] = iter(())
+        self._waiting: collections.deque[_Job] = collections.deque()  # at most one of a kind
+        self._job: _Job | None = None
+        self._scripts: dict[type[m.Message], Callable[[Any], Script]] = {
+            m.GetStatus: self._get_status,
+            m.Query: self._query,
+            m.SwitchApplication: self._load_id,
+            m.LoadFile: self._load_file,
+            m.Start: self._start,
+            m.Stop: self._stop,
+            m.Trigger: self._trigger,
+            m.ReadImage: self._read_image,
+            Command: self._command,
+        }
+
+    def adopt(self, dialect: Dialect) -> None:
+        """There is one dialect."""
+
+    # ------------------------------------------------------------------ bytes in
+
+    @property
+    def buffered(self) -> int:
+        """Bytes that wait for more: of a line, or of a counted text."""
+        return len(self._reader)
+
+    @property
+    def pending(self) -> bytes:
+        """Copy of those bytes."""
+        return self._reader.pending
+
+    def room(self) -> memoryview:
+        """Return where the next bytes may be written; call :meth:`filled` next."""
+        return self._store
+
+    def filled(self, count: int, now: float = 0.0) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`."""
+        self.receive_data(bytes(self._store[:count]))
+        return True
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes; call :meth:`events` next. Never raises for what is in them.
+
+        After Disconnect, and in state FAILED or CLOSED, they are dropped.
+        """
+        if self.state in {State.FAILED, State.CLOSED}:
+            return
+        self.counters.bytes_received += len(data)
+        if self.state is not State.DISCONNECTED:
+            self._reader.feed(data)
+            self._read()
+
+    def receive_eof(self) -> None:
+        """The camera will send no more; call :meth:`events` next."""
+        if self.state in {State.FAILED, State.CLOSED}:
+            return
+        self._events.append(LinkEnded(pending=self.buffered))
+        self._end(State.CLOSED)
+
+    def events(self) -> list[Event]:
+        """Return what came since the last call, in order; the caller owns the list."""
+        events, self._events = self._events, []
+        return events
+
+    def _read(self) -> None:
+        try:
+            if self.state is State.CONNECTING:
+                next(self._login, None)
+            if self.state is State.CONNECTED:
+                self._read_answers()
+            elif self.buffered > 2 * MAX_LINE:
+                raise FrameError(f"more than {2 * MAX_LINE} bytes came before the login")
+        except RemoteProtocolError as error:
+            if self._trace is not None:
+                self._trace(m.Sender.CAMERA, error)
+            self._events.append(LinkFailed(error=error))
+            self._end(State.FAILED)
+
+    def _read_answers(self) -> None:
+        while self._job is not None:
+            answer = self._reader.next_answer()
+            if answer is None:
+                return
+            self._go_on(self._job, answer)
+        line = self._reader.next_line()
+        if line is not None:
+            raise FrameError(f"{line[:64]!r} came, nothing was asked", data=line.encode(ENCODING))
+
+    def _end(self, state: State) -> None:
+        """Nothing more is said or read."""
+        self.state = state
+        self._job = None
+        self._waiting.clear()
+        self._reader = AnswerReader(max_length=0, on_piece=self._on_piece)
+
+    def _on_piece(self, text: str, ended: bool) -> None:
+        self.counters.frames_received += 1
+        if self._trace is not None:
+            kind = Piece.LINE if ended else Piece.TEXT
+            self._trace(m.Sender.CAMERA, Frame(kind, text.encode(ENCODING)))
+
+    # ------------------------------------------------------------------ messages out
+
+    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
+        """Put a request in line; write :meth:`data_to_send` next.
+
+        A Get status that is in line already is not repeated: its answer is new enough. Disconnect
+        has no words, the connection's end is that; what is in line is dropped.
+
+        Raises:
+            LocalProtocolError: there is no session, or an answer of the same kind is still owed.
+            UnsupportedError: the dialect has no such message.
+            ConfigurationError: a file's name cannot be sent.
+        """
+        kind = type(message)
+        self.dialect.message_id(kind)
+        if kind is m.Connect:
+            self._connect()
+        elif kind is m.Disconnect:
+            if self.state in {State.CONNECTING, State.CONNECTED}:
+                self._end(State.DISCONNECTED)
+        elif self.state is not State.CONNECTED or kind not in self._scripts:
+            raise LocalProtocolError(
+                f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
+            )
+        elif kind not in {job.kind for job in (self._job, *self._waiting) if job is not None}:
+            self._waiting.append(_Job(kind, self._scripts[kind](message)))
+            self._begin_next()
+        elif kind is not m.GetStatus:
+            raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
+
+    def data_to_send(self) -> list[bytes]:
+        """Return what is to be written, in order."""
+        outbox, self._outbox = self._outbox, []
+        return outbox
+
+    def _write(self, line: str, kind: Piece = Piece.LINE) -> None:
+        data = line.encode(ENCODING)
+        self._outbox.append(data + LINE_END)
+        self.counters.frames_sent += 1
+        self.counters.bytes_sent += len(data) + len(LINE_END)
+        if self._trace is not None:
+            self._trace(m.Sender.CLIENT, Frame(kind, b"" if kind is Piece.PASSWORD else data))
+
+    # ------------------------------------------------------------------ login
+
+    def _connect(self) -> None:
+        if self.state is not State.IDLE:
+            raise LocalProtocolError(f"Connect cannot be sent in state {self.state.value}")
+        self.state = State.CONNECTING
+        self._login = self._log_in()
+        self._read()  # the greeting may be there
+
+    def _log_in(self) -> Iterator[None]:
+        """Answer each prompt once, and hear whether the camera lets us in.
+
+        The greeting differs from model to model. A camera that asks for something again refuses by
+        that.
+        """
+        prompts = {
+            USER_PROMPT: (self.dialect.user, Piece.LINE),
+            PASSWORD_PROMPT: (self.dialect.password, Piece.PASSWORD),
+        }
+        while True:
+            prompt = next(filter(self._reader.take_prompt, (USER_PROMPT, PASSWORD_PROMPT)), None)
+            if prompt in prompts:
+                self._write(*prompts.pop(prompt))
+                continue
+            line = INVALID_PASSWORD if prompt is not None else self._reader.next_line()
+            said = "" if line is None else line.strip()
+            if said in {LOGGED_IN, INVALID_PASSWORD}:
+                code = StatusCode.DONE if said == LOGGED_IN else StatusCode.NO_ACCESS
+                self.state = State.CONNECTED
+                self._tell(m.ConnectAnswer(code=code, version=1))
+                return
+            if line is None:
+                yield
+            elif said and not said.startswith(WELCOME):
+                raise FrameError(
+                    f"{said[:64]!r} came, the greeting or the login of an In-Sight camera was "
+                    "expected",
+                    data=said.encode(ENCODING),
+                )
+
+    # ------------------------------------------------------------------ scripts
+
+    def _begin_next(self) -> None:
+        while self._job is None and self._waiting:
+            self._job = self._waiting.popleft()
+            self._go_on(self._job, None)
+
+    def _go_on(self, job: _Job, answer: Answer | None) -> None:
+        """Let a script take an answer; write its next line, or begin the next script."""
+        try:
+            line = next(job.script) if answer is None else job.script.send(answer)
+        except StopIteration:
+            self._job = None
+            self._begin_next()
+            return
+        self._reader.expect(COMMANDS[line[:2].upper()].form)
+        self._write(line)
+
+    def _tell(self, message: m.Message) -> None:
+        self._events.append(message)
+
+    def _get_status(self, _message: m.Message | None = None) -> Script:
+        online = (yield "GO").text.strip()
+        if online not in {"0", "1"}:
+            raise FrameError(
+                f"{online[:64]!r} came, 0 (offline) or 1 (online) was expected",
+                data=online.encode(ENCODING),
+            )
+        self._tell(m.StatusReport(status=ONLINE if online == "1" else Status(0)))
+
+    def _name_job(self) -> Generator[str, Answer, int]:
+        """Return the active job's id.
+
+        One without an id has none, and so has one that the camera does not name.
+        """
+        code, text, _ = yield "GJ"
+        if code != StatusCode.DONE:
+            return m.UNNAMED_APPLICATION
+        said = text.strip()
+        if not said.isdecimal() or len(said) > 9 or int(said) > LAST_JOB_ID:
+            raise FrameError(
+                f"{said[:64]!r} came, the id of a job was expected", data=said.encode(ENCODING)
+            )
+        return int(said)
+
+    def _query(self, _message: m.Message) -> Script:
+        job = yield from self._name_job()
+        self._tell(m.QueryAnswer(code=StatusCode.DONE, application=job))
+
+    def _load_id(self, message: m.SwitchApplication) -> Script:
+        return self._load(Command(line=f"SJ{message.application}"))
+
+    def _load_file(self, message: m.LoadFile) -> Script:
+        return self._load(Command(line="LF" + message.name.decode(errors="replace")))
+
+    def _load(self, command: Command) -> Script:
+        code = (yield command.line).code
+        job = yield from self._name_job()
+        self._tell(m.SwitchAnswer(code=code, application=job))
+
+    def _start(self, _message: m.Message) -> Script:
+        self._tell(m.StartAnswer(code=(yield "SO1").code))
+
+    def _stop(self, _message: m.Message) -> Script:
+        self._tell(m.StopAnswer(code=(yield "SO0").code))
+
+    def _trigger(self, _message: m.Message) -> Script:
+        """Trigger, and when the cells are up to date, read them.
+
+        Where the camera took none, its status goes first: it may say why.
+        """
+        code = (yield f"SW{TRIGGER_EVENT}").code
+        if code == StatusCode.FAILED:
+            yield from self._get_status()
+        self._tell(m.TriggerAnswer(code=code))
+        if code != StatusCode.DONE:
+            return
+        job = yield from self._name_job()
+        counter = self.dialect.counter
+        before = (yield from self._value(counter)) if counter else None
+        said: dict[str, str | None] = {}
+        for cell in self.dialect.cells:
+            said[cell] = yield from self._value(cell)
+        after = (yield from self._value(counter)) if counter else None
+        cells = [
+            m.CellValue(cell, None if said[cell] == ERROR_VALUE else said[cell])
+            for cell in self.dialect.cells
+        ]
+        fault = None
+        if before != after:
+            fault = (
+                f"cell {counter}, which counts runs, went from {before} to {after} while the cells "
+                "were read: they may be of more than one run"
+            )
+        self._tell(
+            m.ResultContainer(
+                application=job, data=json.dumps(said).encode(), cells=tuple(cells), fault=fault
+            )
+        )
+
+    def _value(self, cell: str) -> Generator[str, Answer, str | None]:
+        """Return a cell's text, None for one that is empty or does not exist."""
+        answer = yield f"GV{cell}"
+        return answer.text if answer.code == StatusCode.DONE else None
+
+    def _read_image(self, _message: m.Message) -> Script:
+        answer = yield "RI"
+        if answer.code == StatusCode.UNRECOGNIZED:
+            answer = yield "RB"
+        self._tell(m.Image(code=answer.code, data=answer.data))
+
+    def _command(self, message: Command) -> Script:
+        answer = yield message.line
+        data = answer.data or answer.text.encode(ENCODING)
+        self._tell(Reply(line=message.line, code=answer.code, data=data))

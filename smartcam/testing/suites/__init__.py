@@ -1,0 +1,1 @@
+"""Suites for authors of plug-ins: subclass, give examples, inherit the tests."""
