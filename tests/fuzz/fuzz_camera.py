@@ -7,27 +7,21 @@ frame, time, or something that an operator does. What the camera says is heard b
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
-
-from fuzz_input import Choices
+from collections.abc import Callable
+from typing import Any
 
 from smartcam.emulator import Application, Device, Quirks
-from smartcam.emulator.application import BUILTIN_APPLICATIONS
-from smartcam.emulator.bvs.behaviour import manner_of
-from smartcam.emulator.bvs.device import Mode
+from smartcam.emulator._application import BUILTIN_APPLICATIONS
+from smartcam.emulator._bvs.behaviour import behaviour_of
+from smartcam.emulator._bvs.device import Mode
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import POLICIES, Policy, Role, Transport
-from smartcam.protocols.bvs import B16, BID, CODES, HANDBOOK, THESIS, ResultCode
-from smartcam.protocols.framed.machine import Machine, State
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from smartcam.protocols.framed.dialect import FramedDialect
-
-__all__ = ["check"]
+from smartcam.protocols._base import POLICIES, Policy, Role, Transport
+from smartcam.protocols._bvs import B16, BID, CODES, HANDBOOK, THESIS, ResultCode
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.machine import Machine, State
+from tests.fuzz.fuzz_input import Choices
 
 DIALECTS = (HANDBOOK, THESIS, B16, BID, B16.with_quirks(["code"]))
 QUIRKS = (
@@ -64,12 +58,16 @@ class Camera:
     def __init__(
         self, dialect: FramedDialect, quirks: Quirks, active: int, *, running: bool
     ) -> None:
-        manner = manner_of(dialect, quirks)
+        behaviour = behaviour_of(dialect, quirks)
         self.device = Device(
-            APPLICATIONS.values(), active=active, quirks=quirks, running=running, manner=manner
+            APPLICATIONS.values(),
+            active=active,
+            quirks=quirks,
+            running=running,
+            behaviour=behaviour,
         )
         policy = dataclasses.replace(
-            POLICIES_ON_A_BAD_FRAME[quirks.bad_frame], tells=manner.tells_bad_messages
+            POLICIES_ON_A_BAD_FRAME[quirks.bad_frame], tells=behaviour.tells_bad_messages
         )
         self.dialect = dialect
         self.machine = Machine(dialect, Role.CAMERA, Transport.TCP, max_length=LIMIT, policy=policy)
@@ -104,8 +102,8 @@ class Camera:
         heard = self.client.events()
         carried = [self.on_the_wire(message) for message in output]
         assert heard == [message for message in carried if isinstance(message, BY_ITSELF)]
-        if device.connected and device.manner.reports_changes:
-            assert self.status is not None or not device.manner.status_with_session
+        if device.connected and device.behaviour.reports_changes:
+            assert self.status is not None or not device.behaviour.status_with_session
             if self.status is not None:
                 assert (self.status.status, self.status.endian) == (device.status, device.endian)
         if device.connected:
@@ -127,7 +125,7 @@ class Camera:
             case m.ConnectAnswer():
                 self.status = None
             case m.StatusReport():
-                asked = not self.device.manner.status_with_session
+                asked = not self.device.behaviour.status_with_session
                 assert message != self.status or asked, "the same status twice"
                 assert not message.status & ~sum(Status), "a bit without a name"
                 both = Status.BUSY | Status.WAITING_FOR_TRIGGER
@@ -148,7 +146,7 @@ class Camera:
                 assert message.application in APPLICATIONS
             case m.Acknowledgement(code=code) if self.dialect.has(type(message)):
                 assert code in CODES
-            case m.UnknownMessage(payload=payload) if self.device.manner.tells_bad_messages:
+            case m.UnknownMessage(payload=payload) if self.device.behaviour.tells_bad_messages:
                 assert int.from_bytes(payload, "little") in CODES
             case _:
                 raise AssertionError(f"a camera says no {message}")

@@ -7,22 +7,15 @@ fills them.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 from unittest import mock
 
-from fuzz_input import Choices
-from machines import DIALECTS
-
 from smartcam.exceptions import FrameError
-from smartcam.protocols.framed import framing
-from smartcam.protocols.framed.framing import Frame, Framer, HeaderLayout
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from smartcam.protocols.framed.machine import Machine
-
-__all__ = ["HEADERS", "check", "write"]
+from smartcam.protocols._framed import framing
+from smartcam.protocols._framed.framing import Frame, Framer, HeaderLayout
+from smartcam.protocols._framed.machine import Machine
+from tests.fuzz.fuzz_input import Choices
+from tests.machines import DIALECTS
 
 HEADERS = (
     *(dialect.header for dialect in DIALECTS),

@@ -11,16 +11,13 @@ import math
 from datetime import UTC, datetime
 from typing import Any
 
-from fuzz_input import Choices
-from fuzz_layout import fitted
-
 from smartcam._client.interpretation import Interpretation
 from smartcam.exceptions import InterpretationError
 from smartcam.interpreters import resolve
 from smartcam.models import Localization, jsonable
 from smartcam.protocols.messages import ResultContainer
-
-__all__ = ["SPECS", "check"]
+from tests.fuzz.fuzz_input import Choices
+from tests.fuzz.fuzz_layout import fitted
 
 SPECS = (
     "localizations",

@@ -11,13 +11,10 @@ import math
 import pickle
 from typing import Any
 
-from fuzz_input import Choices, text_of
-
 from smartcam.exceptions import ConfigurationError, InterpretationError, LayoutError
 from smartcam.layout import Field, Layout, Record
 from smartcam.models import ByteOrder, jsonable
-
-__all__ = ["Turn", "check", "fitted"]
+from tests.fuzz.fuzz_input import Choices, text_of
 
 
 class Turn(enum.IntFlag):

@@ -12,13 +12,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING
 from unittest import mock
-
-from fuzz_framing import write
-from fuzz_input import Choices
-from fuzz_wire import check_decoding
-from machines import DIALECTS, EXAMPLES, one_by_one
 
 from smartcam.exceptions import (
     FrameError,
@@ -28,16 +22,21 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import POLICIES, Policy, Role, Transport
-from smartcam.protocols.framed import framing
-from smartcam.protocols.framed.framing import Frame
-from smartcam.protocols.framed.machine import TRANSITIONS, LinkEnded, LinkFailed, Machine, State
-
-if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
-    from smartcam.protocols.framed.machine import Event
-
-__all__ = ["check"]
+from smartcam.protocols._base import POLICIES, Policy, Role, Transport
+from smartcam.protocols._framed import framing
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._framed.machine import (
+    TRANSITIONS,
+    Event,
+    LinkEnded,
+    LinkFailed,
+    Machine,
+    State,
+)
+from tests.fuzz.fuzz_framing import write
+from tests.fuzz.fuzz_input import Choices, check_decoding
+from tests.machines import DIALECTS, EXAMPLES, one_by_one
 
 OWN_POLICY = None
 CHOSEN_POLICIES = (

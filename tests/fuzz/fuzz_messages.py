@@ -8,19 +8,15 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from fuzz_input import Choices
-from fuzz_wire import check_decoding
-from machines import DIALECTS
-
 from smartcam.models import jsonable
 from smartcam.protocols import messages as m
-from smartcam.protocols.framed.constructs import view_fields
-from smartcam.protocols.framed.framing import Frame
+from smartcam.protocols._framed.constructs import view_fields
+from smartcam.protocols._framed.framing import Frame
+from tests.fuzz.fuzz_input import Choices, check_decoding
+from tests.machines import DIALECTS
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
-
-__all__ = ["check"]
+    from smartcam.protocols._framed.dialect import FramedDialect
 
 ANY_ID = 0xFF
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from smartcam.emulator import Device, ManualClock, Scenario, load_scenarios
-from smartcam.emulator.scenario.timeline import Timeline
+from smartcam.emulator._scenario.timeline import Timeline
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
     from smartcam.emulator.faults import Fault
-
-__all__ = ["check"]
 
 GREEDY = (b"slots", b"&")
 """What can make much of little; only with these is memory measured, which takes time."""

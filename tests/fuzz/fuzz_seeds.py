@@ -6,26 +6,21 @@ import contextlib
 import re
 import struct
 import tomllib
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
-from fuzz_interpreters import SPECS
-from machines import DIALECTS
-
-from smartcam.emulator.application import BUILTIN_APPLICATIONS, LOCALIZATIONS
+from smartcam.emulator._application import BUILTIN_APPLICATIONS, LOCALIZATIONS
 from smartcam.exceptions import LayoutError
 from smartcam.layout import Layout
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.framed.machine import State
+from smartcam.protocols._base import Role, Transport
+from smartcam.protocols._framed.machine import State
+from tests import ROOT
+from tests.fuzz.fuzz_interpreters import SPECS
+from tests.machines import DIALECTS
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-__all__ = ["seeds"]
-
-ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+VECTORS = ROOT / "tests" / "data" / "vectors.toml"
 FILES = (*sorted((ROOT / "examples").rglob("*.yaml")),)
 LAYOUT = re.compile(r"\"([^\"\n]*\w: ?(?:u?int\d|real\d|bool|string\[)[^\"\n]*)\"")
 URL = re.compile(r"bvs(?:\+udp)?://[^\s\"'`)>]+")
@@ -78,11 +73,9 @@ def seeds(name: str) -> list[bytes]:
 
 def vectors() -> Iterator[tuple[int, m.Sender, bytes]]:
     """Yield dialect's place, sender and bytes of every golden vector."""
+    tables: dict[str, list[dict[str, Any]]] = tomllib.loads(VECTORS.read_text(encoding="utf-8"))
     for place, dialect in enumerate(DIALECTS):
-        name = "_".join((dialect.name, *dialect.quirks))
-        path = ROOT / "tests" / "vectors" / f"bvs_{name}.toml"
-        given: list[dict[str, Any]] = tomllib.loads(path.read_text(encoding="utf-8"))["vector"]
-        for one in given:
+        for one in tables["_".join(("bvs", dialect.name, *dialect.quirks))]:
             yield place, m.Sender(one["sender"]), bytes.fromhex(one["hex"])
 
 

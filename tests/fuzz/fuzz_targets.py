@@ -3,45 +3,76 @@
 from __future__ import annotations
 
 import importlib
+import re
+import tomllib
+import traceback
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.emulator.generators import generator_names
-from smartcam.interpreters.localizations import Localizations
-from smartcam.layout.text import TYPES, UNITS
-from smartcam.protocols.bvs import B16, BVS, MESSAGES, MessageId
+from smartcam.emulator._generators import generator_names
+from smartcam.interpreters._localizations import LocalizationsInterpreter
+from smartcam.layout._text import TYPES, UNITS
+from smartcam.protocols._bvs import B16, BVS, MESSAGES, MessageId
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-__all__ = ["CORPUS", "TARGETS", "Target"]
+    from collections.abc import Callable, Mapping
 
 CORPUS = Path(__file__).parent / "corpus"
+FINDINGS = CORPUS / "findings.toml"
 
 
 class Target(NamedTuple):
-    """One target; its module is ``fuzz_NAME``.
+    """One target: ``check`` of the module ``fuzz_NAME``, or ``check_NAME`` of one that it shares.
 
     Attributes:
         name: its name.
         max_length: bytes of an input at most.
         share: of ``--runs``, in proportion to the others: the fast ones get more.
         words: what its inputs are made of, for whoever changes them.
+        shares: ``texts`` where it stands with others in ``fuzz_texts``.
     """
 
     name: str
     max_length: int
     share: int
     words: tuple[bytes, ...] = ()
+    shares: str = ""
 
     @property
-    def corpus(self) -> Path:
-        """Its folder of inputs."""
-        return CORPUS / self.name
+    def archive(self) -> Path:
+        """The inputs that together reach everything, by their hash."""
+        return CORPUS / f"{self.name}.zip"
+
+    def reached(self) -> dict[str, bytes]:
+        """Return the inputs of the archive by name."""
+        with zipfile.ZipFile(self.archive) as archive:
+            return {name: archive.read(name) for name in sorted(archive.namelist())}
+
+    def findings(self) -> dict[str, bytes]:
+        """Return the inputs that were findings once, by name."""
+        return {
+            row["name"]: row["text"].encode() if "text" in row else bytes.fromhex(row["hex"])
+            for row in tomllib.loads(FINDINGS.read_text(encoding="utf-8"))["finding"]
+            if self.name in row["targets"]
+        }
+
+    def inputs(self) -> dict[str, bytes]:
+        """Return all of them."""
+        return self.reached() | self.findings()
+
+    def keep(self, inputs: Mapping[str, bytes]) -> None:
+        """Write the archive; the same inputs give the same bytes."""
+        with zipfile.ZipFile(self.archive, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, data in sorted(inputs.items()):
+                archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
 
     def load(self) -> Callable[[bytes], None]:
-        """Return its ``check``, which raises where it finds something."""
-        check: Callable[[bytes], None] = importlib.import_module(f"fuzz_{self.name}").check
+        """Return its check, which raises where it finds something."""
+        module = importlib.import_module(f"tests.fuzz.fuzz_{self.shares or self.name}")
+        check: Callable[[bytes], None] = getattr(
+            module, f"check_{self.name}" if self.shares else "check"
+        )
         return check
 
 
@@ -111,7 +142,7 @@ _ADDRESS = _words(
 )
 _SPEC = _words(
     *("localizations", "strings50", "50ByteStrings", "Localizations", "record", "table", "raw"),
-    *(": ", Localizations.default_layout or "", "table: int32", "records: ("),
+    *(": ", LocalizationsInterpreter.default_layout or "", "table: int32", "records: ("),
 )
 
 TARGETS = {
@@ -124,9 +155,67 @@ TARGETS = {
         Target("interpreters", 160, 6, _NUMBERS),
         Target("scenario", 1024, 2, _SCENARIO + _LAYOUT + _YAML),
         Target("camera", 128, 1, _HEADERS),
-        Target("layout_file", 256, 2, _LAYOUT + _YAML + _LAYOUT_FILE),
-        Target("address", 96, 22, _ADDRESS),
-        Target("spec", 128, 22, _SPEC + _LAYOUT),
+        Target("layout_file", 256, 2, _LAYOUT + _YAML + _LAYOUT_FILE, shares="texts"),
+        Target("address", 96, 22, _ADDRESS, shares="texts"),
+        Target("spec", 128, 22, _SPEC + _LAYOUT, shares="texts"),
     )
 }
 """Every target by name, in the order in which they run."""
+
+
+class Known(NamedTuple):
+    """One finding.
+
+    Attributes:
+        name: of its input, which begins the name that it has among the findings.
+        target: where it was found.
+        pattern: regular expression for what :func:`describe` says of it.
+        about: what is wrong.
+    """
+
+    name: str
+    target: str
+    pattern: str
+    about: str
+
+
+KNOWN = (
+    Known(
+        "unknown-key-is-a-surrogate",
+        "scenario",
+        r"UnicodeEncodeError: .*surrogates not allowed in main\.py:model_validate",
+        "an error's text has a lone surrogate in it, which pydantic cannot take",
+    ),
+    Known(
+        "memory-for-slots",
+        "scenario",
+        r"AssertionError: too much memory",
+        "slots are filled with zeros before the container's size is looked at",
+    ),
+    Known(
+        "memory-for-an-errors-text",
+        "scenario",
+        r"AssertionError: too much memory",
+        "a wrong value is written out in full before 64 characters of it are taken",
+    ),
+    Known(
+        "canonical-text-too-long",
+        "layout",
+        r"LayoutError: layout: expected at most 20000 characters",
+        "a text that is accepted prints as one that is not: no copy, no pickle, no file",
+    ),
+)
+
+
+def describe(error: BaseException) -> str:
+    """Return what was raised and where, in one line."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    text = str(error).replace("\n", " ")
+    return f"{type(error).__name__}: {text} in {Path(last.filename).name}:{last.name}"
+
+
+def known(target: str, error: BaseException) -> Known | None:
+    """Return the row that a finding belongs to, None for a new one."""
+    said = describe(error)
+    rows = (one for one in KNOWN if one.target == target)
+    return next((one for one in rows if re.match(one.pattern, said)), None)

@@ -6,28 +6,25 @@ Needs no atheris. Inputs that are named, not numbered, were findings once.
 from __future__ import annotations
 
 import random
+import tomllib
+from collections.abc import Iterator
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
-from fuzz_known import KNOWN, describe, known
-from fuzz_seeds import seeds
-from fuzz_targets import CORPUS, TARGETS, Target
 
-import smartcam.emulator.scenario.file as scenario_module
+import smartcam.emulator._scenario.file as scenario_module
 import smartcam.layout as layout_module
 from smartcam.emulator import Device
-from smartcam.interpreters.localizations import Localizations
+from smartcam.interpreters._localizations import LocalizationsInterpreter
 from smartcam.layout import Layout
-from smartcam.layout.text import parse_text
-from smartcam.protocols.framed.dialect import FramedDialect
-from smartcam.protocols.framed.framing import Framer
-from smartcam.protocols.framed.machine import Machine
+from smartcam.layout._text import parse_text
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import Framer
+from smartcam.protocols._framed.machine import Machine
 from smartcam.settings import Address
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+from tests.fuzz.fuzz_seeds import seeds
+from tests.fuzz.fuzz_targets import CORPUS, FINDINGS, KNOWN, TARGETS, Target, describe, known
 
 SEED = 20_240_229
 CHANGED = {"scenario": 60, "layout_file": 60, "camera": 60, "layout": 200}
@@ -38,16 +35,9 @@ LARGEST_CORPUS = 300_000
 each_target = pytest.mark.parametrize("target", TARGETS.values(), ids=lambda one: one.name)
 
 
-def files(target: Target) -> list[Path]:
-    return sorted(target.corpus.iterdir())
-
-
-def row_of(path: Path) -> Any:
-    """Return the row of :data:`KNOWN` that the file of a finding belongs to, None for another."""
-    return next(
-        (row for row in KNOWN if row.target == path.parent.name and path.name.startswith(row.name)),
-        None,
-    )
+def row_of(target: str, name: str) -> Any:
+    """Return the row of :data:`KNOWN` that an input belongs to, None for another."""
+    return next((row for row in KNOWN if row.target == target and name.startswith(row.name)), None)
 
 
 def run(target: Target, data: bytes, what: str) -> None:
@@ -56,20 +46,18 @@ def run(target: Target, data: bytes, what: str) -> None:
         target.load()(data)
     except Exception as error:
         if known(target.name, error) is None:
-            error.add_note(
-                f"{what}\npython tests/fuzz/fuzz.py --reproduce {target.name} {data.hex()}"
-            )
+            error.add_note(f"{what}\npython -m tests.fuzz --reproduce {target.name} {data.hex()}")
             raise
 
 
 def run_corpus(target: Target) -> None:
-    for path in files(target):
-        run(target, path.read_bytes(), path.name)
+    for name, data in target.inputs().items():
+        run(target, data, name)
 
 
 @each_target
 def test_corpus_gives_no_finding(target: Target) -> None:
-    assert any(row_of(path) is None for path in files(target))
+    assert target.reached()
     run_corpus(target)
 
 
@@ -83,7 +71,7 @@ def test_seeds_give_no_finding(target: Target) -> None:
 
 @each_target
 def test_changed_inputs_give_no_finding(target: Target) -> None:
-    inputs = [path.read_bytes() for path in files(target) if row_of(path) is None]
+    inputs = [data for name, data in target.inputs().items() if row_of(target.name, name) is None]
     made = changed([*inputs, *seeds(target.name)], target)
     for number, data in enumerate(islice(made, CHANGED.get(target.name, MANY))):
         run(target, data, f"changed input {number} of seed {SEED}")
@@ -109,20 +97,24 @@ def changed(inputs: list[bytes], target: Target) -> Iterator[bytes]:
 # ---------------------------------------------------------------------- what is known
 
 
-FINDINGS = [path for path in sorted(CORPUS.glob("*/*")) if row_of(path) is not None]
+OPEN_FINDINGS = {
+    (target.name, name): data
+    for target in TARGETS.values()
+    for name, data in target.findings().items()
+    if row_of(target.name, name) is not None
+}
 
 
-@pytest.mark.parametrize("path", FINDINGS, ids=lambda path: f"{path.parent.name}-{path.name}")
-def test_known_finding_is_still_there(path: Path) -> None:
+@pytest.mark.parametrize(("target", "name"), OPEN_FINDINGS, ids="-".join)
+def test_known_finding_is_still_there(target: str, name: str) -> None:
     """Where this fails the mistake is mended: delete its row of ``KNOWN``, keep the input."""
-    row = row_of(path)
     with pytest.raises(Exception) as caught:  # noqa: PT011 - the row says which
-        TARGETS[row.target].load()(path.read_bytes())
-    assert known(row.target, caught.value) is not None, describe(caught.value)
+        TARGETS[target].load()(OPEN_FINDINGS[target, name])
+    assert known(target, caught.value) is not None, describe(caught.value)
 
 
 def test_every_known_finding_has_its_input() -> None:
-    assert set(KNOWN) == {row_of(path) for path in FINDINGS}
+    assert set(KNOWN) == {row_of(*one) for one in OPEN_FINDINGS}
 
 
 # ---------------------------------------------------------------------- the net has no holes
@@ -143,7 +135,7 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "messages": (FramedDialect, "surplus", lambda *_: 0),
     "machine": (Machine, "_wanted", lambda *_, **__: True),
     "layout": (Layout, "sequence", lambda *_: None),
-    "interpreters": (Localizations, "_check_numbers", lambda *_: None),
+    "interpreters": (LocalizationsInterpreter, "_check_numbers", lambda *_: None),
     "scenario": (scenario_module, "_line", divide_by_zero),
     "camera": (Device, "_report", lambda *_: None),
     "layout_file": (Layout, "to_yaml", lambda _: "x: bool"),
@@ -161,6 +153,8 @@ def test_corpus_finds_a_mistake(target: Target, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_corpora_are_small_and_belong_to_a_target() -> None:
-    paths = [path for path in CORPUS.rglob("*") if path.is_file()]
-    assert {path.parent.name for path in paths} == set(TARGETS)
+    paths = [*CORPUS.iterdir()]
+    assert {path.stem for path in paths if path != FINDINGS} == set(TARGETS)
+    rows = tomllib.loads(FINDINGS.read_text(encoding="utf-8"))["finding"]
+    assert {name for row in rows for name in row["targets"]} <= set(TARGETS)
     assert sum(path.stat().st_size for path in paths) < LARGEST_CORPUS
