@@ -1,14 +1,15 @@
 """Talk to industrial smart cameras.
 
 ``async with smartcam.connect("bvs://192.168.0.10", application=7) as camera`` gives a
-:class:`~smartcam.client.SmartCamera`. ``import smartcam`` is light: names are resolved when they
+:class:`~smartcam.SmartCamera`. ``import smartcam`` is light: names are resolved when they
 are first used.
 """
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam import emulator, exceptions, interpreters, layout, models, protocols
@@ -130,27 +131,18 @@ __all__ = [
     "protocols",
 ]
 
-_ROOMS = frozenset({"emulator", "exceptions", "interpreters", "layout", "models", "protocols"})
-_HOMES = {
-    "Backoff": "backoff",
-    "Layout": "layout",
-    "Observer": "observers",
-    "SmartCamera": "client",
-    "connect": "client",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'smartcam' has no attribute {name!r}")
-    if name in _ROOMS:
-        value: Any = importlib.import_module(f"smartcam.{name}")
-    else:
-        home = _HOMES.get(name) or ("exceptions" if name.endswith("Error") else "models")
-        value = getattr(importlib.import_module(f"smartcam.{home}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "": "emulator exceptions interpreters layout models protocols",
+            "backoff": "Backoff",
+            "client": "SmartCamera connect",
+            "exceptions": " ".join(name for name in __all__ if name.endswith("Error")),
+            "layout": "Layout",
+            "models": "ApplicationChanged CameraEvent Capabilities Connected Disconnected Header "
+            "Histogram Localization Pose Position Quaternion Reconnected Result Statistics Status "
+            "StatusChanged",
+            "observers": "Observer",
+        },
+    )

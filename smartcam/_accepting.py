@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     import logging
     from collections.abc import Callable
 
-__all__ = ["ACCEPT_PAUSE", "Acceptor"]
-
 ACCEPT_PAUSE = 1.0
 """Seconds until the next try where the system has no socket left."""
 

@@ -14,8 +14,6 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-__all__ = ["try_lock"]
-
 PLACE = 1 << 62
 """The byte that is locked on Windows, which keeps others from what is locked: behind all data."""
 

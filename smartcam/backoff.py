@@ -15,7 +15,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 
-__all__ = ["Backoff", "is_transient"]
+__all__ = ["Backoff"]
 
 
 def is_transient(error: BaseException) -> bool:

@@ -1,8 +1,8 @@
 """The camera as the user sees it.
 
 ``open()`` starts the :class:`~smartcam._client.supervisor.Supervisor`, which makes sessions and has
-every chunk of their links dispatched by the :class:`~smartcam._client.dispatch.Inbox`, which knows
-who waits for what. Commands stand here; each is a few messages out and a wait with a deadline.
+every chunk of their links handed on by the :class:`~smartcam._client.dispatch.Dispatch`. Commands
+stand here; each is a few messages out and a wait with a deadline.
 """
 
 from __future__ import annotations
@@ -12,12 +12,22 @@ import contextlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from smartcam._client.command_lock import Turns
-from smartcam._client.dispatch import Inbox
+from smartcam._client.camera_state import CameraState
+from smartcam._client.command_lock import CommandLock
+from smartcam._client.commands import Commands
+from smartcam._client.connection import Connection
+from smartcam._client.counters import ClientCounters
+from smartcam._client.dispatch import Dispatch
 from smartcam._client.interpretation import Interpretation
-from smartcam._client.requests import Conversation, is_ready
+from smartcam._client.keepalive import KeepAlive
+from smartcam._client.listeners import Listeners
+from smartcam._client.polling import Polling
+from smartcam._client.requests import Requests
+from smartcam._client.results import Results
+from smartcam._client.status import StatusRequests, is_ready
 from smartcam._client.supervisor import Supervisor
 from smartcam._client.triggering import TriggerRequest, Triggers
+from smartcam._client.waits import Waits
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectionClosedError,
@@ -30,7 +40,7 @@ from smartcam.exceptions import (
 from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status
 from smartcam.observers import Observer, Observers
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Transport
+from smartcam.protocols._base import Transport
 from smartcam.settings import CameraOptions, CameraSettings
 from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 
@@ -76,7 +86,7 @@ def connect(
             pins the dialect; or a bare host together with ``model``.
         model: camera model, such as ``"BVS002C"``.
         observers: see frames, events, results and errors:
-            :class:`~smartcam.observers.Observer`.
+            :class:`~smartcam.Observer`.
         **options: ``name``, ``application``, ``interpret_as``, ``calibration``, ``y_down``,
             ``lenient``, ``connect_timeout``, ``connect_attempts``, ``switch_timeout``,
             ``request_timeout``, ``close_timeout``, ``liveness_timeout``, ``reconnect``,
@@ -87,7 +97,7 @@ def connect(
     an observer. It gets what ``interpret_as`` gives, turned to y up with ``y_down``; the headers'
     frame is the camera's ``name``, which a calibration with a ``camera_frame`` wants to be that.
     No value passes without it. One that is no list of localizations, or that the calibration
-    refuses, is an :exc:`~smartcam.exceptions.InterpretationError` with the cause chained; an
+    refuses, is an :exc:`~smartcam.InterpretationError` with the cause chained; an
     interpreter whose values never are localizations (raw, record, table, strings50) is a
     ConfigurationError at once. A mapping from application id takes another calibration for each,
     and None for those whose values are to stay as they are; an application that it lacks is an
@@ -103,10 +113,10 @@ class SmartCamera:
     """A smart camera; made by :func:`connect`.
 
     It outlives its links: one that is lost is made again as ``reconnect`` says. Until then every
-    method that talks to the camera raises :exc:`~smartcam.exceptions.ConnectionLostError` at once,
+    method that talks to the camera raises :exc:`~smartcam.ConnectionLostError` at once,
     with the first cause chained; nothing is sent again by itself. Before ``open()`` and after
-    ``close()`` it is :exc:`~smartcam.exceptions.ConnectionClosedError`, and
-    :exc:`~smartcam.exceptions.ConnectionTakenError` once another client has taken the camera,
+    ``close()`` it is :exc:`~smartcam.ConnectionClosedError`, and
+    :exc:`~smartcam.ConnectionTakenError` once another client has taken the camera,
     which ends this one. Then make a new one.
 
     Args:
@@ -119,14 +129,41 @@ class SmartCamera:
         self._observers = Observers(observers)
         self._observed = bool(self._observers)
         self._interpretations: dict[str, Interpretation] = {}  # by their text
-        self._inbox = Inbox(
-            settings.name, self._interpretation(settings.interpret_as), self._observers
+        self._counters = counters = ClientCounters()
+        self._listeners = listeners = Listeners(settings.name, self._observers)
+        self._state = state = CameraState(settings.name, settings.application, listeners)
+        self._waits = waits = Waits(counters)
+        self._connection = connection = Connection(settings.name, waits)
+        patience = settings.request_timeout
+        self._requests = requests = Requests(connection, waits, state, patience)
+        polling = Polling(connection, state, waits, listeners, patience)
+        self._status = status = StatusRequests(connection, requests, polling, state, waits)
+        self._commands = commands = Commands(connection, requests, status, state)
+        spec = settings.interpret_as
+        self._results = results = Results(
+            settings.name, self._interpretation(spec), requests, state, listeners, counters
         )
-        self._inbox.expected = settings.application
-        self._talk = Conversation(self._inbox, settings.request_timeout)
-        self._triggers = Triggers(self._talk)
-        self._turns = Turns(self._talk, settings.switch_timeout)
-        self._supervisor = Supervisor(settings, self._talk, self._turns, self._observers)
+        self._dispatch = Dispatch(
+            settings.name, state, waits, results, listeners, requests, polling, counters
+        )
+        self._triggers = Triggers(
+            connection, requests, status, commands, results, state, waits, polling
+        )
+        limit = settings.switch_timeout
+        self._lock = CommandLock(connection, commands, status, state, waits, limit)
+        keepalive = KeepAlive(requests, waits, state, settings.liveness_timeout, limit)
+        self._supervisor = Supervisor(
+            settings,
+            connection,
+            commands,
+            self._lock,
+            self._dispatch,
+            waits,
+            listeners,
+            counters,
+            keepalive,
+            self._observers,
+        )
 
     # ------------------------------------------------------------------ life
 
@@ -141,13 +178,13 @@ class SmartCamera:
 
         Cancellation: the link is dropped.
         """
-        if self._supervisor.started or self._inbox.end is not None:
+        if self._supervisor.started or self._waits.end is not None:
             raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
         try:
             await self._supervisor.open()
             if self.settings.application is not None:
-                async with self._turns.hold(self.settings.switch_timeout) as deadline:
-                    await self._talk.ensure(self.settings.application, deadline)
+                async with self._lock.hold(self.settings.switch_timeout) as deadline:
+                    await self._commands.ensure(self.settings.application, deadline)
         except BaseException:
             await self.close()
             raise
@@ -176,7 +213,7 @@ class SmartCamera:
 
         Cancellation: safe.
         """
-        await self._supervisor.wait_connected(self._talk.deadline(timeout), timeout)
+        await self._supervisor.wait_connected(self._connection.deadline(timeout), timeout)
 
     async def __aenter__(self) -> Self:
         return await self.open()
@@ -216,14 +253,14 @@ class SmartCamera:
         Raises:
             ConnectionClosedError: there was no session yet.
         """
-        if self._inbox.status is None:
+        if self._state.status is None:
             raise self._supervisor.closed_error()
-        return self._inbox.status
+        return self._state.status
 
     @property
     def active_application(self) -> int | None:
         """Id of the active application as last told by the camera; None before ``open()``."""
-        return self._inbox.active
+        return self._state.active
 
     @property
     def protocol_version(self) -> int | None:
@@ -245,8 +282,8 @@ class SmartCamera:
 
     def statistics(self) -> Statistics:
         """Return everything counted so far, over all sessions. The accounts balance at any time."""
-        streams = self._inbox.streams()
-        return self._inbox.account.statistics(s.statistics() for s in streams if not s.ended)
+        streams = self._listeners.streams()
+        return self._counters.statistics(s.statistics() for s in streams if not s.ended)
 
     # ------------------------------------------------------------------ streams and waits
 
@@ -286,7 +323,7 @@ class SmartCamera:
         The stream goes on over a reconnect; what the camera sent in between nobody got.
 
         A container that does not fit its layout, or its calibration, is raised from the iterator as
-        :exc:`~smartcam.exceptions.InterpretationError`; the iterator stays usable. Results of
+        :exc:`~smartcam.InterpretationError`; the iterator stays usable. Results of
         another application than the one named are counted, not delivered.
 
         Args:
@@ -307,7 +344,7 @@ class SmartCamera:
             overflow=overflow,
             min_interval=min_interval,
         )
-        return self._subscribed(self._inbox.result_streams, stream)
+        return self._subscribed(self._listeners.results, stream)
 
     def statuses(
         self,
@@ -320,7 +357,7 @@ class SmartCamera:
         stream = Subscription[Status](
             "statuses", max_queue=max_queue, overflow=overflow, min_interval=min_interval
         )
-        return self._subscribed(self._inbox.status_streams, stream)
+        return self._subscribed(self._listeners.statuses, stream)
 
     def events(
         self,
@@ -334,7 +371,7 @@ class SmartCamera:
         ``ApplicationChanged``. Subscribe before :meth:`open` to see the first ones.
         """
         stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
-        return self._subscribed(self._inbox.event_streams, stream)
+        return self._subscribed(self._listeners.events, stream)
 
     async def wait_status(
         self, predicate: Callable[[Status], bool], timeout: float = 10.0
@@ -348,10 +385,10 @@ class SmartCamera:
 
         Cancellation: safe.
         """
-        self._talk.require_link()
-        deadline = self._talk.deadline(timeout)
-        await self._talk.refresh_status(deadline)
-        return await self._talk.until(predicate, deadline, "the status wanted", insist=False)
+        self._connection.require_link()
+        deadline = self._connection.deadline(timeout)
+        await self._status.refresh(deadline)
+        return await self._status.until(predicate, deadline, "the status wanted", insist=False)
 
     async def wait_ready(self, timeout: float = 10.0) -> Status:
         """Wait until the camera is not BUSY, and Running if a start was asked for.
@@ -361,11 +398,11 @@ class SmartCamera:
 
         Cancellation: safe.
         """
-        self._talk.require_link()
-        deadline = self._talk.deadline(timeout)
-        await self._talk.refresh_status(deadline)
-        predicate = is_ready if self._talk.wants_running else _is_not_busy
-        return await self._talk.until(predicate, deadline, "the camera to be ready")
+        self._connection.require_link()
+        deadline = self._connection.deadline(timeout)
+        await self._status.refresh(deadline)
+        predicate = is_ready if self._state.wanted.running else _is_not_busy
+        return await self._status.until(predicate, deadline, "the camera to be ready")
 
     def next_result(
         self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
@@ -385,10 +422,9 @@ class SmartCamera:
 
         Cancellation: safe; the result still goes to the streams.
         """
-        self._talk.require_link()
-        future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
-        self._inbox.next_results.add(future)
-        return self._await_next(future, self._talk.deadline(timeout), timeout)
+        self._connection.require_link()
+        future = self._listeners.next_result()
+        return self._await_next(future, self._connection.deadline(timeout), timeout)
 
     # ------------------------------------------------------------------ commands
 
@@ -472,7 +508,7 @@ class SmartCamera:
         counted as late if it comes.
         """
         interpretation = (
-            self._inbox.interpretation
+            self._results.interpretation
             if interpret_as is None
             else self._interpretation(interpret_as)
         )
@@ -494,8 +530,8 @@ class SmartCamera:
     async def _trigger(
         self, application: int | None, request: TriggerRequest, timeout: float
     ) -> list[Result]:
-        turns = self._turns
-        turn = turns.hold(timeout) if application is None else turns.hold_in(application, timeout)
+        lock = self._lock
+        turn = lock.hold(timeout) if application is None else lock.hold_in(application, timeout)
         try:
             async with turn as deadline:
                 return await self._triggers.trigger(request, deadline)
@@ -524,9 +560,9 @@ class SmartCamera:
         Source: SC manual p. 34 (published).
         """
         limit = self.settings.switch_timeout if timeout is None else timeout
-        async with self._turns.hold(limit) as deadline:
-            await self._talk.refresh_status(deadline)
-            await self._talk.switch(application, deadline, start=self._talk.runs)
+        async with self._lock.hold(limit) as deadline:
+            await self._status.refresh(deadline)
+            await self._commands.switch(application, deadline, start=self._commands.runs)
 
     @contextlib.asynccontextmanager
     async def application(self, application: int) -> AsyncGenerator[Self]:
@@ -537,14 +573,14 @@ class SmartCamera:
 
         Cancellation: going back is finished by the client's supervisor; the next call waits for it.
         """
-        async with self._turns.hold(self.settings.switch_timeout) as deadline:
-            before = await self._turns.enter(application, deadline)
+        async with self._lock.hold(self.settings.switch_timeout) as deadline:
+            before = await self._lock.enter(application, deadline)
         try:
             yield self
         except BaseException:
-            self._turns.leave(before)
+            self._lock.leave(before)
             raise
-        await self._turns.leave_and_wait(before)
+        await self._lock.leave_and_wait(before)
 
     async def start(self, *, timeout: float = 10.0) -> None:
         """Enter run mode; returns when the camera reports Running and is not BUSY.
@@ -555,8 +591,8 @@ class SmartCamera:
 
         Cancellation: safe; the command may have been sent.
         """
-        async with self._turns.hold(timeout) as deadline:
-            await self._talk.start(deadline)
+        async with self._lock.hold(timeout) as deadline:
+            await self._commands.start(deadline)
 
     async def stop(self, *, timeout: float = 10.0) -> None:
         """Leave run mode; returns when the camera no longer reports Running.
@@ -569,8 +605,8 @@ class SmartCamera:
 
         Cancellation: safe; the command may have been sent.
         """
-        async with self._turns.hold(timeout) as deadline:
-            await self._talk.stop(deadline)
+        async with self._lock.hold(timeout) as deadline:
+            await self._commands.stop(deadline)
 
     async def query_application(self, *, timeout: float | None = None) -> int:
         """Ask the camera which application is active.
@@ -582,7 +618,7 @@ class SmartCamera:
         Cancellation: safe; the answer is dropped when it comes.
         """
         limit = self.settings.request_timeout if timeout is None else timeout
-        return await self._talk.query(self._talk.deadline(limit))
+        return await self._commands.query(self._connection.deadline(limit))
 
     async def query_status(self, *, timeout: float | None = None) -> Status:
         """Ask the camera for its status.
@@ -594,9 +630,9 @@ class SmartCamera:
         Cancellation: safe.
         """
         limit = self.settings.request_timeout if timeout is None else timeout
-        self._talk.require(m.GetStatus)
-        await self._talk.refresh_status(self._talk.deadline(limit))
-        return self._talk.status
+        self._connection.require(m.GetStatus)
+        await self._status.refresh(self._connection.deadline(limit))
+        return self._status.last
 
     async def reset_errors(self, *, timeout: float | None = None) -> Status:
         """Clear the error bits that stay set until then; return the status after it.
@@ -611,10 +647,10 @@ class SmartCamera:
         Source: BVS ID guide p. 227 (published).
         """
         limit = self.settings.request_timeout if timeout is None else timeout
-        deadline = self._talk.deadline(limit)
-        await self._talk.command(m.ResetErrors(), deadline)
-        await self._talk.refresh_status(deadline)
-        return self._talk.status
+        deadline = self._connection.deadline(limit)
+        await self._requests.command(m.ResetErrors(), deadline)
+        await self._status.refresh(deadline)
+        return self._status.last
 
     async def read_image(self, *, timeout: float | None = None) -> bytes:
         """Return the last picture, as a file's bytes.
@@ -627,9 +663,9 @@ class SmartCamera:
         Cancellation: safe; the answer is dropped when it comes.
         """
         limit = self.settings.request_timeout if timeout is None else timeout
-        self._talk.require(m.ReadImage)
-        image = await self._talk.ask(m.ReadImage(), m.Image, self._talk.deadline(limit))
-        self._talk.check(m.ReadImage, image)
+        self._connection.require(m.ReadImage)
+        image = await self._requests.ask(m.ReadImage(), m.Image, self._connection.deadline(limit))
+        self._requests.check(m.ReadImage, image)
         return image.data
 
     async def get_clock(self, *, timeout: float | None = None) -> datetime:
@@ -642,8 +678,10 @@ class SmartCamera:
         Cancellation: safe; the answer is dropped when it comes.
         """
         limit = self.settings.request_timeout if timeout is None else timeout
-        clock = await self._talk.ask(m.GetClock(), m.ClockAnswer, self._talk.deadline(limit))
-        self._talk.check(m.GetClock, clock)
+        clock = await self._requests.ask(
+            m.GetClock(), m.ClockAnswer, self._connection.deadline(limit)
+        )
+        self._requests.check(m.GetClock, clock)
         fields = (clock.year, clock.month, clock.day, clock.hour, clock.minute, clock.second)
         try:
             return datetime(*fields)  # noqa: DTZ001 - the camera's clock has no zone
@@ -694,7 +732,7 @@ class SmartCamera:
             LocalProtocolError: the number does not fit.
         """
         await self._tell(m.SetSequenceNumber(number=number))
-        self._inbox.attribution.give_number(number)
+        self._triggers.give_number(number)
 
     async def reboot(self) -> None:
         """Restart the camera; returns when the session is over.
@@ -707,15 +745,15 @@ class SmartCamera:
 
         Cancellation: the command may have been sent.
         """
-        link = self._talk.require_link()
-        self._talk.require(m.Reboot)
+        link = self._connection.require_link()
+        self._connection.require(m.Reboot)
         self._supervisor.restarts(link)
         await self._tell(m.Reboot())
         if link.machine.transport is Transport.TCP:
             await link.wait_closed(self.settings.close_timeout)
         # over UDP nothing tells that the session is over, and over TCP perhaps nothing in time
         link.abort(ConnectionResetError("the camera restarts"))
-        self._inbox.fail(link.lost_error())
+        self._dispatch.fail(link.lost_error())
 
     async def request(
         self,
@@ -744,24 +782,26 @@ class SmartCamera:
 
         Cancellation: safe; the answer is dropped when it comes.
         """
-        dialect = self._talk.dialect
+        dialect = self._connection.dialect
         raw = dialect.raw_request(message_id, bytes(payload))
-        deadline = self._talk.deadline(
+        deadline = self._connection.deadline(
             self.settings.request_timeout if timeout is None else timeout
         )
         if raw.answered if answered is None else answered:
-            return dialect.body(await self._talk.exchange(raw.message, raw.answer, deadline))
+            return dialect.body(await self._requests.exchange(raw.message, raw.answer, deadline))
         if raw.answered and raw.known:
             # answered it is nevertheless, and that must not pass for the next one's answer
-            await self._talk.post(raw.message, raw.answer, deadline)
+            await self._requests.post(raw.message, raw.answer, deadline)
         else:
-            await self._talk.tell(raw.message, deadline, answered=False)
+            await self._requests.tell(raw.message, deadline, answered=False)
         return None
 
     # ------------------------------------------------------------------ small helpers
 
     async def _tell(self, message: m.Request) -> None:
-        await self._talk.command(message, self._talk.deadline(self.settings.request_timeout))
+        await self._requests.command(
+            message, self._connection.deadline(self.settings.request_timeout)
+        )
 
     def _interpretation(self, spec: object) -> Interpretation:
         known = self._interpretations.get(spec) if isinstance(spec, str) else None
@@ -777,11 +817,11 @@ class SmartCamera:
 
     def _subscribed(self, subscribers: Subscribers[Any], queue: QueueT) -> QueueT:
         """Have a queue offered what comes; it has ended already where nothing will."""
-        end = self._inbox.end
+        end = self._waits.end
         if end is not None and self._supervisor.over:  # between two sessions it waits for the next
             queue.end(None if isinstance(end, ConnectionClosedError) else end)
         subscribers.add(queue)
-        self._inbox.want_status()
+        self._status.wanted()
         return queue
 
     async def _await_next(
@@ -797,8 +837,6 @@ class SmartCamera:
                 f"{self.name}: no result came within {timeout:g} s; status: {self.status}",
                 waited=timeout,
             ) from exc
-        finally:
-            self._inbox.next_results.discard(future)
 
 
 def _size_of(result: Result) -> int:

@@ -70,7 +70,6 @@ __all__ = [
     "TriggerTimeoutError",
     "UnsupportedError",
     "WrongApplicationError",
-    "hex_excerpt",
 ]
 
 MAX_EXCERPT = 64

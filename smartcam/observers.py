@@ -4,19 +4,41 @@ from __future__ import annotations
 
 import logging
 from asyncio import CancelledError
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from datetime import datetime
 
-    from smartcam._client.link import TraceEntry
     from smartcam.exceptions import SmartCamError
     from smartcam.models import CameraEvent, Result
 
-__all__ = ["Observer", "Observers"]
+__all__ = ["Observer", "TraceEntry"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
+
+
+class TraceEntry(NamedTuple):
+    """One frame as ``--trace`` writes it.
+
+    Attributes:
+        at: when, UTC.
+        camera: name of the camera.
+        direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
+            unfinished frame when the link ended.
+        message_id: id on the wire, None for broken bytes and where there are no such ids.
+        message: name of the message, or the error's text for broken bytes.
+        fields: decoded body, None where it cannot be decoded.
+        hex: the bytes.
+    """
+
+    at: datetime
+    camera: str
+    direction: str
+    message_id: int | None
+    message: str
+    fields: Any
+    hex: str
 
 
 class Observer:
@@ -27,23 +49,23 @@ class Observer:
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """A frame went over the wire, or bytes came that make none.
+        """See a frame that went over the wire, or bytes that make none.
 
         Frames are decoded for this only where an observer overrides it.
         """
 
     def on_state(self, event: CameraEvent) -> None:
-        """Something happened to the camera: what ``camera.events()`` gives, in the same order."""
+        """See what happened to the camera: the items of ``camera.events()``, in the same order."""
 
     def on_result(self, result: Result) -> None:
-        """A result container was interpreted: for a trigger, a stream or ``next_result()``.
+        """See a result that was interpreted: for a trigger, a stream or ``next_result()``.
 
         The result of a trigger has ``triggered_at`` and ``latency``. A container that nobody waits
         for is counted and not interpreted.
         """
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
-        """Something went wrong.
+        """See an error.
 
         Args:
             camera: its name.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from importlib.metadata import Distribution, EntryPoint
 
-__all__ = ["INTERPRETERS", "PROTOCOLS", "PluginInfo", "Registry"]
+__all__ = ["INTERPRETERS", "PROTOCOLS"]
 
 _log = logging.getLogger(__name__)
 
@@ -65,11 +65,11 @@ class Registry:
         return sorted(infos)
 
     def __contains__(self, name: object) -> bool:
-        """Whether ``name`` is known, as a name or an alias."""
+        """Return whether ``name`` is known, as a name or an alias."""
         return name in self._builtins or name in self._aliases or name in self._entry_points()
 
     def load(self, name: str) -> object:
-        """Return what ``name`` stands for, importing it at the first call.
+        """Return the plug-in of a name, importing it at the first call.
 
         Raises:
             PluginError: unknown, provided by two distributions (or by one that takes a built-in's
@@ -152,7 +152,7 @@ def _distributions() -> Iterator[Distribution]:
 
 
 def _key(found: Distribution) -> str:
-    """Return what tells distributions apart; its file's name, where that says it, is fastest."""
+    """Return a distribution's normalized name; its file's name, where that says it, is fastest."""
     known: str | None = getattr(found, "_normalized_name", None)
     return known or _name_of(found).lower()
 
@@ -169,8 +169,11 @@ def _name_of(found: Distribution) -> str:
 INTERPRETERS = Registry(
     "smartcam.interpreters",
     {
-        name: f"smartcam.interpreters.{name}:{name.capitalize()}"
-        for name in ("localizations", "strings50", "record", "table", "raw")
+        "localizations": "smartcam.interpreters._localizations:LocalizationsInterpreter",
+        "raw": "smartcam.interpreters._basic:RawInterpreter",
+        "record": "smartcam.interpreters._basic:RecordInterpreter",
+        "strings50": "smartcam.interpreters._basic:Strings50Interpreter",
+        "table": "smartcam.interpreters._basic:TableInterpreter",
     },
     # the thesis' keywords for the first two
     aliases={"Localizations": "localizations", "50ByteStrings": "strings50"},
@@ -178,5 +181,8 @@ INTERPRETERS = Registry(
 
 PROTOCOLS = Registry(
     "smartcam.protocols",
-    {"bvs": "smartcam.protocols.bvs:BVS", "insight": "smartcam.protocols.insight.dialect:INSIGHT"},
+    {
+        "bvs": "smartcam.protocols._bvs:BVS",
+        "insight": "smartcam.protocols._insight.dialect:INSIGHT",
+    },
 )

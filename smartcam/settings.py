@@ -1,12 +1,13 @@
 """What a connection is told: the camera's address and the client's options.
 
-A wrong option is a :exc:`~smartcam.exceptions.ConfigurationError` that names it.
+A wrong option is a :exc:`~smartcam.ConfigurationError` that names it.
 """
 
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, cast
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, TypeVar, cast
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError
@@ -16,13 +17,15 @@ from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
-    from smartcam.interpreters.base import Spec
+    from smartcam.interpreters._base import Spec
     from smartcam.models import Calibration
-    from smartcam.protocols.base import Protocol
+    from smartcam.protocols._base import Protocol
 
-__all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address", "validation_text"]
+__all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address"]
+
+M = TypeVar("M", bound=BaseModel)
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
 
@@ -142,7 +145,7 @@ USER, PASSWORD = "user", "password"
 
 
 def _query(shown: str, query: str, protocol: Protocol) -> dict[str, str]:
-    """Return what a URL's query says; ``shown`` is the URL for error texts."""
+    """Return the parameters of a URL's query; ``shown`` is the URL for error texts."""
     known = ["dialect", "quirks", *(key for key in protocol.parameters if key not in _LOGIN)]
     said: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
@@ -288,6 +291,18 @@ class CameraSettings(BaseModel):
         if settings.name:
             return settings
         return settings.model_copy(update={"name": f"{address.host}:{address.port}"})
+
+
+def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
+    """Return ``given`` as a model; a mapping has its fields.
+
+    Raises:
+        ConfigurationError: a field is wrong; the text begins with ``what`` and names the field.
+    """
+    try:
+        return kind.model_validate(dict(given) if isinstance(given, Mapping) else given)
+    except ValidationError as exc:
+        raise ConfigurationError(f"{what}: {validation_text(exc)}") from exc
 
 
 def validation_text(error: ValidationError) -> str:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-__all__ = ["BatchSubscription", "Overflow", "Queue", "Subscribers", "Subscription"]
+__all__ = ["BatchSubscription", "Subscription"]
 
 T = TypeVar("T")
 
@@ -29,7 +29,7 @@ class Overflow(enum.Enum):
     DROP_OLDEST = "drop_oldest"
     """The oldest item makes room; it is counted."""
     ERROR = "error"
-    """The stream ends with :exc:`~smartcam.exceptions.SubscriberOverflowError`, after what is
+    """The stream ends with :exc:`~smartcam.SubscriberOverflowError`, after what is
     queued."""
 
 
@@ -218,7 +218,7 @@ class Queue(Generic[T]):
         return True
 
     def _exceeded_by(self, size: int) -> bool:
-        """Whether ``size`` bytes more are too many."""
+        """Return whether ``size`` bytes more are too many."""
         if self._bytes + size <= self._max_queue_bytes:
             return False
         self._weigh()

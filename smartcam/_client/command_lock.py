@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Any
 
-    from smartcam._client.requests import Conversation
-
-__all__ = ["Before", "Turn", "Turns"]
+    from smartcam._client.camera_state import CameraState, Wanted
+    from smartcam._client.commands import Commands
+    from smartcam._client.connection import Connection
+    from smartcam._client.status import StatusRequests
+    from smartcam._client.waits import Waits
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
@@ -35,47 +37,44 @@ class Before:
     Attributes:
         application: id of the application that was active.
         running: whether it ran.
-        expected: the application that was named, if any.
-        wants_running: the run state that was asked for, if any.
+        wanted: what was asked of the camera.
     """
 
     application: int
     running: bool
-    expected: int | None
-    wants_running: bool | None
+    wanted: Wanted
 
 
-class Turn:
-    """One command's turn: ``async with turns.hold(timeout) as deadline``."""
+@dataclass(slots=True, eq=False)
+class Hold:
+    """One command's turn: ``async with lock.hold(timeout) as deadline``."""
 
-    __slots__ = ("_timeout", "_turns")
-
-    def __init__(self, turns: Turns, timeout: float) -> None:
-        self._turns = turns
-        self._timeout = timeout
+    _lock: CommandLock
+    _timeout: float
 
     def __aenter__(self) -> Coroutine[Any, Any, float]:
-        return self._turns.take(self._timeout)
+        return self._lock.take(self._timeout)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
     ) -> None:
-        self._turns.give_back()
+        self._lock.give_back()
 
 
-class Turns:
-    """Gives commands their turn.
+@dataclass(eq=False)
+class CommandLock:
+    """Gives commands their turn."""
 
-    Args:
-        talk: the conversation that the turn is about.
-        switch_timeout: bound of each switch, seconds.
-    """
+    _connection: Connection
+    _commands: Commands
+    _status: StatusRequests
+    _state: CameraState
+    _waits: Waits
+    _switch_timeout: float  # bound of each switch, seconds
 
-    def __init__(self, talk: Conversation, switch_timeout: float) -> None:
+    def __post_init__(self) -> None:
         self._jobs: asyncio.TaskGroup | None = None  # of the session, None between two
         self._owed: Before | None = None  # to go back to in the next session
-        self._talk = talk
-        self._switch_timeout = switch_timeout
         self._lock = asyncio.Lock()
         self._in_line = 0  # commands that wait for the lock
         self._leaving: set[asyncio.Task[None]] = set()
@@ -112,14 +111,14 @@ class Turns:
 
     # ------------------------------------------------------------------ for commands
 
-    def hold(self, timeout: float) -> Turn:
+    def hold(self, timeout: float) -> Hold:
         """Hold the turn with ``async with``; it gives the deadline, the wait for it included.
 
         Raises:
             ResponseTimeoutError: others had it for ``timeout`` seconds.
             SmartCamError: going back failed before this command, and why.
         """
-        return Turn(self, timeout)
+        return Hold(self, timeout)
 
     @contextlib.asynccontextmanager
     async def hold_in(self, application: int, timeout: float) -> AsyncGenerator[float]:
@@ -128,30 +127,30 @@ class Turns:
         Afterwards the application before is back; after an error or a cancellation that goes on
         behind the caller's back.
         """
-        self._talk.deadline(timeout)  # a wrong one is refused before anything is switched
+        self._connection.deadline(timeout)  # a wrong one is refused before anything is switched
         async with self.hold(self._switch_timeout) as switch_deadline:
             before = await self.enter(application, switch_deadline)
             try:
-                yield self._talk.deadline(timeout)
+                yield self._connection.deadline(timeout)
             finally:
                 going_back = self.leave(before)
         if going_back is not None:
             await asyncio.wait({going_back})
 
     async def take(self, timeout: float) -> float:
-        """Take the turn and return the deadline; for :class:`Turn`, which gives it back."""
-        talk = self._talk
-        deadline = talk.deadline(timeout)
-        talk.require_link()
+        """Take the turn and return the deadline; for :class:`Hold`, which gives it back."""
+        connection = self._connection
+        deadline = connection.deadline(timeout)
+        connection.require_link()
         if self._lock.locked() or self._in_line or self._leaving:
             await self._take_in_line(deadline, timeout)
         else:
             await self._lock.acquire()  # it is free
         try:
-            talk.require_link()  # it may have been lost meanwhile
+            connection.require_link()  # it may have been lost meanwhile
             self._raise_failed()
-            if talk.unconfirmed:
-                await talk.catch_up(deadline)
+            if self._commands.unconfirmed:
+                await self._commands.catch_up(deadline)
         except BaseException:
             self._lock.release()
             raise
@@ -168,7 +167,7 @@ class Turns:
                 await self._acquire()
         except TimeoutError as exc:
             raise ResponseTimeoutError(
-                f"{self._talk.name}: another command had the camera for {timeout:g} s",
+                f"{self._connection.name}: another command had the camera for {timeout:g} s",
                 waited=timeout,
             ) from exc
         finally:
@@ -176,12 +175,11 @@ class Turns:
 
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""
-        talk = self._talk
-        active = await talk.query_loaded(deadline)
-        running = talk.runs
-        before = Before(active, running, talk.inbox.expected, talk.wants_running)
+        commands = self._commands
+        active = await commands.query_loaded(deadline)
+        before = Before(active, commands.runs, self._state.wanted)
         try:
-            await talk.ensure(application, deadline)
+            await commands.ensure(application, deadline)
         except BaseException:
             self.leave(before)
             raise
@@ -192,7 +190,7 @@ class Turns:
 
         Whoever left first is done last: of several that are owed the outermost counts.
         """
-        if self._jobs is None or self._talk.inbox.end is not None:
+        if self._jobs is None or self._waits.end is not None:
             self._owe(before)
             return None
         return self._start_job("going_back", self._go_back(before))
@@ -201,7 +199,7 @@ class Turns:
         if self._jobs is None:
             job.close()
             return None
-        task = self._jobs.create_task(job, name=f"smartcam[{self._talk.name}].{what}")
+        task = self._jobs.create_task(job, name=f"smartcam[{self._connection.name}].{what}")
         self._leaving.add(task)
         task.add_done_callback(self._leaving.discard)
         return task
@@ -228,58 +226,54 @@ class Turns:
     def _owe(self, before: Before) -> None:
         """Keep what the next session is to go back to."""
         self._owed = before
-        self._talk.inbox.expected = before.expected
-        self._talk.wants_running = before.wants_running
+        self._state.want(before.wanted)
 
     async def _go_back(self, before: Before) -> None:
         """Restore application and run state; never raises."""
-        talk = self._talk
         async with self._lock:
             try:
                 await self._have(before.application, before.running)
             except SmartCamError as error:
-                logger.warning("%s ! going back failed: %s", talk.name, error)
+                logger.warning("%s ! going back failed: %s", self._connection.name, error)
                 if self._is_loss(error):
                     self._owe(before)
                 else:
                     self._failed = error
             finally:
-                talk.inbox.expected = before.expected
-                talk.wants_running = before.wants_running
+                self._state.want(before.wanted)
 
     async def _restore(self) -> None:
         """Have the application that was named, and the run state that was asked for; never raises.
 
         Where the link is lost again the next session does it.
         """
-        talk = self._talk
-        wanted = talk.inbox.expected, talk.wants_running
+        wanted = self._state.wanted
         async with self._lock:
             try:
                 await self._have(*wanted)
             except SmartCamError as error:
-                logger.warning("%s ! restoring failed: %s", talk.name, error)
+                logger.warning("%s ! restoring failed: %s", self._connection.name, error)
                 if not self._is_loss(error):
                     self._failed = error
             finally:
-                talk.inbox.expected, talk.wants_running = wanted
+                self._state.want(wanted)
 
     def _is_loss(self, error: SmartCamError) -> bool:
         """Whether the link is lost, an answer that did not come included: it costs the link."""
-        link = self._talk.link
+        link = self._connection.link
         return isinstance(error, LinkError) or (link is not None and link.lost)
 
     async def _have(self, application: int | None, running: bool | None) -> None:
         """Have an application and a run state, by the least that is needed; None: as it is."""
-        talk = self._talk
-        deadline = talk.deadline(self._switch_timeout)
-        active = await talk.query_loaded(deadline)
+        commands, status = self._commands, self._status
+        deadline = self._connection.deadline(self._switch_timeout)
+        active = await commands.query_loaded(deadline)
         if application is not None and active != application:
-            await talk.switch(application, deadline, start=running is True)
-        elif running and Status.RUNNING not in talk.status:
-            await talk.start(deadline)
-        elif running is False and Status.RUNNING in talk.status:
-            await talk.stop(deadline)
+            await commands.switch(application, deadline, start=running is True)
+        elif running and Status.RUNNING not in status.last:
+            await commands.start(deadline)
+        elif running is False and Status.RUNNING in status.last:
+            await commands.stop(deadline)
 
     async def _acquire(self) -> None:
         """Take the lock, but behind every job that goes back.

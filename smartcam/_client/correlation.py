@@ -26,8 +26,6 @@ from typing import Literal, NamedTuple
 
 from smartcam.models import Status
 
-__all__ = ["NUMBER_STEP", "Attribution", "Debt", "Run", "Trigger", "Verdict"]
-
 Debt = Literal["late", "streamed"]
 
 NUMBER_STEP = 1000
@@ -45,7 +43,7 @@ MAX_OWED = 1024
 
 
 @dataclass(slots=True, eq=False)
-class Run:
+class Progress:
     """How far the camera is with a trigger, as far as is heard.
 
     Attributes:
@@ -67,14 +65,14 @@ class Run:
 
 
 @dataclass(slots=True, eq=False)
-class Trigger:
+class SentTrigger:
     """The trigger under way.
 
     Attributes:
         wanted: how many results it is to have.
         number: sequence number set for it, None where its layout has none.
         certain: no run of others may carry its number.
-        run: how far the camera is with it.
+        progress: how far the camera is with it.
         came: how many of its results came.
         early: containers that came before its fence was answered.
         given_up: what it still misses is owed.
@@ -84,20 +82,20 @@ class Trigger:
     wanted: int = 1
     number: int | None = None
     certain: bool = False
-    run: Run = field(default_factory=Run)
+    progress: Progress = field(default_factory=Progress)
     came: int = 0
     early: int = 0
     given_up: bool = False
     ended: bool = False
 
 
-class Verdict(NamedTuple):
+class Match(NamedTuple):
     """Whose a container is.
 
     Attributes:
         fate: ``triggered``: of the trigger under way; ``late`` or ``streamed``: of one that was
             given up; ``nobody``: of none of ours; ``held``: not known yet, see
-            :meth:`Attribution.on_answer_to_query`.
+            :meth:`Correlation.on_query_answer`.
         extra: of a trigger that has all its results.
     """
 
@@ -105,7 +103,7 @@ class Verdict(NamedTuple):
     extra: bool = False
 
 
-OURS, HELD = Verdict("triggered"), Verdict("held")
+OURS, HELD = Match("triggered"), Match("held")
 
 _WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
 
@@ -117,10 +115,10 @@ class _Owed:
     fate: Debt
     number: int | None
     missing: int
-    run: Run
+    progress: Progress
 
 
-class Attribution:
+class Correlation:
     """Decides whose each container is; knows no wire and no time.
 
     Args:
@@ -131,17 +129,15 @@ class Attribution:
         pending: the trigger under way.
         doubted: the status may be older than the last trigger, which was given up: it may say that
             the camera waits for one although it has one.
-        numbered: numbers of ours are about: a container's may say whose it is.
     """
 
     def __init__(self, chance: float) -> None:
-        self.pending: Trigger | None = None
+        self.pending: SentTrigger | None = None
         self.doubted: bool = False
-        self.numbered: bool = False
         self._ordered = False
         self._drops_waiting: bool | None = None  # whether it shows a trigger; None: not known yet
         self._satisfied = False  # the last trigger has its results, no other inspection was seen
-        self._last: Run | None = None  # of the last trigger, until it has its results
+        self._last: Progress | None = None  # of the last trigger, until it has its results
         self._owed: list[_Owed] = []
         self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
         self._last_number: int | None = None  # of the last trigger that had its results
@@ -153,16 +149,6 @@ class Attribution:
         """Fate of the result of an earlier trigger that may still come."""
         return self._owed[0].fate if self._owed else None
 
-    @property
-    def satisfied(self) -> bool:
-        """The last trigger has its results, and no other inspection was seen since."""
-        return self._satisfied
-
-    @property
-    def quiet(self) -> bool:
-        """Nothing of ours is about: a container that comes is nobody's."""
-        return self.pending is None and not self._owed and not self.numbered
-
     # ------------------------------------------------------------------ the session
 
     def begin_session(self, *, ordered: bool) -> None:
@@ -171,7 +157,7 @@ class Attribution:
         self._satisfied = self.doubted = False
         self._last = None
         for one in self._owed:  # whether it began may have been told to nobody
-            one.run = Run(begun=True)
+            one.progress = Progress(begun=True)
 
     def settled(self) -> None:
         """Nothing of before can come: the application was stopped, and all of that was heard."""
@@ -186,7 +172,7 @@ class Attribution:
         """
         self.doubted = False
         if self._ordered and self._drops_waiting:
-            self._owed = [one for one in self._owed if one.run.begun]
+            self._owed = [one for one in self._owed if one.progress.begun]
             self._last = None
 
     # ------------------------------------------------------------------ the trigger
@@ -208,25 +194,23 @@ class Attribution:
         """The user has set the number of the next run."""
         self._given = number
 
-    def send(self, pending: Trigger) -> None:
+    def send(self, pending: SentTrigger) -> None:
         """A trigger is sent now."""
         self.pending, self._satisfied = pending, False
-        self._last = pending.run
-        if pending.number is not None:
-            self.numbered = True
-        else:
+        self._last = pending.progress
+        if pending.number is None:
             self._given = None  # its run has it
 
     def leave(self) -> None:
         """The trigger's caller goes on."""
         self.pending = None
 
-    def done(self, pending: Trigger) -> None:
+    def done(self, pending: SentTrigger) -> None:
         """The trigger has all its results."""
         self._satisfied, self._last_number = True, pending.number
         self._last = None
 
-    def give_up(self, pending: Trigger, fate: Debt = "late", *, unread: int = 0) -> None:
+    def give_up(self, pending: SentTrigger, fate: Debt = "late", *, unread: int = 0) -> None:
         """Nobody waits for the trigger any more; its results may still come.
 
         Args:
@@ -238,8 +222,8 @@ class Attribution:
         if pending.given_up or missing <= 0:
             return
         pending.given_up = True
-        self.doubted = self.doubted or not pending.run.begun
-        self._owed.append(_Owed(fate, pending.number, missing, pending.run))
+        self.doubted = self.doubted or not pending.progress.begun
+        self._owed.append(_Owed(fate, pending.number, missing, pending.progress))
         del self._owed[:-MAX_OWED]
         if pending.number is not None:
             self._given_up[pending.number] = fate
@@ -248,24 +232,22 @@ class Attribution:
 
     # ------------------------------------------------------------------ what comes
 
-    def on_fence(self, status: int) -> None:
-        """The Query in front of the last trigger is answered.
+    def on_query_answer(self, status: int, *, fence: bool) -> None:
+        """A Query is answered.
 
         Args:
             status: as it is now.
+            fence: it is the one in front of the last trigger; else it was sent behind that. A
+                camera that shows the trigger has done so by now then. Of one that was never seen
+                to, it is known now that it does not, and a container that was held for that is the
+                trigger's.
         """
         run = self._last
-        if run is not None:
+        if run is None:
+            return
+        if fence:
             run.reached, run.shown = True, self._ordered and not status & _WAITING
-
-    def on_answer_to_query(self) -> None:
-        """A Query that was sent behind the last trigger is answered.
-
-        A camera that shows the trigger has done so by now. Of one that was never seen to, it is
-        known now that it does not, and a container that was held for that is the trigger's.
-        """
-        run = self._last
-        if run is not None and run.reached and not run.begun and self._drops_waiting is None:
+        elif run.reached and not run.begun and self._drops_waiting is None:
             self._drops_waiting = False
 
     def on_answer(self) -> None:
@@ -302,15 +284,16 @@ class Attribution:
         self._given = None  # that run has it
         return self._ordered and previous is not None
 
-    def judge(self, number: int | None) -> Verdict:
+    def judge(self, number: int | None, *, older: bool = False) -> Match:
         """Say whose a container of the right application is.
 
         Args:
             number: its sequence number, None where it has none or none of ours is about.
+            older: it is not the pending trigger's.
         """
         pending = self.pending
-        if pending is not None and not pending.ended:
-            if not pending.run.reached:
+        if pending is not None and not pending.ended and not older:
+            if not pending.progress.reached:
                 pending.early += 1
             elif pending.came == pending.wanted:
                 pass  # all are there, and are still to be confirmed
@@ -318,7 +301,7 @@ class Attribution:
                 if number == pending.number:
                     return OURS
             elif number is None or pending.number is None or number == pending.number:
-                run = pending.run
+                run = pending.progress
                 known = number is not None and pending.number is not None
                 if (
                     (run.begun and (known or not run.over))
@@ -328,29 +311,28 @@ class Attribution:
                     return OURS
                 if self._drops_waiting is None and not run.shown:
                     return HELD
-        return self.judge_other(number)
+        return self._judge_other(number)
 
-    def _may_pay(self, run: Run) -> bool:
+    def _may_pay(self, run: Progress) -> bool:
         """Whether a container that comes now may be of a run: where it shows, it has begun."""
         shows = self._ordered and self._drops_waiting
         return run.begun or (run.reached and not run.shown and not shows)
 
-    def judge_other(self, number: int | None) -> Verdict:
-        """Say whose a container is that is not the pending trigger's; as :meth:`judge`."""
+    def _judge_other(self, number: int | None) -> Match:
         if number is not None and number in self._given_up:
             self._pay([one for one in self._owed if one.number == number])
-            return Verdict(self._given_up[number])
+            return Match(self._given_up[number])
         if number is not None and number == self._last_number:
-            return Verdict("nobody", extra=True)
+            return Match("nobody", extra=True)
         # a number that is none of ours may be that of a trigger that was sent without one
         open_ = [
             one
             for one in self._owed
-            if (number is None or one.number is None) and self._may_pay(one.run)
+            if (number is None or one.number is None) and self._may_pay(one.progress)
         ]
         if open_:
-            return Verdict(self._pay(open_))
-        return Verdict("nobody", extra=self._satisfied and number is None)
+            return Match(self._pay(open_))
+        return Match("nobody", extra=self._satisfied and number is None)
 
     def _pay(self, owed: list[_Owed]) -> Debt:
         """One result of the first of these has come."""

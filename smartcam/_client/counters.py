@@ -8,18 +8,16 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from smartcam.models import HISTOGRAM_BOUNDS, Histogram, Statistics
-from smartcam.protocols.framed.machine import Counters
+from smartcam.protocols._framed.machine import Counters
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from smartcam.models import SubscriberStatistics
 
-__all__ = ["Account", "Times"]
-
 
 class Times:
-    """Collects times for a :class:`~smartcam.models.Histogram`."""
+    """Collects times for a :class:`~smartcam.Histogram`."""
 
     __slots__ = ("_counts", "_longest", "_shortest", "_total")
 
@@ -39,7 +37,7 @@ class Times:
             self._longest = seconds
 
     def histogram(self) -> Histogram:
-        """Return what was counted so far."""
+        """Return a snapshot of the counts."""
         some = self._longest >= self._shortest
         return Histogram(
             HISTOGRAM_BOUNDS,
@@ -50,8 +48,8 @@ class Times:
         )
 
 
-class Account:
-    """The account of one client.
+class ClientCounters:
+    """What one client has counted.
 
     Attributes:
         fates: what became of result containers; their sum is ``received``.
@@ -84,6 +82,26 @@ class Account:
         """Count containers with what became of them, in one step: the sum always holds."""
         self.received += containers
         self.fates[fate] += containers
+
+    def skip(self, empty_slots: int) -> None:
+        """Count all-zero records that an interpreter skipped."""
+        self.empty_slots += empty_slots
+
+    def note_extra(self, containers: int) -> None:
+        """Count containers for a trigger that had its results already."""
+        self.extra_results += containers
+
+    def note_other(self) -> None:
+        """Count an inspection that something else has triggered."""
+        self.inspections_by_others += 1
+
+    def note_overtrigger(self) -> None:
+        """Count that the Overtriggered bit rose."""
+        self.overtriggers += 1
+
+    def note_loss(self, error: Exception) -> None:
+        """Keep the text of a link's last error."""
+        self.last_error = str(error)
 
     def begin(self, wire: Counters) -> None:
         """Count a session, and what goes over its link from now on."""

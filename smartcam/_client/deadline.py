@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Alarm"]
 
-
-class Alarm:
+class DeadlineTimer:
     """Calls back at a deadline; one deadline at a time.
 
     Args:

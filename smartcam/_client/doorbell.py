@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     import contextvars
     from collections.abc import Callable, Generator
 
-__all__ = ["Doorbell"]
-
 
 class Doorbell:
     """One task may ``await`` it, again and again; :meth:`ring` has it go on.

@@ -26,8 +26,8 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.protocols.base import Dialect, Protocol, Transport, Verdict
-from smartcam.protocols.framed.machine import LinkEnded, LinkFailed
+from smartcam.protocols._base import Dialect, Protocol, Transport, Verdict
+from smartcam.protocols._framed.machine import LinkEnded, LinkFailed
 from smartcam.protocols.messages import (
     Connect,
     ConnectAnswer,
@@ -44,20 +44,9 @@ from smartcam.registry import PROTOCOLS
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from smartcam._client.link import TraceEntry
+    from smartcam.observers import TraceEntry
     from smartcam.protocols.messages import Message
     from smartcam.settings import Address, CameraSettings
-
-__all__ = [
-    "Session",
-    "Try",
-    "attempt",
-    "code_text",
-    "establish",
-    "load_protocol",
-    "names_of",
-    "tries_for",
-]
 
 logger: logging.Logger = logging.getLogger("smartcam.handshake")
 
@@ -239,7 +228,7 @@ class _Collector:
 
 
 def code_text(dialect: Dialect, code: int, request: type[Message] | None = None) -> str:
-    """Return what a result code says in the answer to a request."""
+    """Return the text of a result code in the answer to a request."""
     number = f"{code:#04x}" if code >= 0 else str(code)
     return f"code {number} ({dialect.code(code, request).text})"
 
@@ -330,7 +319,7 @@ async def attempt(
 
 
 def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
-    """Return what to try at an address, each on a fresh link."""
+    """Return the attempts at an address, each for a fresh link."""
     protocol = load_protocol(address.protocol)
     return protocol.tries(
         protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
@@ -408,7 +397,7 @@ async def establish(
 def _sharer(
     limit: asyncio.Timeout, end: float, untried: int, *, hurried: bool
 ) -> Callable[[str], None]:
-    """Return what gives each step of an attempt its time, in a round that is over at ``end``.
+    """Return the function that gives each step of an attempt its time, in a round until ``end``.
 
     Only the answer to Connect has to leave time for the dialects that are untried, this one
     included: no link is none for any of them, and who answered speaks this one.
@@ -426,7 +415,7 @@ def _sharer(
 
 
 def _folded(tries: list[Try]) -> str:
-    """Return what came of all attempts, those with the same outcome in a row as one."""
+    """Return the outcomes of all attempts in words, equal ones in a row as one."""
     parts: list[str] = []
     numbered = enumerate(map(str, tries), 1)
     for text, group in itertools.groupby(numbered, key=operator.itemgetter(1)):

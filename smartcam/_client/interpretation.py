@@ -1,4 +1,4 @@
-"""From a result container to a :class:`~smartcam.models.Result`: which interpreter, and running it.
+"""From a result container to a :class:`~smartcam.Result`: which interpreter, and running it.
 
 ``interpret_as`` is one specification for whatever comes, or a mapping from application id to one.
 ``calibration`` stands behind the interpreter, for all applications or for each by itself; where it
@@ -17,7 +17,7 @@ from smartcam.exceptions import (
     InterpretationError,
     WrongApplicationError,
 )
-from smartcam.interpreters.base import (
+from smartcam.interpreters._base import (
     Context,
     Interpreter,
     PlainInterpreter,
@@ -28,7 +28,7 @@ from smartcam.interpreters.base import (
     run_plain,
     run_sequence,
 )
-from smartcam.layout.texts import pack_texts
+from smartcam.layout._texts import pack_texts
 from smartcam.models import Localization
 from smartcam.registry import INTERPRETERS
 
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 
     from smartcam.models import ByteOrder, Calibration
     from smartcam.protocols.messages import ResultContainer
-
-__all__ = ["Interpretation", "byte_order"]
-
 
 _BYTE_ORDERS: dict[int, ByteOrder] = {0: "little", 1: "big"}
 
@@ -107,8 +104,8 @@ class Interpretation:
         self._y_down = y_down
         self._plain_context = Context(y_down=y_down, lenient=lenient)
         self._endian = 0
-        self._one: _Way | None = None
-        self._by_application: dict[int, _Way] = {}
+        self._one: _ApplicationReader | None = None
+        self._by_application: dict[int, _ApplicationReader] = {}
         if hasattr(spec, "items"):
             for application, one in spec.items():
                 if not isinstance(application, int):
@@ -132,7 +129,7 @@ class Interpretation:
         return self._one is None
 
     def numbering(self, application: int | None) -> Numbering | None:
-        """Return how this application's containers carry the sequence number, None if not."""
+        """Return the place of the number in this application's containers, None without one."""
         way = self._way(application)
         return way.numbering if way is not None else None
 
@@ -146,12 +143,12 @@ class Interpretation:
         except InterpretationError:
             return None
 
-    def _way(self, application: int | None) -> _Way | None:
+    def _way(self, application: int | None) -> _ApplicationReader | None:
         if self._one is not None or application is None:
             return self._one
         return self._by_application.get(application)
 
-    def _known(self, application: int) -> _Way:
+    def _known(self, application: int) -> _ApplicationReader:
         way = self._way(application)
         if way is None:
             known = sorted(self._by_application)
@@ -342,7 +339,11 @@ class _Calibrations:
 
 
 def _calibration(given: Any, y_down: bool) -> Calibration:
-    """Return what was given; raise where it is no calibration, or one that would mirror poses."""
+    """Return the calibration that was given.
+
+    Raises:
+        ConfigurationError: it is none, or one that would mirror poses.
+    """
     method = getattr(given, "to_robot", None)
     if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):
         raise ConfigurationError(
@@ -386,7 +387,7 @@ def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
     return pack_texts(interpreter.layout, container.cells)
 
 
-class _Way(NamedTuple):
+class _ApplicationReader(NamedTuple):
     """How the containers of one application are read.
 
     Attributes:
@@ -402,7 +403,7 @@ class _Way(NamedTuple):
     numbering: Numbering | None
 
 
-def _way(interpreter: Interpreter) -> _Way:
+def _way(interpreter: Interpreter) -> _ApplicationReader:
     layout = interpreter.layout
     own = type(interpreter).sequence is not Interpreter.sequence
     field = layout.sequence_field if layout is not None else None
@@ -410,4 +411,4 @@ def _way(interpreter: Interpreter) -> _Way:
     if layout is not None and field is not None and field.wire.high is not None:
         always = field in layout.head or layout.repeat is None
         numbering = Numbering(min(field.wire.high, MAX_NUMBER), always)
-    return _Way(interpreter, plain(interpreter), own or field is not None, numbering)
+    return _ApplicationReader(interpreter, plain(interpreter), own or field is not None, numbering)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import SmartCamError
@@ -17,38 +18,58 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Generator
 
+    from smartcam._client.camera_state import CameraState
     from smartcam._client.link import Link
-    from smartcam._client.requests import Conversation
+    from smartcam._client.requests import Requests
+    from smartcam._client.waits import Waits
 
-__all__ = ["watched"]
 
+@dataclass(eq=False)
+class KeepAlive:
+    """Watches the link of each session."""
 
-@contextlib.contextmanager
-def watched(
-    link: Link, talk: Conversation, timeout: float | None, switch_timeout: float
-) -> Generator[None]:
-    """Watch a link while the body runs; with ``timeout=None`` do not."""
-    if timeout is None:
-        yield
-        return
-    watch = _Watch(link, talk, timeout / 2, switch_timeout)
-    watch.look()
-    try:
-        yield
-    finally:
-        watch.stop()
+    _requests: Requests
+    _waits: Waits
+    _state: CameraState
+    _timeout: float | None  # seconds of silence after which a link is given up; None: never
+    _switch_timeout: float  # seconds that loading an application may take
+
+    @contextlib.contextmanager
+    def watched(self, link: Link) -> Generator[None]:
+        """Watch a link while the body runs."""
+        if self._timeout is None:
+            yield
+            return
+        watch = _Watch(self, link, self._timeout / 2)
+        watch.look()
+        try:
+            yield
+        finally:
+            watch.stop()
+
+    def ask(self, due: float) -> None:
+        """Ask for a sign of life, to come until ``due`` (loop time)."""
+        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
+            self._requests.ask_for_life(due)
+
+    def patience(self, usual: float) -> float:
+        """Return the seconds of silence allowed: more in a switch, or a trigger that is answered.
+
+        It is ours or somebody else's.
+        """
+        status = self._state.status
+        loading = status is not None and status.loading
+        slow = loading or self._waits.owes(m.SwitchAnswer, m.TriggerAnswer)
+        return self._switch_timeout if slow else usual
 
 
 class _Watch:
     """One timer; set again each time it fires, never by what is received."""
 
-    def __init__(
-        self, link: Link, talk: Conversation, patience: float, switch_timeout: float
-    ) -> None:
+    def __init__(self, owner: KeepAlive, link: Link, patience: float) -> None:
+        self._owner = owner
         self._link = link
-        self._talk = talk
         self._patience = patience  # seconds of silence before a question, and after it
-        self._switch_timeout = switch_timeout
         self._loop = asyncio.get_running_loop()
         self._asked_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -64,9 +85,10 @@ class _Watch:
         if self._asked_at is not None and self._asked_at <= heard_at:  # a clock may be coarse
             self._asked_at = None
         if self._asked_at is None:
-            quiet = self._switch_timeout if self._loading else self._patience
+            quiet = self._owner.patience(self._patience)
             if now >= heard_at + quiet:
-                self._ask(now)
+                self._asked_at = now
+                self._owner.ask(now + self._patience)
                 when = now + self._patience
             else:
                 # a load may begin or end meanwhile, so look at each step
@@ -78,15 +100,3 @@ class _Watch:
                 self._link.give_up(TimeoutError(silence))
                 return
         self._timer = self._loop.call_at(when, self.look)
-
-    def _ask(self, now: float) -> None:
-        self._asked_at = now
-        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
-            self._talk.ask_for_life(now + self._patience)
-
-    @property
-    def _loading(self) -> bool:
-        """A switch is under way, ours or somebody else's, or a trigger that will be answered."""
-        owed = self._talk.inbox.answers
-        loads = m.SwitchAnswer in owed or m.TriggerAnswer in owed
-        return loads or self._talk.status.loading

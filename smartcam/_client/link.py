@@ -13,23 +13,23 @@ import collections
 import contextlib
 import logging
 import socket
+import weakref
 from datetime import UTC, datetime
-from time import thread_time
+from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.doorbell import Doorbell
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
-from smartcam.protocols.base import Dialect, Role, Transport
-from smartcam.protocols.framed.machine import Event, LinkFailed, LinkMachine, ResultBurst, State
+from smartcam.observers import TraceEntry
+from smartcam.protocols._base import Dialect, Role, Transport
+from smartcam.protocols._framed.machine import Event, LinkFailed, LinkMachine, ResultBurst, State
 from smartcam.protocols.messages import Disconnect, Message, Sender
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from smartcam.protocols.base import Protocol
-    from smartcam.protocols.framed.framing import Frame
-
-__all__ = ["Chunk", "Link", "TraceEntry", "open_link"]
+    from smartcam.protocols._base import Protocol
+    from smartcam.protocols._framed.framing import Frame
 
 logger: logging.Logger = logging.getLogger("smartcam.connection")
 
@@ -45,7 +45,18 @@ TURN = 0.0002
 """Seconds of the processor that the receive task takes in one turn of the event loop, about: from
 how long a chunk took follows how much the next one holds."""
 
-LEAST_CHUNK = 8
+SHARED_TURN = 0.00005
+"""The same where other links have the same loop: what they do waits for a turn of each that floods,
+at each of its steps."""
+
+PASSES = 4
+"""Times that the loop goes round before the next chunk, at most, where other links have it, too: as
+long as they, or whoever else is there, take more than a turn of it."""
+
+links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
+"""How many links are open on a loop."""
+
+LEAST_CHUNK = 4
 """Frames of a chunk that are worth to be cut."""
 
 FIRST_CHUNK = 64
@@ -70,29 +81,6 @@ class Chunk(NamedTuple):
     received_at: float
     events: list[Event]
     frames: int = 1
-
-
-class TraceEntry(NamedTuple):
-    """One frame as ``--trace`` writes it.
-
-    Attributes:
-        at: when, UTC.
-        camera: name of the camera.
-        direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
-            unfinished frame when the link ended.
-        message_id: id on the wire, None for broken bytes and where there are no such ids.
-        message: name of the message, or the error's text for broken bytes.
-        fields: decoded body, None where it cannot be decoded.
-        hex: the bytes.
-    """
-
-    at: datetime
-    camera: str
-    direction: str
-    message_id: int | None
-    message: str
-    fields: Any
-    hex: str
 
 
 class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
@@ -183,7 +171,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         if self._busy_since is not None:
             self._adapt(self._busy_since)
         if self._chunks:
-            await asyncio.sleep(0)  # others have their turn
+            await self._give_way()
         while not self._chunks:
             if self._loss is not None:
                 raise self.lost_error()
@@ -234,7 +222,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.abort(reason)
 
     def lost_error(self) -> ConnectionLostError:
-        """Return what the receive task and writers are told when the link is gone."""
+        """Return the error for the receive task and writers when the link is gone."""
         where = "" if self.name == self.peer else f" to {self.peer}"
         error = ConnectionLostError(
             f"{self.name}: the link{where} is gone: {self._loss}",
@@ -263,6 +251,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """asyncio: the link is open."""
         self._transport = transport
+        links[self._loop] = links.get(self._loop, 0) + 1
         sock = transport.get_extra_info("socket")
         if sock is not None and self.machine.transport is Transport.TCP:
             # the camera sets it and advises it (SC manual p. 40: published)
@@ -306,6 +295,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """asyncio: the link is over."""
         self._lose(exc or ConnectionResetError("the camera closed the connection"))
+        links[self._loop] -= 1
         if not self._closed.done():
             self._closed.set_result(None)
 
@@ -352,11 +342,20 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 self._transport.pause_reading()
         self._doorbell.ring()
 
+    async def _give_way(self) -> None:
+        """Let the loop go round; more often where it is shared and the others are at work."""
+        for _ in range(PASSES if links[self._loop] > 1 else 1):
+            left = perf_counter()
+            await asyncio.sleep(0)
+            if perf_counter() - left < SHARED_TURN:
+                break
+
     def _adapt(self, since: float) -> None:
         """Have the next chunks hold as much as one turn takes, by how long the last one took."""
         self._busy_since = None
         took = thread_time() - since
-        frames = int(self._busy_with * TURN / max(took, 1e-9))
+        turn = SHARED_TURN if links[self._loop] > 1 else TURN
+        frames = int(self._busy_with * turn / max(took, 1e-9))
         frames = max(frames, self._most // 2)  # once is no rule
         self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
 

@@ -8,19 +8,20 @@ question does not say what it should, and the link is given up.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ResponseTimeoutError, SmartCamError
-from smartcam.protocols.base import Transport
 from smartcam.protocols.messages import GetStatus, SwitchAnswer, TriggerAnswer
 
 if TYPE_CHECKING:
-    from smartcam._client.dispatch import Inbox
-    from smartcam._client.link import Link
+    import asyncio
 
-__all__ = ["StatusPoll"]
+    from smartcam._client.camera_state import CameraState
+    from smartcam._client.connection import Connection
+    from smartcam._client.listeners import Listeners
+    from smartcam._client.waits import Waits
 
 PERIOD = 0.02
 """Seconds between two questions while somebody waits: a fraction of a usual inspection."""
@@ -32,68 +33,90 @@ REPEAT_AFTER = 0.5
 """Seconds until an open question counts as lost: answers take milliseconds."""
 
 
-class StatusPoll:
-    """Asks for the status over one link.
+@dataclass(eq=False)
+class Polling:
+    """Asks for the status over the link of each session in which it has to be asked for."""
 
-    Args:
-        link: the link.
-        inbox: knows who wants a status, and how many have come.
-        patience: seconds that an answer may take.
-    """
+    _connection: Connection
+    _state: CameraState
+    _waits: Waits
+    _listeners: Listeners
+    _patience: float  # seconds that an answer may take
 
-    def __init__(self, link: Link, inbox: Inbox, patience: float) -> None:
-        self._link = link
-        self._inbox = inbox
-        self._patience = patience
-        self._ordered = link.machine.transport is Transport.TCP
-        self._loop = asyncio.get_running_loop()
+    def __post_init__(self) -> None:
+        self._running = False
+        self._triggered = False  # a trigger is under way
         self._timer: asyncio.TimerHandle | None = None
         self._asked_at = 0.0
         self._open_since = 0.0
         self._heard = -1  # statuses that had come when the open question was asked
 
+    def begin_session(self) -> None:
+        """Begin to ask, where the status does not come by itself."""
+        self._running = self._connection.features.polled
+        self._asked_at = self._open_since = 0.0
+        self._heard = -1
+        self.wanted()
+
+    def end_session(self) -> None:
+        """Ask no more."""
+        self._running = False
+        self._stop()
+
     def wanted(self) -> None:
         """Somebody wants a status: begin to ask, or ask more often."""
-        if self._timer is not None and self._timer.when() - self._loop.time() <= PERIOD:
+        if not self._running:
             return
-        self.stop()
-        self._timer = self._loop.call_later(0.0, self._tick)
+        loop = self._connection.loop
+        if self._timer is not None and self._timer.when() - loop.time() <= PERIOD:
+            return
+        self._stop()
+        self._timer = loop.call_later(0.0, self._tick)
+
+    def begin_trigger(self) -> None:
+        """A trigger is under way, and wants to know what becomes of it."""
+        self._triggered = True
+        self.wanted()
+
+    def end_trigger(self) -> None:
+        """No trigger is under way any more."""
+        self._triggered = False
 
     def ask(self) -> None:
         """Ask now, whatever is open: what was asked before may tell of what was before."""
-        with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
-            self._link.send(GetStatus(), answered=False)
+        if self._running:
+            with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
+                self._connection.require_link().send(GetStatus(), answered=False)
 
-    def stop(self) -> None:
-        """Ask no more."""
+    def _stop(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def _tick(self) -> None:
         self._timer = None
-        inbox = self._inbox
-        if not (inbox.awaits_status or inbox.watches_status) or self._link.lost:
+        link, heard = self._connection.link, self._state.statuses_heard
+        soon = self._triggered or self._waits.awaits_status
+        if not (soon or self._listeners.watches_status) or link is None or link.lost:
             return
-        now = self._loop.time()
-        answered = inbox.statuses_heard != self._heard
+        loop = self._connection.loop
+        now = loop.time()
+        answered = heard != self._heard
         if answered or self._may_be_silent:
             self._open_since = now
-        elif self._ordered and now - self._open_since >= self._patience:
+        elif self._connection.features.ordered and now - self._open_since >= self._patience:
             silence = f"no status within {now - self._open_since:.1f} s of being asked for"
-            self._link.give_up(ResponseTimeoutError(f"{inbox.name}: {silence}"))
+            link.give_up(ResponseTimeoutError(f"{self._connection.name}: {silence}"))
             return
         if answered or now - self._asked_at >= REPEAT_AFTER:
-            self._heard, self._asked_at = inbox.statuses_heard, now
+            self._heard, self._asked_at = heard, now
             try:
-                self._link.send(GetStatus(), answered=False)
+                link.send(GetStatus(), answered=False)
             except SmartCamError:  # the link is over: the receive task tells
                 return
-        period = PERIOD if inbox.awaits_status else IDLE_PERIOD
-        self._timer = self._loop.call_later(period, self._tick)
+        self._timer = loop.call_later(PERIOD if soon else IDLE_PERIOD, self._tick)
 
     @property
     def _may_be_silent(self) -> bool:
         """Something is loaded or inspected, and one thing may be done after the other."""
-        answers = self._inbox.answers
-        return SwitchAnswer in answers or TriggerAnswer in answers
+        return self._waits.owes(SwitchAnswer, TriggerAnswer)

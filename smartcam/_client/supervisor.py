@@ -1,8 +1,8 @@
 """The life of a client: sessions, one after the other, and what happens between them.
 
-One task per client, the library's only bare ``create_task``. It makes a session, has the receive
+One task per client, its only bare ``create_task``. It makes a session, has the receive
 task read its link to the end, tells everybody that it is over, and by the
-:class:`~smartcam.backoff.Backoff` makes the next. When the camera was lost again soon after a
+:class:`~smartcam.Backoff` makes the next. When the camera was lost again soon after a
 reconnect another client has it: then it stops.
 """
 
@@ -11,11 +11,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from smartcam._client.handshake import Session, establish
-from smartcam._client.keepalive import watched
 from smartcam.exceptions import (
     ConnectionClosedError,
     ConnectionLostError,
@@ -24,16 +24,20 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.models import Connected, Disconnected, Reconnected
-from smartcam.protocols.base import Transport
+from smartcam.protocols._base import Transport
 
 if TYPE_CHECKING:
-    from smartcam._client.command_lock import Turns
+    from smartcam._client.command_lock import CommandLock
+    from smartcam._client.commands import Commands
+    from smartcam._client.connection import Connection
+    from smartcam._client.counters import ClientCounters
+    from smartcam._client.dispatch import Dispatch
+    from smartcam._client.keepalive import KeepAlive
     from smartcam._client.link import Link
-    from smartcam._client.requests import Conversation
+    from smartcam._client.listeners import Listeners
+    from smartcam._client.waits import Waits
     from smartcam.observers import Observers
     from smartcam.settings import Address, CameraSettings
-
-__all__ = ["Supervisor"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
@@ -42,28 +46,28 @@ TAKEN_WITHIN = 10.0
 client (a decision of this library; the camera does not say so)."""
 
 
+@dataclass(eq=False)
 class Supervisor:
     """Makes sessions and reads them.
-
-    Args:
-        settings: of the client.
-        talk: what speaks over the link.
-        turns: who may speak.
-        observers: who else wants to know.
 
     Attributes:
         session: the last session that was made, None before the first.
     """
 
-    def __init__(
-        self, settings: CameraSettings, talk: Conversation, turns: Turns, observers: Observers
-    ) -> None:
+    _settings: CameraSettings
+    _connection: Connection
+    _commands: Commands
+    _lock: CommandLock
+    _dispatch: Dispatch
+    _waits: Waits
+    _listeners: Listeners
+    _counters: ClientCounters
+    _keepalive: KeepAlive
+    _observers: Observers
+
+    def __post_init__(self) -> None:
         self.session: Session | None = None
-        self._settings = settings
-        self._talk = talk
-        self._inbox = talk.inbox
-        self._turns = turns
-        self._observers = observers
+        self._name = self._settings.name
         self._task: asyncio.Task[None] | None = None
         self._opened: asyncio.Future[SmartCamError | None] | None = None
         self._changed = asyncio.Event()
@@ -95,7 +99,7 @@ class Supervisor:
     def connected(self) -> bool:
         """Whether there is a session."""
         session = self.session
-        return session is not None and not session.link.lost and self._inbox.end is None
+        return session is not None and not session.link.lost and self._waits.end is None
 
     async def open(self) -> None:
         """Start, and wait for the first session.
@@ -123,22 +127,21 @@ class Supervisor:
             if self.connected:
                 with contextlib.suppress(TimeoutError):  # another's command may be in between
                     async with asyncio.timeout(self._settings.switch_timeout):
-                        await self._turns.settle()
+                        await self._lock.settle()
             linked = self.connected
-            self._inbox.fail(self.closed_error())
+            self._dispatch.fail(self.closed_error())
             if linked and session is not None:
                 await session.link.close(self._settings.close_timeout)
         finally:
-            self._inbox.fail(self.closed_error())
+            self._dispatch.fail(self.closed_error())
             if session is not None:
                 session.link.give_up(ConnectionAbortedError("closed by this side"))
             if task is not None:
                 if not self._reading:
                     task.cancel()
                 await asyncio.wait({task})
-            self._inbox.end = self._ended_by or self.closed_error()
-            self._inbox.finish()
-            self._talk.end()
+            self._dispatch.finish(self._ended_by or self.closed_error())
+            self._commands.end_session()
 
     async def wait_connected(self, deadline: float, timeout: float) -> None:
         """Wait until there is a session, and what had to be restored in it is.
@@ -151,17 +154,17 @@ class Supervisor:
             async with asyncio.timeout_at(deadline):
                 while True:
                     if not self.started or self.over:
-                        self._talk.require_link()
+                        self._connection.require_link()
                     changed = self._changed
                     if self.connected:
-                        await self._turns.settle()
+                        await self._lock.settle()
                     if self.connected:
                         return
                     await changed.wait()
         except TimeoutError as exc:
-            why = self._inbox.account.last_error or "there was none yet"
+            why = self._counters.last_error or "there was none yet"
             raise ResponseTimeoutError(
-                f"{self._talk.name}: no session within {timeout:g} s; the last one: {why}",
+                f"{self._name}: no session within {timeout:g} s; the last one: {why}",
                 waited=timeout,
             ) from exc
 
@@ -174,7 +177,7 @@ class Supervisor:
         address = self._settings.address
         state = "closed" if self.started else "not opened yet"
         return ConnectionClosedError(
-            f"{self._talk.name}: the connection is {state}", host=address.host, port=address.port
+            f"{self._name}: the connection is {state}", host=address.host, port=address.port
         )
 
     # ------------------------------------------------------------------ the task
@@ -187,21 +190,21 @@ class Supervisor:
         except SmartCamError as exc:
             error = exc
         except Exception as exc:  # nobody must wait for a dead supervisor
-            logger.exception("%s ! the supervisor failed", self._talk.name)
+            logger.exception("%s ! the supervisor failed", self._name)
             cause = exc.exceptions[0] if isinstance(exc, ExceptionGroup) else exc
-            error = ConnectionLostError(f"{self._talk.name}: {cause!r} in the client")
+            error = ConnectionLostError(f"{self._name}: {cause!r} in the client")
             error.__cause__ = cause
         finally:
-            self._inbox.fail(error)
+            self._dispatch.fail(error)
             if self._closing:
-                self._inbox.end = self.closed_error()  # whatever it was before
+                error = self.closed_error()  # whatever it was before
             else:
-                self._inbox.end = self._ended_by = error
+                self._ended_by = error
             if self.session is not None:
                 self.session.link.abort()
-            self._inbox.account.end()
-            self._inbox.finish()
-            self._talk.end()
+            self._counters.end()
+            self._dispatch.finish(error)
+            self._commands.end_session()
             self._tell()
             if self._opened is not None and not self._opened.done():
                 self._opened.set_result(error)
@@ -224,7 +227,7 @@ class Supervisor:
                 return self._taken(error)
             self._short_lived = self._short_lived + 1 if again and short else 0
             self._excused = restarting
-            await self._turns.vacated()
+            await self._lock.vacated()
             session = await self._reconnect(error)
 
     async def _have(self, session: Session) -> ConnectionLostError:
@@ -234,47 +237,44 @@ class Supervisor:
         self._reading = True
         try:
             restore = settings.restore and self.session is not None
-            async with self._turns.session(restore=restore) as tasks:
+            async with self._lock.session(restore=restore) as tasks:
                 self._adopt(session)
-                limit, longest = settings.liveness_timeout, settings.switch_timeout
-                with watched(link, self._talk, limit, longest):
-                    name = f"smartcam[{self._talk.name}].receive"
+                with self._keepalive.watched(link):
+                    name = f"smartcam[{self._name}].receive"
                     error = await tasks.create_task(self._receive(link), name=name)
                 self._tell_of_loss(link, error)  # ends the jobs' waits too
         finally:
             self._reading = False
-            self._talk.end_polling()
+            self._commands.end_session()
             link.abort()
         return error
 
     def _adopt(self, session: Session) -> None:
-        inbox, again = self._inbox, self.session is not None
+        again = self.session is not None
         self.session = session
         ordered = session.link.machine.transport is Transport.TCP
-        inbox.begin(session.dialect, ordered=ordered)
-        self._talk.begin(session.link)
-        inbox.account.begin(session.link.machine.counters)
-        logger.info("%s = connected to %s", self._talk.name, session.address.url)
+        self._dispatch.begin_session(session.dialect, ordered=ordered)
+        self._commands.begin_session(session.link)
+        self._counters.begin(session.link.machine.counters)
+        logger.info("%s = connected to %s", self._name, session.address.url)
         kind = Reconnected if again else Connected
-        inbox.publish(kind(camera=self._talk.name, at=datetime.now(UTC), url=session.address.url))
+        event = kind(camera=self._name, at=datetime.now(UTC), url=session.address.url)
+        self._listeners.publish(event)
         for chunk in session.early:
-            inbox.dispatch(chunk)
+            self._dispatch.dispatch(chunk)
         if self._opened is not None and not self._opened.done():
             self._opened.set_result(None)
         self._tell()
 
     async def _receive(self, link: Link) -> ConnectionLostError:
         """The receive task: have each chunk dispatched until the link ends; return why it did."""
-        inbox = self._inbox
         while True:
             try:
                 chunk = await link.receive()
             except ConnectionLostError as error:
                 return error
-            inbox.dispatch(chunk)
+            self._dispatch.dispatch(chunk)
             del chunk  # the next one may take its time
-            if inbox.active_in_doubt:
-                self._talk.ask_what_is_active()
 
     def _tell_of_loss(self, link: Link, error: ConnectionLostError) -> None:
         """Tell everybody that a link has ended; what came before is dispatched."""
@@ -284,13 +284,11 @@ class Supervisor:
         reason = "closed by this side" if self._closing else reason
         if not expected:
             logger.warning("! %s", error)
-            self._inbox.account.last_error = str(error)
-            self._observers.error(self._talk.name, error)
-        self._inbox.fail(error)
-        self._inbox.publish(
-            Disconnected(
-                camera=self._talk.name, at=datetime.now(UTC), reason=reason, expected=expected
-            )
+            self._counters.note_loss(error)
+            self._observers.error(self._name, error)
+        self._dispatch.fail(error)
+        self._listeners.publish(
+            Disconnected(camera=self._name, at=datetime.now(UTC), reason=reason, expected=expected)
         )
         self._tell()
 
@@ -300,7 +298,7 @@ class Supervisor:
         Raises:
             SmartCamError: it was given up.
         """
-        policy, name = self._settings.reconnect, self._talk.name
+        policy, name = self._settings.reconnect, self._name
         settings = self._settings.model_copy(update={"address": self.address})
         failed: SmartCamError = loss
         if policy is not None:
@@ -312,7 +310,7 @@ class Supervisor:
                     failed = exc
                 level = logging.WARNING if tried == 1 else logging.DEBUG
                 logger.log(level, "%s ! reconnect %d: %s", name, tried, failed)
-                self._inbox.account.last_error = str(failed)
+                self._counters.note_loss(failed)
                 self._observers.error(name, failed)
                 if not policy.transient(failed):
                     break
@@ -325,15 +323,15 @@ class Supervisor:
     def _taken(self, error: ConnectionLostError) -> ConnectionTakenError:
         address = self.address
         taken = ConnectionTakenError(
-            f"{self._talk.name}: lost again right after a reconnect: another client has the "
+            f"{self._name}: lost again right after a reconnect: another client has the "
             f"camera, which serves one; stopped, so as not to fight for it ({error})",
             host=address.host,
             port=address.port,
         )
         taken.__cause__ = error.__cause__
         logger.warning("! %s", taken)
-        self._inbox.account.last_error = str(taken)
-        self._observers.error(self._talk.name, taken)
+        self._counters.note_loss(taken)
+        self._observers.error(self._name, taken)
         return taken
 
     def _tell(self) -> None:
@@ -343,7 +341,7 @@ class Supervisor:
 
 
 def _silence(error: ConnectionLostError, liveness_timeout: float | None) -> float:
-    """Return how many seconds ago a link was lost when it is noticed: only silence may tell."""
+    """Return the seconds since a link was lost when it is noticed: only silence may tell."""
     cause = error.__cause__
     if isinstance(cause, ResponseTimeoutError) or not isinstance(cause, TimeoutError):
         return 0.0

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._client.correlation import Run
-from smartcam._client.deadline import Alarm
-from smartcam._client.dispatch import PendingTrigger
-from smartcam._client.requests import is_ready
+from smartcam._client.correlation import Progress
+from smartcam._client.results import PendingTrigger
+from smartcam._client.status import is_ready
 from smartcam.exceptions import (
     CameraBusyError,
     CameraFaultError,
@@ -34,13 +34,17 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
     from typing import Any
 
-    from smartcam._client.dispatch import Inbox
+    from smartcam._client.camera_state import CameraState
+    from smartcam._client.commands import Commands
+    from smartcam._client.connection import Connection
     from smartcam._client.interpretation import Interpretation
     from smartcam._client.link import Link
-    from smartcam._client.requests import Conversation
+    from smartcam._client.polling import Polling
+    from smartcam._client.requests import Requests
+    from smartcam._client.results import Results
+    from smartcam._client.status import StatusRequests
+    from smartcam._client.waits import Answer, Waits
     from smartcam.models import Result
-
-__all__ = ["TriggerRequest", "Triggers"]
 
 _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
 _SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
@@ -89,20 +93,27 @@ def takes_trigger(status: Status) -> bool:
     return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
 
 
+@dataclass(eq=False)
 class Triggers:
-    """Triggers a camera, one trigger at a time; whose turn it is, is the client's business.
+    """Triggers a camera, one trigger at a time: whose turn it is, the command lock says."""
 
-    Args:
-        talk: what is said to the camera.
-    """
+    _connection: Connection
+    _requests: Requests
+    _status: StatusRequests
+    _commands: Commands
+    _results: Results
+    _state: CameraState
+    _waits: Waits
+    _polling: Polling
 
-    def __init__(self, talk: Conversation) -> None:
-        self._talk = talk
-        self.inbox: Inbox = talk.inbox
-        self.name: str = talk.name
+    def __post_init__(self) -> None:
+        self._name = self._connection.name
+        self._correlation = self._results.correlation
         self._doubtful: Link | None = None  # over UDP: a status may have been lost on it
-        self._alarm = Alarm(self._expire)
-        talk.at_end.append(self._alarm.cancel)
+
+    def give_number(self, number: int) -> None:
+        """Note that the user has set the number of the next run."""
+        self._correlation.give_number(number)
 
     def trigger(
         self, request: TriggerRequest, deadline: float
@@ -112,7 +123,7 @@ class Triggers:
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
-        if self._talk.acknowledged:
+        if self._connection.features.acknowledged:
             return self._trigger_until_taken(request, deadline)
         return self._trigger_once(request, deadline)
 
@@ -122,7 +133,7 @@ class Triggers:
         while True:
             try:
                 if busy is not None:
-                    await self._talk.pause(deadline, "the camera to take a trigger")
+                    await self._status.pause(deadline, "the camera to take a trigger")
                 return await self._trigger_once(request, deadline)
             except CameraBusyError as exc:
                 if not request.wait:
@@ -139,50 +150,51 @@ class Triggers:
         Raises:
             SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
         """
-        talk, attribution = self._talk, self.inbox.attribution
-        if talk.poll is not None:
-            await talk.refresh_status(deadline)
-            attribution.heard()
+        connection, state, correlation = self._connection, self._state, self._correlation
+        features = connection.features
+        if features.polled:
+            await self._status.refresh(deadline)
+            correlation.heard()
         self._raise_fault()
         cleared = False
-        if request.input_data is not None and self.inbox.input_in_doubt:
+        if request.input_data is not None and self._results.input_in_doubt:
             raise InputContainerError(
-                f"{self.name}: input data of an earlier trigger, which had no result, may still be "
-                "queued in the camera and would be taken for this one's; switch_application() "
+                f"{self._name}: input data of an earlier trigger, which had no result, may still "
+                "be queued in the camera and would be taken for this one's; switch_application() "
                 "empties the queue"
             )
-        if self.inbox.expected is not None and self.inbox.active != self.inbox.expected:
+        if state.wanted.application is not None and state.active != state.wanted.application:
             await self._check_application(deadline)
-        if self._doubtful is not None and self._doubtful is talk.link:
-            await talk.ask_for_status(deadline)
-            await talk.fence(deadline)  # it has come by then, or is lost again
+        if self._doubtful is not None and self._doubtful is connection.link:
+            await self._status.demand(deadline)
+            await self._requests.fence(deadline)  # it has come by then, or is lost again
             self._doubtful = None
-            attribution.heard()
+            correlation.heard()
         interpretation = request.interpretation
-        numbering = interpretation.numbering(self.inbox.active) if talk.numbered else None
+        numbering = interpretation.numbering(state.active) if features.numbered else None
         # an older result shows by its number where each container has one
         decided = numbering is not None and numbering.always
-        if attribution.doubted:  # the trigger before may not show in the status yet
-            await talk.fence(deadline)
-            attribution.heard()
-        if talk.halted_at is not None or attribution.debt is not None:
+        if correlation.doubted:  # the trigger before may not show in the status yet
+            await self._requests.fence(deadline)
+            correlation.heard()
+        if self._commands.halted or correlation.debt is not None:
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
         while True:
-            status = int(talk.status)
+            status = int(self._status.last)
             if status & _SPEAKS_AGAINST != _WAITING:
                 await self._wait_for_trigger(deadline, wait=request.wait)
             elif status & _OVERTRIGGERED and not cleared:
                 cleared = True
                 await self._clear_overtriggered(deadline)
-            elif talk.fences and talk.owes(m.QueryAnswer):  # one can be open
-                await talk.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+            elif features.fences and self._waits.owes(m.QueryAnswer):  # one can be open
+                await self._requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
         number, certain = None, False
         if numbering is not None:
-            number, certain = attribution.take_number(numbering.highest)
-        fenced = talk.fences and not (certain and decided)
-        loop = talk.loop or asyncio.get_running_loop()
+            number, certain = correlation.take_number(numbering.highest)
+        fenced = features.fences and not (certain and decided)
+        loop = connection.loop
         pending = PendingTrigger(
             outcome=loop.create_future(),
             interpretation=interpretation,
@@ -193,93 +205,85 @@ class Triggers:
             number=number,
             certain=certain,
             # where each application has its own interpreter none is read with another's layout
-            application=None if interpretation.by_application else self.inbox.active,
-            run=Run(reached=not fenced, confirmed=not talk.confirms),
+            application=None if interpretation.by_application else state.active,
+            progress=Progress(reached=not fenced, confirmed=not features.confirms),
         )
         return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
 
     async def _await_results(
         self, pending: PendingTrigger, input_data: bytes | None, deadline: float, *, fenced: bool
     ) -> list[Result]:
-        inbox, outcome, link = self.inbox, pending.outcome, self._talk.require_link()
+        requests, features = self._requests, self._connection.features
+        outcome, link = pending.outcome, self._connection.require_link()
         words: list[m.Message] = [_FENCE] if fenced else []
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
-        if self._talk.acknowledged:
-            await self._talk.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
+        if features.acknowledged:
+            await requests.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
         if input_data is not None and link.machine.dialect.answers(m.SetInput):
-            due = self._talk.due_after(deadline)
-            await self._talk.command(m.SetInput(data=input_data), deadline, due=due)
-            if fenced and self._talk.owes(m.QueryAnswer):
-                await self._talk.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+            due = requests.due_after(deadline)
+            await requests.command(m.SetInput(data=input_data), deadline, due=due)
+            if fenced and self._waits.owes(m.QueryAnswer):
+                await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
         elif input_data is not None:
             words.append(m.SetInput(data=input_data))
-        inbox.begin_trigger(pending)
-        self._alarm.set(deadline)
+        self._results.begin_trigger(pending, deadline)
         try:
             link.send(*words, _TRIGGER)
             if fenced:
-                self._talk.expect_fence(pending.sent_at, deadline)
-            if self._talk.acknowledged:
+                requests.expect_fence(pending.sent_at, deadline)
+            if features.acknowledged:
                 self._expect_acknowledgement(pending, deadline)
-            else:
-                inbox.input_in_doubt = inbox.input_in_doubt or input_data is not None
-            if self._talk.poll is not None:
-                self._talk.poll.wanted()
+            elif input_data is not None:
+                self._results.input_sent()
+            self._polling.begin_trigger()
             if not link.writable:
                 with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
                     async with asyncio.timeout_at(deadline):
                         await link.drain()
             return await outcome
         except TimeoutError as exc:
-            inbox.attribution.give_up(pending)
+            self._correlation.give_up(pending)
             # it may have been stopped: then Waiting did not drop for this trigger
-            certain = self._talk.ordered or pending.run.begun
+            certain = features.ordered or pending.progress.begun
             self._doubtful = None if certain else link
             waited = max(0.0, deadline - pending.sent_at)
             came = f"{len(pending.results)} of {pending.wanted} results"
             raise TriggerTimeoutError(
-                f"{self.name}: {came if pending.results else 'no result'} within "
-                f"{round(waited, 2):g} s of the trigger; status: {self._talk.status}"
+                f"{self._name}: {came if pending.results else 'no result'} within "
+                f"{round(waited, 2):g} s of the trigger; status: {self._status.last}"
                 f"{_told_of_fence(pending)}",
                 waited=waited,
             ) from exc
         except asyncio.CancelledError:
             if not outcome.done() or outcome.cancelled():
-                inbox.attribution.give_up(pending)
+                self._correlation.give_up(pending)
             else:
                 outcome.exception()  # nobody will look at it
             raise
         finally:
-            self._alarm.clear()
-            inbox.end_trigger()
+            self._polling.end_trigger()
+            self._results.end_trigger()
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
         """Have the trigger end at once where the camera says that it took none."""
 
-        def on_answer(answer: asyncio.Future[m.Message | SmartCamError]) -> None:
+        def on_answer(answer: asyncio.Future[Answer]) -> None:
             got = answer.result()
             if isinstance(got, SmartCamError) or pending.outcome.done():
                 return
             try:
-                self._talk.check(m.Trigger, got)
+                self._requests.check(m.Trigger, got)
             except (CommandRejectedError, UnsupportedError) as exc:
-                busy = isinstance(got, m.Acknowledgement) and self._talk.is_busy(got)
-                if not self._talk.ordered:  # it may be the answer to an earlier one
-                    self.inbox.attribution.give_up(pending)
+                busy = isinstance(got, m.Acknowledgement) and self._requests.is_busy(got)
+                if not self._connection.features.ordered:  # it may be the answer to an earlier one
+                    self._correlation.give_up(pending)
                 pending.fail(CameraBusyError(str(exc)) if busy else exc)
             except SmartCamError as exc:  # the link is over
                 pending.fail(exc)
 
-        due = self._talk.due_after(deadline)
-        self._talk.expect(m.TriggerAnswer, due).add_done_callback(on_answer)
-
-    def _expire(self) -> None:
-        """The trigger's deadline: from this moment on its result is late."""
-        pending = self.inbox.pending
-        if pending is not None:
-            self.inbox.attribution.give_up(pending)
-            pending.fail(TimeoutError())
+        due = self._requests.due_after(deadline)
+        self._requests.expect(m.TriggerAnswer, due).add_done_callback(on_answer)
 
     async def _check_application(self, deadline: float) -> None:
         """See to it that the application that was named is the active one.
@@ -287,14 +291,14 @@ class Triggers:
         Raises:
             WrongApplicationError: somebody else has switched; nothing was sent but a Query.
         """
-        inbox = self.inbox
-        await self._talk.fence(deadline)  # what is known may be old
-        if inbox.active != inbox.expected:
+        await self._requests.fence(deadline)  # what is known may be old
+        active, expected = self._state.active, self._state.wanted.application
+        if active != expected:
             raise WrongApplicationError(
-                f"{self.name}: application {inbox.active} is active, somebody else has switched; "
-                f"{inbox.expected} was expected",
-                expected=inbox.expected,
-                got=inbox.active,
+                f"{self._name}: application {active} is active, somebody else has switched; "
+                f"{expected} was expected",
+                expected=expected,
+                got=active,
             )
 
     async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
@@ -302,32 +306,32 @@ class Triggers:
         begin = asyncio.get_running_loop().time()
         while True:
             self._raise_fault()
-            status = self._talk.status
+            status = self._status.last
             if takes_trigger(status):
                 return
             if is_stopped(status):
                 raise NotRunningError(
-                    f"{self.name}: application {self.inbox.active} is stopped: start it, or name "
+                    f"{self._name}: application {self._state.active} is stopped: start it, or name "
                     f"it so that it is started; status: {status}"
                 )
             if not wait:
                 raise CameraBusyError(
-                    f"{self.name}: the camera does not wait for a trigger: {status}"
+                    f"{self._name}: the camera does not wait for a trigger: {status}"
                 )
             try:
-                await self._talk.wait_status(_is_decided, deadline)
+                await self._status.insist(_is_decided, deadline)
             except TimeoutError as exc:
                 free = _WHY_READY if is_ready(status) else ""
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
-                    f"{self.name}: the camera did not wait for a trigger within "
-                    f"{round(waited, 2):g} s; status: {self._talk.status}{free}",
+                    f"{self._name}: the camera did not wait for a trigger within "
+                    f"{round(waited, 2):g} s; status: {self._status.last}{free}",
                     waited=waited,
                 ) from exc
 
     def _raise_fault(self) -> None:
-        if int(self._talk.status) & _SYSTEM_ERROR:
-            raise CameraFaultError(f"{self.name}: the camera reports System Error")
+        if int(self._status.last) & _SYSTEM_ERROR:
+            raise CameraFaultError(f"{self._name}: the camera reports System Error")
 
     async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:
         """Await the result of an earlier trigger, or make it impossible, unless a number decides.
@@ -337,28 +341,26 @@ class Triggers:
         trigger again. A camera that does one thing after the other needs the fence only.
         Source: that Stop voids the inspection is inferred.
         """
-        attribution = self.inbox.attribution
-        if not self._talk.halted and (decided or attribution.debt is None):
+        correlation, commands = self._correlation, self._commands
+        if not commands.halted and (decided or correlation.debt is None):
             return
-        if self._talk.dialect.in_order or not self._talk.dialect.has(m.Stop):
+        dialect = self._connection.dialect
+        if dialect.in_order or not dialect.has(m.Stop):
             await self._wait_for_trigger(deadline, wait=wait)
-            await self._talk.fence(deadline)
-            attribution.settled()
+            await self._requests.fence(deadline)
+            correlation.settled()
             return
         now = asyncio.get_running_loop().time()
-        if not self._talk.halted and Status.RUNNING in self._talk.status:
+        if not commands.halted and Status.RUNNING in self._status.last:
             grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
             with contextlib.suppress(TimeoutError):
-                await self.inbox.wait_status(_is_decided, grace)
-            if attribution.debt is None:
+                await self._status.wait(_is_decided, grace)
+            if correlation.debt is None:
                 return
-        if self._talk.runs:
+        if commands.runs:
             # interrupted here, the next trigger does all of it again
-            self._talk.halted_at = self.inbox.loads_by_others
-            await self._talk.halt(deadline)
-            await self._talk.fence(deadline)
-            await self._talk.enter_run_mode(deadline)
-        attribution.settled()
+            await commands.void_inspection(deadline)
+        correlation.settled()
 
     async def _clear_overtriggered(self, deadline: float) -> None:
         """Reset Overtriggered, or wait a moment for it to fall: only then can it rise for ours.
@@ -366,14 +368,15 @@ class Triggers:
         Source: it falls by itself (SC manual p. 30, published), when is unknown; on BVS ID it stays
         until it is reset (BVS ID guide p. 227, published).
         """
-        if self._talk.dialect.has(m.ResetErrors):
-            await self._talk.command(m.ResetErrors(), deadline, due=self._talk.due_after(deadline))
-            await self._talk.refresh_status(deadline)
+        if self._connection.dialect.has(m.ResetErrors):
+            due = self._requests.due_after(deadline)
+            await self._requests.command(m.ResetErrors(), deadline, due=due)
+            await self._status.refresh(deadline)
             return
         now = asyncio.get_running_loop().time()
         grace = now + min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))
         with contextlib.suppress(TimeoutError):
-            await self.inbox.wait_status(_is_not_overtriggered, grace)
+            await self._status.wait(_is_not_overtriggered, grace)
 
 
 def _is_not_overtriggered(status: Status) -> bool:
@@ -381,10 +384,10 @@ def _is_not_overtriggered(status: Status) -> bool:
 
 
 def _told_of_fence(pending: PendingTrigger) -> str:
-    """Return what an error text says of the fence, and of containers that came before it."""
-    if not pending.run.reached:
+    """Return the part of an error text on the fence, and on containers that came before it."""
+    if not pending.progress.reached:
         return "; the question in front of the trigger was not answered"
-    if not pending.run.confirmed:
+    if not pending.progress.confirmed:
         return "; no status came that tells whether the trigger was taken"
     if pending.early:
         what = "result came" if pending.early == 1 else "results came"

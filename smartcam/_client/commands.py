@@ -1,0 +1,245 @@
+"""What the camera is told to do: start, stop, load another application.
+
+Every ``deadline`` is loop time. Whose command it is (one at a time) is the command lock's business.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam._client.handshake import code_text
+from smartcam._client.status import is_ready
+from smartcam.exceptions import CommandRejectedError, ConfigurationError
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam._client.camera_state import CameraState
+    from smartcam._client.connection import Connection
+    from smartcam._client.link import Link
+    from smartcam._client.requests import Requests
+    from smartcam._client.status import StatusRequests
+
+
+@dataclass(eq=False)
+class Commands:
+    """Changes what the camera runs.
+
+    Attributes:
+        unconfirmed: a Start or Stop was sent whose status has not come.
+    """
+
+    _connection: Connection
+    _requests: Requests
+    _status: StatusRequests
+    _state: CameraState
+
+    def __post_init__(self) -> None:
+        self.unconfirmed: bool = False
+        self._halted_at: int | None = None  # loads by others when a trigger's fence stopped it
+
+    def begin_session(self, link: Link) -> None:
+        """A new session: nothing is owed on it, its status is heard."""
+        self._connection.begin_session(link)
+        self._requests.begin_session()
+        self._status.begin_session()
+        self.unconfirmed = False
+
+    def end_session(self) -> None:
+        """The session is over: nothing is asked any more."""
+        self._status.end_session()
+
+    @property
+    def runs(self) -> bool:
+        """Running, or stopped only by a trigger that was interrupted before it started again."""
+        return self.halted or Status.RUNNING in self._status.last
+
+    @property
+    def halted(self) -> bool:
+        """A trigger's fence has stopped it and not started it again, nor has anybody loaded it."""
+        return self._halted_at == self._state.loads_by_others
+
+    # ------------------------------------------------------------------ run state
+
+    async def start(self, deadline: float) -> None:
+        """Enter run mode and wait until the camera reports it."""
+        self._connection.require(m.Start)
+        self._state.want_running(True)
+        await self._enter_run_mode(deadline)
+
+    async def stop(self, deadline: float) -> None:
+        """Leave run mode and wait until the camera reports it."""
+        self._connection.require(m.Stop)
+        self._state.want_running(False)
+        await self._leave_run_mode(deadline)
+
+    async def void_inspection(self, deadline: float) -> None:
+        """Stop and start again, and have heard all that was said before the start.
+
+        Cancellation: it may stay stopped; it is :attr:`halted` then.
+        """
+        self._halted_at = self._state.loads_by_others
+        await self._confirm_stop(deadline)
+        await self._requests.fence(deadline)
+        await self._enter_run_mode(deadline)
+
+    async def _enter_run_mode(self, deadline: float) -> None:
+        await self._confirm(m.Start(), is_ready, deadline, "Running and not BUSY after Start")
+        self._halted_at = None
+
+    async def _leave_run_mode(self, deadline: float) -> None:
+        self._halted_at = None
+        await self._confirm_stop(deadline)
+
+    async def _confirm_stop(self, deadline: float) -> None:
+        await self._confirm(m.Stop(), _is_not_running, deadline, "not Running after Stop")
+
+    async def _confirm(
+        self, command: m.Request, predicate: Callable[[Status], bool], deadline: float, what: str
+    ) -> None:
+        self.unconfirmed = True  # and it stays so where the wait is interrupted
+        await self._requests.command(command, deadline)
+        await self._status.refresh(deadline)
+        await self._status.until(predicate, deadline, what)
+        self.unconfirmed = False
+
+    async def catch_up(self, deadline: float) -> None:
+        """Know the status again where a start or stop was interrupted.
+
+        What these two have caused comes before the answer to a Query that was sent after them, or
+        is to be asked for.
+        """
+        if self._connection.features.polled:
+            await self._status.refresh(deadline)
+        else:
+            await self._requests.fence(deadline)
+        self.unconfirmed = False
+
+    # ------------------------------------------------------------------ application
+
+    async def query(self, deadline: float) -> int:
+        """Return the active application.
+
+        During a switch a Query tells the old id, so an owed switch answer is awaited first; or it
+        is answered as too busy, and asked again.
+
+        Raises:
+            ResponseTimeoutError: no answer, or none but that the camera is busy.
+        """
+        requests = self._requests
+        await requests.await_owed(m.SwitchAnswer, m.Query(), deadline)
+        while True:
+            answer = await requests.ask(m.Query(), m.QueryAnswer, deadline)
+            if not requests.is_busy(answer):
+                requests.check(m.Query, answer)
+                return answer.application
+            await self._status.pause(deadline, "the busy camera to name its application")
+
+    async def query_loaded(self, deadline: float) -> int:
+        """Return the active application; while one is being loaded a Query tells the old one."""
+        await self._status.refresh(deadline)  # whether it runs is asked next
+        await self._status.until(_is_not_loading, deadline, "the application to be loaded")
+        return await self.query(deadline)
+
+    async def ensure(self, application: int, deadline: float) -> None:
+        """Have an application running and ready, by the least that is needed."""
+        if await self.query_loaded(deadline) != application:
+            await self.switch(application, deadline, start=True)
+            return
+        self._state.want_application(application)
+        if Status.RUNNING not in self._status.last:
+            await self.start(deadline)
+        self._state.want_running(True)
+        await self._status.until(is_ready, deadline, "Running and not BUSY")
+
+    async def switch(self, application: int | str, deadline: float, *, start: bool) -> None:
+        """Stop if need be, switch, wait until not BUSY, start if wanted.
+
+        Args:
+            application: its id, or the name of its file.
+            deadline: loop time.
+            start: enter run mode afterwards, where there is one.
+
+        Raises:
+            UnsupportedError: the dialect loads no applications, or none by name.
+            CommandRejectedError: the camera refused; the old application runs again if it ran.
+        """
+        request = self._load_request(application)
+        dialect = self._connection.dialect
+        stops = dialect.has(m.Stop)
+        was_running = self.runs and stops
+        # Never allowed, several applications may carry it (SC manual p. 34, published): so nothing
+        # is stopped for it.
+        never = application == 0 and 0 not in dialect.application_ids
+        active: int | None
+        if stops and never:
+            code, active = 1, await self.query(deadline)
+        else:
+            if was_running:
+                await self._leave_run_mode(deadline)
+            code, active = await self._load(request, application, deadline)
+        done = dialect.code(code).verdict is Verdict.DONE
+        if not done or (isinstance(application, int) and active != application):
+            if was_running and Status.RUNNING not in self._status.last:
+                await self._enter_run_mode(deadline)
+            refusal = (
+                f"the camera refused to switch to application {application}: "
+                f"{code_text(dialect, code, type(request))}"
+            )
+            if never:
+                refusal = "no application may have the id 0"
+            elif done:
+                refusal = f"the camera says it switched, but not to application {application}"
+            raise CommandRejectedError(
+                f"{self._connection.name}: {refusal}; application {active} is active",
+                message_id=dialect.message_id(request),
+                code=code,
+                active_application=active,
+            )
+        await self._status.refresh(deadline)
+        await self._status.until(_is_not_busy, deadline, "not BUSY")
+        if start and stops:
+            await self.start(deadline)
+
+    async def _load(
+        self, request: m.Request, application: int | str, deadline: float
+    ) -> tuple[int, int | None]:
+        """Have an application loaded; return the answer's code and the one that is active then."""
+        requests = self._requests
+        answer = await requests.ask(request, m.SwitchAnswer, deadline)
+        while requests.is_busy(answer):
+            await self._status.pause(deadline, f"the busy camera to load {application}")
+            answer = await requests.ask(request, m.SwitchAnswer, deadline)
+        told = answer.application in self._connection.dialect.application_ids
+        return answer.code, answer.application if told else self._state.active
+
+    def _load_request(self, application: int | str) -> m.Request:
+        name = self._connection.name
+        if isinstance(application, str):
+            self._connection.require(m.LoadFile)
+            if not application.isprintable():
+                raise ConfigurationError(f"{name}: {application!r} is no file's name")
+            return m.LoadFile(name=application.encode())
+        self._connection.require(m.SwitchApplication)
+        ids = self._connection.dialect.application_ids
+        if application != 0 and application not in ids:
+            raise ConfigurationError(
+                f"{name}: application id {application} is not {ids.start} to {ids.stop - 1}"
+            )
+        return m.SwitchApplication(application=application)
+
+
+def _is_not_loading(status: Status) -> bool:
+    return not status.loading
+
+
+def _is_not_running(status: Status) -> bool:
+    return Status.RUNNING not in status
+
+
+def _is_not_busy(status: Status) -> bool:
+    return Status.BUSY not in status

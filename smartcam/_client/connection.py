@@ -1,0 +1,124 @@
+"""The link of the session that there is, and what its protocol has."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import ConfigurationError, ConnectionClosedError
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import Transport
+
+if TYPE_CHECKING:
+    from smartcam._client.link import Link
+    from smartcam._client.waits import Waits
+    from smartcam.protocols._base import Dialect
+
+
+class Features(NamedTuple):
+    """What the protocol of a session has, as far as it matters in every trigger.
+
+    Attributes:
+        ordered: messages come in order and none is lost (TCP).
+        numbered: a trigger may be given a sequence number.
+        acknowledged: a trigger is answered.
+        polled: the status is told when it is asked for, not by itself.
+        fences: a Query in front of a trigger tells what is older.
+        confirms: a status behind its answer tells whether a trigger was taken.
+    """
+
+    ordered: bool = True
+    numbered: bool = False
+    acknowledged: bool = False
+    polled: bool = False
+    fences: bool = False
+    confirms: bool = False
+
+    @staticmethod
+    def of(link: Link) -> Features:
+        """Return those of a link's session."""
+        dialect = link.machine.dialect
+        ordered = link.machine.transport is Transport.TCP
+        polled = not dialect.capabilities.status_by_itself
+        acknowledged = dialect.has(m.TriggerAnswer)
+        fences = ordered and not dialect.in_order  # who does one thing after the other needs none
+        return Features(
+            ordered=ordered,
+            numbered=dialect.has(m.SetSequenceNumber),
+            acknowledged=acknowledged,
+            polled=polled,
+            fences=fences,
+            confirms=fences and acknowledged and polled,
+        )
+
+
+@dataclass(eq=False)
+class Connection:
+    """One link after the other.
+
+    Attributes:
+        name: the camera's name.
+        link: the last one, None before the first.
+        features: of its protocol.
+    """
+
+    name: str
+    _waits: Waits
+
+    def __post_init__(self) -> None:
+        self.link: Link | None = None
+        self.features: Features = Features()
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def begin_session(self, link: Link) -> None:
+        """Speak over this link from now on."""
+        self.link = link
+        self.features = Features.of(link)
+        self._loop = asyncio.get_running_loop()
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """The event loop; kept, since asking for it is a system call in CPython 3.11."""
+        return self._loop or asyncio.get_running_loop()
+
+    def require_link(self) -> Link:
+        """Return the link.
+
+        Raises:
+            LinkError: there is none, and why.
+        """
+        self._waits.raise_end()
+        if self.link is None:
+            raise ConnectionClosedError(f"{self.name}: not connected: open it first")
+        return self.link
+
+    @property
+    def dialect(self) -> Dialect:
+        """What is spoken in this session.
+
+        Raises:
+            LinkError: there is none.
+        """
+        return self.require_link().machine.dialect
+
+    def require(self, message_type: type[m.Message]) -> None:
+        """See to it that the dialect has a message, before anything is done for it.
+
+        Raises:
+            UnsupportedError: it has not.
+            LinkError: there is no session.
+        """
+        if not self.dialect.has(message_type):
+            raise self.dialect.unsupported(message_type)
+
+    def deadline(self, timeout: float) -> float:
+        """Return the loop time in ``timeout`` seconds.
+
+        Raises:
+            ConfigurationError: it is no finite number of seconds, 0 or more.
+        """
+        if not 0 <= timeout < math.inf:
+            raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
+        return self.loop.time() + timeout

@@ -1,0 +1,173 @@
+"""Who listens to a camera: streams, single waiters for the next result, observers."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import weakref
+from typing import TYPE_CHECKING, Any
+
+from smartcam.streams import Subscribers
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.exceptions import InterpretationError, SmartCamError
+    from smartcam.models import CameraEvent, Result, Status
+    from smartcam.observers import Observers
+    from smartcam.streams import Queue
+
+logger: logging.Logger = logging.getLogger("smartcam.client")
+
+
+class Listeners:
+    """What comes from a camera is handed to these.
+
+    Args:
+        name: the camera's name.
+        observers: who see everything.
+
+    Attributes:
+        results: subscriptions to results.
+        statuses: subscriptions to statuses.
+        events: subscriptions to events.
+        observed: there are observers.
+    """
+
+    def __init__(self, name: str, observers: Observers) -> None:
+        self.results: Subscribers[Result] = Subscribers()
+        self.statuses: Subscribers[Status] = Subscribers()
+        self.events: Subscribers[CameraEvent] = Subscribers()
+        self.observed: bool = bool(observers)
+        self._name = name
+        self._observers = observers
+        # weak: a waiter that was made and never awaited must not count as a listener
+        self._next_results: weakref.WeakSet[asyncio.Future[Result]] = weakref.WeakSet()
+
+    def streams(self) -> list[Queue[Any]]:
+        """Return every subscription that is still referred to."""
+        return [*self.results, *self.statuses, *self.events]
+
+    def next_result(self) -> asyncio.Future[Result]:
+        """Return a future that gets the next result; it is let go when nobody holds it."""
+        future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
+        self._next_results.add(future)
+        return future
+
+    @property
+    def streams_results(self) -> bool:
+        """Whether a result would be handed to streams, and to nobody else."""
+        return self._streams_hear and not (self.observed or self._awaits_next)
+
+    @property
+    def hears_results(self) -> bool:
+        """Whether a result would be handed to anybody but its trigger."""
+        return self._streams_hear or self._awaits_next
+
+    @property
+    def _streams_hear(self) -> bool:
+        return any(not stream.ended for stream in self.results)
+
+    @property
+    def _awaits_next(self) -> bool:
+        return any(not future.done() for future in self._next_results)
+
+    @property
+    def watches_status(self) -> bool:
+        """Whether somebody subscribed to statuses or events."""
+        streams: list[Queue[Any]] = [*self.statuses, *self.events]
+        return any(not stream.ended for stream in streams)
+
+    @property
+    def sees_events(self) -> bool:
+        """Whether anybody would see an event."""
+        watched = self.observed or bool(self.events.references)
+        return watched or logger.isEnabledFor(logging.DEBUG)
+
+    # ------------------------------------------------------------------ what comes
+
+    def publish(self, event: CameraEvent) -> None:
+        """Hand an event to its subscribers."""
+        logger.debug("%s = %s", self._name, event)
+        self._observers.state(event)
+        for stream in self.events:
+            stream.offer(event, 0.0)
+
+    def offer_status(self, status: Status, now: float) -> None:
+        """Hand a status to its subscribers."""
+        if self.statuses.references:
+            for stream in self.statuses:
+                stream.offer(status, now)
+
+    def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
+        """Hand results that are only streamed to their subscribers; ``size`` bytes in all."""
+        for stream in self.results:
+            stream.offer_all(results, now, size)
+
+    def offer_result(self, result: Result, now: float, *, current: bool) -> None:
+        """Hand a result on; ``current`` where it is not known to be an older trigger's."""
+        if self.observed:
+            self._observers.result(result)
+        if self.results.references:
+            for stream in self.results:
+                stream.offer(result, now, len(result.raw))
+        if current and self._next_results:
+            for future in self._take_next_results():
+                future.set_result(result)
+
+    def offer_error(
+        self, error: InterpretationError, now: float, size: int, *, current: bool, owned: bool
+    ) -> None:
+        """Hand on that a container cannot be read.
+
+        Args:
+            error: why.
+            now: loop time.
+            size: the container's bytes.
+            current: as for :meth:`offer_result`.
+            owned: a trigger is ended by it, whose caller tells the observers.
+        """
+        if self.results:
+            _drop_frames(error)
+        for stream in self.results:
+            stream.offer(error, now, size)
+        if current:
+            for future in self._take_next_results():
+                future.set_exception(error)
+        if not owned:
+            self._observers.error(self._name, error)
+
+    def fail(self, error: SmartCamError) -> None:
+        """Tell who waits for the next result that there is no session; streams go on."""
+        for future in self._take_next_results():
+            future.set_exception(error)
+
+    def end(self, error: SmartCamError | None) -> None:
+        """End the streams: nothing more will come, because of ``error`` if any."""
+        for stream in self.streams():
+            stream.end(error)
+
+    def _take_next_results(self) -> list[asyncio.Future[Result]]:
+        waiting = [future for future in self._next_results if not future.done()]
+        self._next_results.clear()
+        return waiting
+
+
+def _drop_frames(error: SmartCamError) -> None:
+    """Take the frames from an error that may wait in a queue: they hold a whole delivery's bytes.
+
+    What it came from gets a note instead that says where it was raised.
+    """
+    chain: list[BaseException | None] = [error]
+    while chain:
+        one = chain.pop()
+        place = one.__traceback__ if one is not None else None
+        if one is None or place is None:
+            continue
+        while place.tb_next is not None:
+            place = place.tb_next
+        if one is not error:
+            code = place.tb_frame.f_code
+            one.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
+        one.__traceback__ = None  # so that each comes once
+        chain += (one.__cause__, one.__context__)

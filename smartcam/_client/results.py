@@ -1,0 +1,449 @@
+"""What becomes of each result: the trigger under way, whose each container is, who gets it."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import random
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, cast
+
+from smartcam._client.correlation import Correlation, Match, SentTrigger
+from smartcam._client.deadline import DeadlineTimer
+from smartcam.exceptions import (
+    CameraFaultError,
+    InputContainerError,
+    InterpretationError,
+    NotRunningError,
+    OvertriggeredError,
+    SmartCamError,
+    WrongApplicationError,
+)
+from smartcam.models import Result, Status
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+    from datetime import datetime
+
+    from smartcam._client.camera_state import CameraState
+    from smartcam._client.counters import ClientCounters
+    from smartcam._client.interpretation import Interpretation
+    from smartcam._client.listeners import Listeners
+    from smartcam._client.requests import Requests
+    from smartcam.protocols._framed.machine import ResultBurst
+
+logger: logging.Logger = logging.getLogger("smartcam.client")
+
+# as plain integers: what an IntFlag does in Python costs more than all else that a status needs
+_RUNNING = int(Status.RUNNING)
+_FAILING = int(Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR)
+
+_CURRENT = {"triggered", "nobody"}
+"""Fates of what is not known to be an older trigger's."""
+
+# half the time of a NamedTuple's own; the cast because a bare tuple is generic
+_new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class PendingTrigger(SentTrigger):
+    """The trigger under way, and who waits for it.
+
+    Attributes:
+        outcome: gets the results or the error.
+        interpretation: how to read its results.
+        has_input: input data was sent with it.
+        sent_at: loop time.
+        triggered_at: wall clock, UTC.
+        application: the one that is believed to be active, None where any will do.
+        results: those that came.
+    """
+
+    outcome: asyncio.Future[list[Result]]
+    interpretation: Interpretation
+    has_input: bool
+    sent_at: float
+    triggered_at: datetime
+    application: int | None = None
+    results: list[Result] = field(default_factory=list[Result])
+
+    def take(self, result: Result) -> None:
+        """One of its results has come."""
+        self.results.append(result)
+        self.came += 1
+
+    def succeed(self) -> None:
+        """Give its caller the results."""
+        self.ended = True
+        self.outcome.set_result(self.results)
+
+    def fail(self, error: Exception) -> None:
+        """Give its caller the reason why there are none."""
+        self.ended = True
+        self.outcome.set_exception(error)
+
+
+@dataclass(eq=False)
+class Results:
+    """Gives each container exactly one fate, and its result to its trigger and to the streams.
+
+    Attributes:
+        interpretation: how to read results that no trigger reads otherwise.
+        correlation: says whose each container is.
+        input_in_doubt: the input data of a trigger without a result may still be queued in the
+            camera.
+    """
+
+    _name: str
+    interpretation: Interpretation
+    _requests: Requests
+    _state: CameraState
+    _listeners: Listeners
+    _counters: ClientCounters
+
+    def __post_init__(self) -> None:
+        self.correlation: Correlation = Correlation(random.random())  # noqa: S311
+        self.input_in_doubt: bool = False
+        self._pending: PendingTrigger | None = None
+        self._numbering: Interpretation | None = None  # how to read numbers, once there are ours
+        # containers of which it is not known yet whether they are the trigger's
+        self._held: list[tuple[m.ResultContainer, float, datetime]] = []
+        self._warned_extra = self._warned_others = False
+        self._lossy = False  # a message may come twice, or not
+        self._timer = DeadlineTimer(lambda: self.give_up(TimeoutError()))
+
+    def begin_session(self, *, ordered: bool, complete: bool) -> None:
+        """A new session.
+
+        Args:
+            ordered: messages come in order and none is lost (TCP).
+            complete: every change of the status is told, too.
+        """
+        self._warned_extra = self._warned_others = False
+        self._lossy = not ordered
+        self.correlation.begin_session(ordered=complete)
+
+    def fail(self, error: SmartCamError) -> None:
+        """The session is over: end the trigger under way.
+
+        What it would have given may come in the next session: it is owed.
+        """
+        self.give_up(error)
+        self._release_held()
+
+    def finish(self) -> None:
+        """There will be no session any more: leave nothing in the event loop."""
+        self._timer.cancel()
+
+    # ------------------------------------------------------------------ the trigger under way
+
+    @property
+    def pending(self) -> PendingTrigger | None:
+        """The trigger under way, as long as its caller waits."""
+        pending = self._pending
+        if pending is None or pending.ended:
+            return None
+        if pending.outcome.cancelled():  # its caller was not woken yet
+            pending.ended = True
+            self.correlation.give_up(pending)
+            return None
+        return pending
+
+    def begin_trigger(self, pending: PendingTrigger, deadline: float) -> None:
+        """A trigger is sent now; from ``deadline`` (loop time) on its results are late."""
+        self._pending = pending
+        self._timer.set(deadline)
+        if pending.number is not None:
+            self._numbering = pending.interpretation
+        self.correlation.send(pending)
+
+    def end_trigger(self) -> None:
+        """Its caller goes on."""
+        self._pending = None
+        self._timer.clear()
+        self.correlation.leave()
+        self._release_held()
+
+    def give_up(self, error: Exception) -> None:
+        """End the trigger under way with an error; its results are late from this moment on."""
+        pending = self.pending
+        if pending is not None:
+            self.correlation.give_up(pending)
+            pending.fail(error)
+
+    def input_sent(self) -> None:
+        """Input data went out with the trigger, and nothing says that it was taken."""
+        self.input_in_doubt = True
+
+    # ------------------------------------------------------------------ what comes
+
+    def on_switched(self) -> None:
+        """Another application was loaded: nothing of before can come."""
+        self.input_in_doubt = False
+        self.correlation.settled()
+
+    def on_query_answer(self, *, fence: bool) -> None:
+        """A Query is answered; ``fence``: the one in front of the last trigger."""
+        if fence:
+            self.correlation.on_query_answer(int(self._state.status or 0), fence=True)
+        elif self._held:
+            self.correlation.on_query_answer(int(self._state.status or 0), fence=False)
+            self._release_held()
+
+    def on_trigger_answer(self) -> bool:
+        """A trigger is answered; return whether a status behind that is to confirm it."""
+        self.correlation.on_answer()
+        pending = self._pending
+        return pending is not None and not pending.progress.confirmed
+
+    def on_status(self, previous: int | None, bits: int, now: float) -> None:
+        """Take a status.
+
+        Args:
+            previous: the one before, None where there was none in this session.
+            bits: the new one.
+            now: loop time.
+        """
+        risen, fallen = bits & ~(previous or 0), (previous or 0) & ~bits
+        if risen & _FAILING or fallen & _RUNNING:
+            self._fail_trigger(risen, fallen)
+        if self.correlation.on_status(previous, bits):
+            self._note_others()
+        if self._held:
+            self._release_held()
+        if self._pending is not None and self._pending.results:
+            self._complete(now)
+
+    def _fail_trigger(self, risen: int, fallen: int) -> None:
+        """End the trigger under way where the status says that its result cannot be trusted."""
+        pending = self.pending
+        if pending is None:
+            return
+        error: SmartCamError | None = None
+        if risen & Status.SYSTEM_ERROR:
+            error = CameraFaultError(f"{self._name}: the camera reports System Error")
+        elif risen & Status.OVERTRIGGERED:
+            error = OvertriggeredError(
+                f"{self._name}: the camera dropped a trigger while ours was under way; "
+                "it cannot be told whose"
+            )
+        elif risen & Status.INPUT_CONTAINER and pending.has_input:
+            error = InputContainerError(
+                f"{self._name}: input data and inspections are out of step: "
+                "the result would not belong to this input"
+            )
+        elif fallen & Status.RUNNING:
+            error = NotRunningError(
+                f"{self._name}: somebody else stopped application {self._state.active} during the "
+                f"inspection, which voids it; status: {self._state.status}"
+            )
+        if error is not None:
+            self.correlation.give_up(pending, "streamed")  # what still comes is nobody's
+            pending.fail(error)
+
+    def on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
+        """Count and hand on several containers at once; one by one where they may differ."""
+        results = self._read_burst(burst, at)
+        if results is None:
+            for container in burst:
+                self.on_result(container, now, at)
+            return
+        self._state.set_active(burst.application, at)
+        count = len(burst.data)
+        self._counters.count("streamed", count)
+        if self.correlation.judge(None).extra:
+            self._note_extra(count)
+        self._listeners.offer_burst(results, now, burst.size)
+
+    def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
+        """Return the results of a burst that is only streamed; None where one may be anything else.
+
+        A trigger or a single waiter may want one, a debt be paid, an observer look at each; and
+        what cannot be interpreted is an item of its own.
+        """
+        application = burst.application
+        if self._pending or self._numbering or self.correlation.debt:
+            return None
+        if not self._listeners.streams_results:
+            return None
+        if self._state.wanted.application not in {None, application}:
+            return None
+        name, first = self._name, self._counters.received + 1
+        done = self.interpretation.burst(
+            application, burst.data, self._state.endian, camera=name, number=first, at=at
+        )
+        if done is None:
+            return None
+        values, empty_slots = done
+        self._counters.skip(empty_slots)
+        # rows of a Result's fields; a loop in Python would take twice as long
+        numbers, none = itertools.count(first), itertools.repeat(None)
+        names, applications, ats = map(itertools.repeat, (name, application, at))
+        fields = (names, applications, none, numbers, none, ats, none, burst.data, values)
+        rows = zip(*fields, strict=False)
+        return list(map(_new_tuple, itertools.repeat(Result), rows))
+
+    def _release_held(self) -> None:
+        """Give the containers their fate of which it was not known whether they are the trigger's.
+
+        They are, if nothing of it was seen to begin since; what came before that is older.
+        """
+        held, self._held = self._held, []
+        pending = self.pending
+        older = pending is None or pending.progress.begun
+        for container, now, at in held:
+            self.on_result(container, now, at, older=older)
+
+    def on_result(
+        self, container: m.ResultContainer, now: float, at: datetime, *, older: bool = False
+    ) -> None:
+        """Give a container its fate.
+
+        Args:
+            container: it.
+            now: loop time when it came.
+            at: the same on the wall clock.
+            older: it is known not to be of the trigger under way.
+        """
+        state, counters, pending = self._state, self._counters, self.pending
+        active, expected = state.active, state.wanted.application
+        if container.application < 0:  # a quirk: it does not say whose it is
+            known = m.UNNAMED_APPLICATION if active is None else active
+            container = replace(container, application=known)
+        if expected is None and pending is not None:
+            expected = pending.application
+        if active != container.application:
+            state.set_active(container.application, at)
+        if expected is not None and container.application != expected:
+            counters.count("wrong_application")
+            self.give_up(self._wrong_application(container, expected))  # ours may still come
+            return
+        numbering = self._numbering
+        number = numbering.number(container, state.endian) if numbering is not None else None
+        match = self.correlation.judge(number, older=older)
+        if match.fate == "held":
+            if pending is not None and len(self._held) < pending.wanted:
+                self._held.append((container, now, at))
+                self._requests.ask_what_is_active()
+                return
+            match = self.correlation.judge(number, older=True)
+        if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
+            match = Match("nobody", extra=True)
+        if match.extra:
+            self._note_extra()
+        owner = pending if match.fate == "triggered" else None
+        self._hand_on(container, owner, match.fate, number, now, at)
+
+    def _hand_on(
+        self,
+        container: m.ResultContainer,
+        owner: PendingTrigger | None,
+        fate: str,
+        number: int | None,
+        now: float,
+        at: datetime,
+    ) -> None:
+        """Count a container and give what is in it to who listens."""
+        counters, listeners = self._counters, self._listeners
+        current = fate in _CURRENT
+        if owner is None:
+            heard = listeners.hears_results
+            if fate == "nobody":
+                fate = "streamed" if heard else "unclaimed"
+            if not heard:
+                counters.count(fate)
+                return
+        try:
+            result = self._interpret(container, owner, now, at)
+        except InterpretationError as error:
+            counters.count("late" if fate == "late" else "uninterpretable")
+            size, owned = len(container.data), owner is not None
+            listeners.offer_error(error, now, size, current=current, owned=owned)
+            if owner is not None:
+                self._fail_unread(owner, error, number)
+            return
+        counters.count(fate)
+        listeners.offer_result(result, now, current=current)
+        if owner is not None:
+            owner.take(result)
+            self._complete(now)
+
+    def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
+        """Whether it is a datagram that came twice, as far as can be told: one like it is there."""
+        results = pending.results if pending is not None else []
+        return any(one.raw == container.data for one in results)
+
+    def _note_extra(self, count: int = 1) -> None:
+        self._counters.note_extra(count)
+        if not self._warned_extra:
+            self._warned_extra = True
+            logger.warning(
+                "%s ! the application sends more than one result for a trigger; "
+                "results_per_trigger= takes them all",
+                self._name,
+            )
+
+    def _note_others(self) -> None:
+        self._counters.note_other()
+        if not self._warned_others:
+            self._warned_others = True
+            logger.warning("%s ! something else triggers the camera, too", self._name)
+
+    def _interpret(
+        self, container: m.ResultContainer, owner: PendingTrigger | None, now: float, at: datetime
+    ) -> Result:
+        interpretation = owner.interpretation if owner is not None else self.interpretation
+        number = self._counters.received + 1
+        value, sequence, empty_slots = interpretation(
+            container, self._state.endian, camera=self._name, number=number, at=at
+        )
+        self._counters.skip(empty_slots)
+        return Result(
+            self._name,
+            container.application,
+            sequence,
+            number,
+            owner.triggered_at if owner is not None else None,
+            at,
+            now - owner.sent_at if owner is not None else None,
+            container.data,
+            value,
+        )
+
+    def _complete(self, now: float) -> None:
+        """End the trigger under way if it has all its results, and nothing speaks against it."""
+        owner = self.pending
+        if owner is None or owner.came < owner.wanted or not owner.progress.confirmed:
+            return
+        self._end_input_doubt(owner)
+        self._counters.processing.add(now - owner.sent_at)
+        self.correlation.done(owner)
+        owner.succeed()
+
+    def _fail_unread(
+        self, owner: PendingTrigger, error: InterpretationError, number: int | None
+    ) -> None:
+        """End a trigger whose result came and cannot be read."""
+        self._end_input_doubt(owner)
+        # where its number cannot be read, it may be another's, and its own still come
+        certain = owner.number is None or number == owner.number
+        self.correlation.give_up(owner, unread=int(certain))
+        if not owner.given_up:
+            self.correlation.done(owner)
+        owner.fail(error)
+
+    def _end_input_doubt(self, owner: PendingTrigger) -> None:
+        if owner.has_input:
+            self.input_in_doubt = False
+
+    def _wrong_application(
+        self, container: m.ResultContainer, expected: int
+    ) -> WrongApplicationError:
+        return WrongApplicationError(
+            f"{self._name}: a result of application {container.application} came, "
+            f"application {expected} was expected",
+            expected=expected,
+            got=container.application,
+        )

@@ -1,0 +1,173 @@
+"""What the camera's status is: having it told, and waiting for it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import LocalProtocolError, ResponseTimeoutError
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam._client.camera_state import CameraState
+    from smartcam._client.connection import Connection
+    from smartcam._client.polling import Polling
+    from smartcam._client.requests import Requests
+    from smartcam._client.waits import Waits
+
+BUSY_PAUSE = 0.02
+"""Seconds until a camera that was too busy for a request is asked again."""
+
+
+def is_ready(status: Status) -> bool:
+    """Running and not BUSY."""
+    return Status.RUNNING in status and Status.BUSY not in status
+
+
+@dataclass(eq=False)
+class StatusRequests:
+    """Waits for statuses, and has them told where they do not come by themselves."""
+
+    _connection: Connection
+    _requests: Requests
+    _polling: Polling
+    _state: CameraState
+    _waits: Waits
+
+    def begin_session(self) -> None:
+        """Have the status told from now on, where it does not come by itself."""
+        self._polling.begin_session()
+
+    def end_session(self) -> None:
+        """Ask for no status any more."""
+        self._polling.end_session()
+
+    def wanted(self) -> None:
+        """Somebody subscribed: have statuses told, where they do not come by themselves."""
+        self._polling.wanted()
+
+    @property
+    def last(self) -> Status:
+        """The last status; there is one since the session was made."""
+        return self._state.status or Status(0)
+
+    async def until(
+        self,
+        predicate: Callable[[Status], bool],
+        deadline: float,
+        what: str,
+        *,
+        insist: bool = True,
+    ) -> Status:
+        """Wait for a status.
+
+        Args:
+            predicate: says which.
+            deadline: loop time.
+            what: it in words.
+            insist: have it said again where it may have been lost.
+
+        Raises:
+            ResponseTimeoutError: says what was waited for and what the status is.
+        """
+        begin = asyncio.get_running_loop().time()
+        try:
+            if not insist:
+                return await self.wait(predicate, deadline)
+            return await self.insist(predicate, deadline)
+        except TimeoutError as exc:
+            waited = max(0.0, deadline - begin)
+            raise ResponseTimeoutError(
+                f"{self._connection.name}: waited {round(waited, 2):g} s for {what}; "
+                f"status: {self.last}",
+                waited=waited,
+            ) from exc
+
+    async def wait(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
+        """Return the first status, the present one included, that ``predicate`` accepts.
+
+        It is shown every status in order. What it raises comes out here.
+
+        Raises:
+            TimeoutError: at ``deadline`` (loop time).
+            LinkError: the session ended.
+        """
+        self._waits.raise_end()
+        status = self._state.status
+        if status is not None and predicate(status):
+            return status
+        self._polling.wanted()
+        return await self._waits.status(predicate, deadline)
+
+    async def insist(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
+        """Wait for a status; over UDP, where one may be lost, have it said again half-way.
+
+        Raises:
+            TimeoutError: at ``deadline``.
+        """
+        features = self._connection.features
+        if not features.ordered and not features.polled:
+            now = asyncio.get_running_loop().time()
+            with contextlib.suppress(TimeoutError):
+                return await self.wait(predicate, now + 0.5 * (deadline - now))
+            await self.demand(deadline)
+        return await self.wait(predicate, deadline)
+
+    async def demand(self, deadline: float) -> None:
+        """Have the camera say its status, by Get status where there is that.
+
+        Elsewhere Connect brings one (SC manual p. 29, published). A Query goes first: who has lost
+        the session must not take it back by this.
+        """
+        link = self._connection.require_link()
+        if self._connection.features.polled:
+            link.send(m.GetStatus(), answered=False)
+            return
+        try:
+            await self._requests.fence(deadline)
+            link.send(m.Connect())
+        except ResponseTimeoutError:
+            pass  # its own time may not be over; keepalive sees to the rest
+        except LocalProtocolError as exc:  # the last one's answer never came
+            link.give_up(TimeoutError(f"statuses are lost: {exc}"))
+
+    async def refresh(self, deadline: float) -> None:
+        """Know the status as it is now, where it can be asked for.
+
+        Raises:
+            ResponseTimeoutError: the camera did not tell it.
+        """
+        connection = self._connection
+        if not connection.dialect.has(m.GetStatus):
+            return
+        heard = self._state.statuses_heard
+        while True:  # a datagram may be lost
+            connection.require_link().send(m.GetStatus(), answered=False)
+            await self._requests.fence(deadline)
+            if self._state.statuses_heard != heard:
+                return
+            await self.pause(deadline, "the camera to tell its status")
+
+    async def pause(self, deadline: float, what: str) -> None:
+        """Wait a moment before the camera is asked again.
+
+        Raises:
+            ResponseTimeoutError: there is no time left.
+        """
+        now = asyncio.get_running_loop().time()
+        if deadline - now <= BUSY_PAUSE:
+            raise ResponseTimeoutError(
+                f"{self._connection.name}: waited until the time was over for {what}; "
+                f"status: {self.last}"
+            )
+        with contextlib.suppress(TimeoutError):  # and a loss ends it at once
+            await self.wait(_never, now + BUSY_PAUSE)
+
+
+def _never(_: Status) -> bool:
+    return False

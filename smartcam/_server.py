@@ -1,0 +1,28 @@
+"""What the servers have in common: emulated cameras, sites, proxies."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing import Self
+
+
+class Server(ABC):
+    """Something that is started and stopped; as an asynchronous context manager it does both."""
+
+    @abstractmethod
+    async def start(self) -> None:
+        """Start it; do nothing where it is started already."""
+
+    @abstractmethod
+    async def stop(self) -> None:
+        """Stop it; do nothing where it is stopped."""
+
+    async def __aenter__(self) -> Self:
+        await self.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
