@@ -6,7 +6,7 @@ entry points of the group ``smartcam.interpreters``.
 
 from __future__ import annotations
 
-from smartcam.interpreters.base import (
+from smartcam.interpreters._base import (
     Context,
     Function,
     Interpreter,

@@ -15,20 +15,21 @@ heavy ones are imported where they are first used.
 
 from __future__ import annotations
 
+import functools
 import struct
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import ConfigurationError, InterpretationError
-from smartcam.layout.codec import Payload, Record, RecordCodec, check_names, named, record_class
-from smartcam.layout.text import Field, parse_text, to_text
+from smartcam.layout._codec import Payload, Record, RecordCodec, check_names, named, record_class
+from smartcam.layout._text import Field, misfit, parse_text, to_text
 
 if TYPE_CHECKING:
     import numpy as np
     from pydantic import BaseModel
 
-    from smartcam.layout.codec import Rows
-    from smartcam.layout.tables import TableCodec
+    from smartcam.layout._codec import Rows
+    from smartcam.layout._tables import TableCodec
     from smartcam.models import ByteOrder
 
 __all__ = ["Field", "Layout", "Record"]
@@ -153,7 +154,7 @@ class Layout:
         return f"Layout({self._text!r}{', lenient=True' if self._lenient else ''})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self._text, self._lenient)
+        return functools.partial(Layout, lenient=self._lenient), (self._text,)
 
     # -- values ------------------------------------------------------------------------------
 
@@ -245,7 +246,7 @@ class Layout:
     def parse_tables(
         self, payloads: Sequence[bytes], byte_order: ByteOrder = "little"
     ) -> list[np.ndarray[tuple[int], np.dtype[np.void]]]:
-        """Return what :meth:`parse_table` gives for each of several payloads."""
+        """Return the tables of several payloads, each as by :meth:`parse_table`."""
         view, make = self._views.get(byte_order), self._frombuffer
         if view is not None and self._fixed is None:
             try:
@@ -328,7 +329,7 @@ class Layout:
         (``json``, ``copy``, ...) has that name as alias.
         """
         if self._model is None:
-            from smartcam.layout.files import make_model
+            from smartcam.layout._files import make_model
 
             self._model = make_model(self._spec)
         return self._model
@@ -342,7 +343,7 @@ class Layout:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout as plain data, which :meth:`from_dict` takes back."""
-        from smartcam.layout.files import to_data
+        from smartcam.layout._files import to_data
 
         return to_data(self._spec, lenient=self._lenient)
 
@@ -358,7 +359,7 @@ class Layout:
             ConfigurationError: unknown keys or values of the wrong type.
             LayoutError: what they say makes no layout.
         """
-        from smartcam.layout.files import from_data
+        from smartcam.layout._files import from_data
 
         text, lenient = from_data(data)
         return cls(text, lenient=lenient)
@@ -369,7 +370,7 @@ class Layout:
         Raises:
             MissingExtraError: PyYAML is not installed.
         """
-        from smartcam.layout.files import dump_yaml
+        from smartcam.layout._files import dump_yaml
 
         return dump_yaml(self.to_dict())
 
@@ -382,17 +383,17 @@ class Layout:
             LayoutError: the text is neither YAML nor a layout text, or makes no layout.
             MissingExtraError: PyYAML is not installed.
         """
-        from smartcam.layout.files import load_yaml
+        from smartcam.layout._files import load_yaml
 
         loaded = load_yaml(text)
         return cls.from_dict(loaded) if isinstance(loaded, Mapping) else cls(loaded)
 
     def _table(self, byte_order: ByteOrder) -> TableCodec:
-        """Return what reads tables; made where one is first asked for, because of numpy."""
+        """Return the codec of tables; made where one is first asked for, because of numpy."""
         if byte_order not in self._tables:
             import numpy as np
 
-            from smartcam.layout.tables import TableCodec
+            from smartcam.layout._tables import TableCodec
 
             codec = TableCodec(self._codecs[byte_order][1], byte_order)
             self._frombuffer = np.frombuffer
@@ -417,15 +418,8 @@ class Layout:
         index = next(i for i, field in enumerate(head.fields) if field.name == repeat)
         told = int(head.read_field(payload, 0, index))
         if not 0 <= told <= count:
-            offset = head.offsets[index]
-            raise InterpretationError(
-                f"{head.fields[index].label} at offset {offset}: expected 0 to {count}, "
-                f"as many records of {codec.size} bytes as the container holds, got {told}",
-                field=repeat,
-                offset=offset,
-                expected=f"0 to {count}",
-                got=told,
-            )
+            more = f", as many records of {codec.size} bytes as the container holds"
+            raise misfit(head.fields[index], head.offsets[index], f"0 to {count}", told, more=more)
         return told
 
     def _misfit(
@@ -433,11 +427,9 @@ class Layout:
     ) -> InterpretationError:
         """Say which field is cut, or from where on there is too much.
 
-        Args:
-            codec: of the record (or the head) that does not fit.
-            got: bytes of the payload.
-            start: where the first record begins.
-            count: number of records that must be there, None for any.
+        ``codec``: of the record (or the head) that does not fit. ``got``: bytes of the payload.
+        ``start``: where the first record begins. ``count``: of records that must be there, None for
+        any.
         """
         full = max(0, got - start) // codec.size
         at = start + codec.size * (full if count is None else min(full, count))
@@ -518,7 +510,3 @@ def _list_of_records(value: object) -> list[Any]:
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray, Record)):
         raise ConfigurationError(f"layout: expected a list of records, got {value!r:.200}")
     return list(records)
-
-
-def _restore(text: str, lenient: bool) -> Layout:
-    return Layout(text, lenient=lenient)

@@ -1,9 +1,11 @@
 """The words that client and camera exchange, whatever the wire looks like.
 
 Each message is a frozen dataclass that declares its body once: a field's annotation says what it is
-on the wire (:data:`Word`, :data:`UInt32`, :data:`Data`). A dialect's table (``protocols/bvs.py``)
-says which message has which id, and which of its fields the dialect leaves out; codecs, construct
-views and the documentation are made from both.
+on the wire (:data:`Word`, :data:`UInt32`, :data:`Data`). A dialect's table
+(``protocols/_bvs.py``) says which message has which id, and which of its fields the dialect leaves
+out; codecs, construct views and the documentation are made from both. When a message may come is
+said in ``protocols/_framed/machine.py``: a request or report that is new stands among those of a
+session there.
 """
 
 from __future__ import annotations
@@ -15,7 +17,6 @@ from typing import Annotated, Any, ClassVar, NamedTuple, get_type_hints
 from smartcam.models import Status
 
 __all__ = [
-    "UNNAMED_APPLICATION",
     "Acknowledgement",
     "CellValue",
     "ClockAnswer",
@@ -56,9 +57,7 @@ __all__ = [
     "TriggerAnswer",
     "UInt32",
     "UnknownMessage",
-    "Wire",
     "Word",
-    "wire_fields",
 ]
 
 

@@ -7,8 +7,6 @@ bytes come.
 
 from __future__ import annotations
 
-__all__ = ["FRAME_RATE", "FRAME_TIME", "HINT_TIME", "Unfinished"]
-
 FRAME_TIME = 5.0
 """Seconds that a frame of a stream may take to become whole, beside those of its length. A camera
 writes it at once; TCP makes good for lost segments within one or two."""
@@ -41,10 +39,7 @@ class Unfinished:
     def age(self, frame: int, since: float, now: float) -> float:
         """Return for how many seconds bytes of a frame have come; to be asked each time some come.
 
-        Args:
-            frame: its number.
-            since: when the first came.
-            now: when the last came.
+        ``frame``: its number. The first came at ``since``, the last ``now``.
         """
         if frame != self._frame:
             self._frame, self._heard, self._pause, self.searched = frame, since, 0.0, 0

@@ -9,7 +9,7 @@ client knows nothing of commands. What is known of the camera, and who says so, 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from smartcam.exceptions import (
     CommandRejectedError,
@@ -19,8 +19,8 @@ from smartcam.exceptions import (
 )
 from smartcam.models import Capabilities
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import (
-    Code,
+from smartcam.protocols._base import (
+    CodeMeaning,
     Dialect,
     Protocol,
     RawRequest,
@@ -28,8 +28,8 @@ from smartcam.protocols.base import (
     Transport,
     Verdict,
 )
-from smartcam.protocols.insight.machine import Command, InSightMachine, Piece, Reply, unsendable
-from smartcam.protocols.insight.words import (
+from smartcam.protocols._insight.machine import Command, InSightMachine, Piece, Reply, unsendable
+from smartcam.protocols._insight.words import (
     COMMANDS,
     DEFAULT_PORT,
     ENCODING,
@@ -45,9 +45,7 @@ from smartcam.protocols.insight.words import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.protocols.framed.framing import Frame
-
-__all__ = ["INSIGHT", "NATIVE", "InSightDialect"]
+    from smartcam.protocols._framed.framing import Frame
 
 MAX_LOGIN = 255
 """Characters of a user's name or password; the camera's own bound is not published."""
@@ -58,7 +56,7 @@ _VERDICTS: Mapping[int, Verdict] = {
 }
 """What codes say; the others refuse."""
 
-_LOGIN = Code("the user or the password is wrong", Verdict.REFUSED)
+_LOGIN = CodeMeaning("the user or the password is wrong", Verdict.REFUSED)
 
 _MNEMONICS: Mapping[type[m.Message], str] = {
     m.GetStatus: "GO",
@@ -83,9 +81,7 @@ class InSightDialect(Dialect):
     """In-Sight native mode.
 
     Args:
-        name: as in ``?dialect=``.
-        about: one line for people.
-        source: where it is described, with its grade.
+        name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
         user: who logs in.
         password: the user's.
         cells: cells that are read after each trigger, in order, as commands name them.
@@ -97,11 +93,14 @@ class InSightDialect(Dialect):
     cells: tuple[str, ...] = ()
     counter: str = ""
 
+    in_order: ClassVar[bool] = True
+    exclusive: ClassVar[bool] = False  # several users may be connected at a time (published)
+    has_login: ClassVar[bool] = True
+
     def with_parameters(self, parameters: Mapping[str, str]) -> InSightDialect:
         """Return the dialect with user, password, cells and counter of a URL.
 
-        Raises:
-            ConfigurationError: a cell is none, or a text cannot be sent.
+        Raises ConfigurationError: a cell is none, or a text cannot be sent.
         """
         for key in ("user", "password"):
             problem = unsendable(parameters.get(key, ""), MAX_LOGIN)
@@ -136,45 +135,26 @@ class InSightDialect(Dialect):
         """Ids of jobs: 0 to 999 (published)."""
         return range(LAST_JOB_ID + 1)
 
-    @property
-    def in_order(self) -> bool:
-        """A connection's commands are done one after the other."""
-        return True
-
-    @property
-    def exclusive(self) -> bool:
-        """Several users may be connected at a time (published)."""
-        return False
-
-    @property
-    def has_login(self) -> bool:
-        """A user logs in."""
-        return True
-
-    def code(self, code: int, request: type[m.Message] | None = None) -> Code:
-        """Return what a status code means in the answer to a request."""
+    def code(self, code: int, request: type[m.Message] | None = None) -> CodeMeaning:
+        """Return the meaning of a status code in the answer to a request."""
         if request is m.Connect and code != StatusCode.DONE:
             return _LOGIN
         mnemonic = _MNEMONICS.get(request, "") if request is not None else ""
-        return Code(code_text(mnemonic, code), _VERDICTS.get(code, Verdict.REFUSED))
+        return CodeMeaning(code_text(mnemonic, code), _VERDICTS.get(code, Verdict.REFUSED))
 
     def has(self, message_type: type[m.Message]) -> bool:
-        """Whether there is such a message."""
+        """Return whether there is such a message."""
         return message_type in _REQUESTS or message_type in _REPORTS
 
     def message_id(self, message: m.Message | type[m.Message]) -> int:
-        """Return 0: commands have no numbers.
-
-        Raises:
-            UnsupportedError: it has no such message.
-        """
+        """Return 0: commands have no numbers; UnsupportedError: it has no such message."""
         kind = message if isinstance(message, type) else type(message)
         if not self.has(kind):
             raise self.unsupported(kind)
         return 0
 
     def called(self, message: m.Message) -> str:
-        """Return what an error calls a message: its name, and its command."""
+        """Return a message's name for errors, with its command."""
         kind = type(message)
         command = message.line if isinstance(message, Command) else _MNEMONICS.get(kind, "")
         return f"{kind.__name__} ({command[:32]})"
@@ -225,8 +205,7 @@ class InSightDialect(Dialect):
 def _cell_names(text: str) -> list[str]:
     """Return the cells that a URL names, as commands name them.
 
-    Raises:
-        ConfigurationError: one is neither a cell, a range, nor a name; or there are too many.
+    Raises ConfigurationError: one is neither a cell, a range, nor a name; or there are too many.
     """
     names: list[str] = []
     for part in filter(None, (one.strip() for one in text.split(","))):

@@ -8,14 +8,12 @@ from pydantic import BaseModel, ConfigDict, RootModel, ValidationError, create_m
 from pydantic import Field as ModelField
 
 from smartcam.exceptions import ConfigurationError, LayoutError
-from smartcam.layout.text import TYPES, UNITS, LayoutSpec, parse_text, to_text
-from smartcam.layout.text import Field as LayoutField
-from smartcam.layout.yamls import BadYamlError, load, yaml_module
+from smartcam.layout._text import TYPES, UNITS, LayoutSpec, parse_text, to_text
+from smartcam.layout._text import Field as LayoutField
+from smartcam.layout._yamls import BadYamlError, load, yaml_module
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-__all__ = ["dump_yaml", "from_data", "load_yaml", "make_model", "to_data"]
 
 _Name = Annotated[str, ModelField(pattern=r"^[^\W\d]\w*$", max_length=200)]
 _Count = Annotated[int, ModelField(ge=1, le=65_535, strict=True)]
@@ -37,8 +35,8 @@ class _LayoutData(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    fields_: list[_FieldData] = ModelField(alias="fields", min_length=1)
     head: list[_FieldData] = []
+    fields_: list[_FieldData] = ModelField(alias="fields", min_length=1)
     repeat: Literal["*"] | _Count | _Name | None = None
     group: _Name | None = None
     lenient: bool = ModelField(False, strict=True)
@@ -46,36 +44,28 @@ class _LayoutData(BaseModel):
 
 def to_data(spec: LayoutSpec, *, lenient: bool) -> dict[str, Any]:
     """Return ``spec`` as plain data; what has its usual value is left out."""
-    data: dict[str, Any] = {}
-    if spec.head:
-        data["head"] = [_field_data(field) for field in spec.head]
-    data["fields"] = [_field_data(field) for field in spec.fields]
-    if spec.repeat is not None:
-        data["repeat"] = spec.repeat
-    if spec.group is not None:
-        data["group"] = spec.group
-    if lenient:
-        data["lenient"] = True
-    return data
+    data = _LayoutData.model_construct(
+        head=[_field_data(field) for field in spec.head],
+        fields_=[_field_data(field) for field in spec.fields],
+        repeat=spec.repeat,
+        group=spec.group,
+        lenient=lenient,
+    )
+    return data.model_dump(by_alias=True, exclude_defaults=True)
 
 
-def _field_data(field: LayoutField) -> dict[str, Any]:
-    data: dict[str, Any] = {"name": field.name, "type": field.type_text}
-    if field.unit is not None:
-        data["unit"] = field.unit
-    if field.sequence:
-        data["sequence"] = True
-    return data
+def _field_data(field: LayoutField) -> _FieldData:
+    return _FieldData.model_construct(
+        name=field.name, type=field.type_text, unit=field.unit, sequence=field.sequence
+    )
 
 
 def from_data(data: Mapping[str, Any]) -> tuple[str, bool]:
     """Return the layout text of plain data, and whether it is lenient.
 
-    The text is put together from checked words and then read like any other, so that there is
-    one place that knows what a layout may be.
-
-    Raises:
-        ConfigurationError: unknown keys, or values that are no words of a layout text.
+    The text is put together from checked words and then read like any other, so that there is one
+    place that knows what a layout may be. Raises ConfigurationError: unknown keys, or values that
+    are no words of a layout text.
     """
     try:
         checked = _LayoutData.model_validate(data)
@@ -121,36 +111,26 @@ def dump_yaml(data: dict[str, Any]) -> str:
 def load_yaml(text: str) -> dict[str, Any] | str:
     """Return the plain data of a YAML document, or the layout text that it is.
 
-    Raises:
-        LayoutError: neither the one nor the other.
+    Raises LayoutError: neither the one nor the other.
     """
     try:
         loaded: Any = load(text, what="layout: YAML")
     except BadYamlError as exc:
         # "x: int32, y: int32" is no YAML; a broken document is no layout text either
         try:
-            return _checked_text(text)
+            parse_text(text)
         except LayoutError as error:
+            place = "" if exc.line is None else f"line {exc.line}: "
             raise LayoutError(
-                f"{error}\nnor is it YAML: {_place(exc)}{exc}",
-                text=error.text,
-                position=error.position,
+                f"{error}\nnor is it YAML: {place}{exc}", text=error.text, position=error.position
             ) from exc
+        return text
     given: Any = loaded
     if isinstance(loaded, str):
         return loaded
     # "x: int32" is a YAML mapping as well; those of a file hold more than texts
     is_data = isinstance(loaded, dict) and not all(isinstance(v, str) for v in given.values())
     return given if is_data else text
-
-
-def _checked_text(text: str) -> str:
-    parse_text(text)
-    return text
-
-
-def _place(exc: BadYamlError) -> str:
-    return "" if exc.line is None else f"line {exc.line}: "
 
 
 def make_model(spec: LayoutSpec) -> type[BaseModel]:

@@ -11,26 +11,13 @@ from typing import TYPE_CHECKING
 
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Code, Protocol, Transport, Verdict
-from smartcam.protocols.framed.dialect import FramedDialect, MessageRow, StatusBits, WireQuirk
-from smartcam.protocols.framed.framing import HeaderLayout
-from smartcam.protocols.framed.machine import Machine
+from smartcam.protocols._base import CodeMeaning, Protocol, Transport, Verdict
+from smartcam.protocols._framed.dialect import FramedDialect, MessageRow, StatusBits, WireQuirk
+from smartcam.protocols._framed.framing import HeaderLayout
+from smartcam.protocols._framed.machine import Machine
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-__all__ = [
-    "B16",
-    "BID",
-    "BVS",
-    "CODES",
-    "DEFAULT_PORT",
-    "HANDBOOK",
-    "MESSAGES",
-    "THESIS",
-    "MessageId",
-    "ResultCode",
-]
 
 DEFAULT_PORT = 36701
 """Port of the camera in all documents (SC manual p. 28: published)."""
@@ -204,16 +191,18 @@ class ResultCode(enum.IntEnum):
     INSPECTION_ERROR = 0x1A
 
 
-CODES: Mapping[int, Code] = {
-    ResultCode.OK: Code("OK: executed", Verdict.DONE),
-    ResultCode.OK_INSPECTION_ID: Code("OK Inspection ID", Verdict.DONE),
-    ResultCode.OK_DATE_TIME: Code("OK Date Time", Verdict.DONE),
-    ResultCode.ERROR: Code(
+CODES: Mapping[int, CodeMeaning] = {
+    ResultCode.OK: CodeMeaning("OK: executed", Verdict.DONE),
+    ResultCode.OK_INSPECTION_ID: CodeMeaning("OK Inspection ID", Verdict.DONE),
+    ResultCode.OK_DATE_TIME: CodeMeaning("OK Date Time", Verdict.DONE),
+    ResultCode.ERROR: CodeMeaning(
         "NOK Error: transfer or execution failed, e.g. wrong format or length", Verdict.REFUSED
     ),
-    ResultCode.INVALID_COMMAND: Code("NOK Invalid Command: unknown command code", Verdict.UNKNOWN),
-    ResultCode.BUSY: Code("NOK Busy: Ready status is not set", Verdict.BUSY),
-    ResultCode.INSPECTION_ERROR: Code(
+    ResultCode.INVALID_COMMAND: CodeMeaning(
+        "NOK Invalid Command: unknown command code", Verdict.UNKNOWN
+    ),
+    ResultCode.BUSY: CodeMeaning("NOK Busy: Ready status is not set", Verdict.BUSY),
+    ResultCode.INSPECTION_ERROR: CodeMeaning(
         "NOK Inspection Error: program change failed", Verdict.REFUSED
     ),
 }

@@ -20,40 +20,6 @@ from smartcam.exceptions import ConfigurationError, FrameError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = [
-    "COMMANDS",
-    "DEFAULT_PORT",
-    "ENCODING",
-    "ERROR_VALUE",
-    "HEX_WIDTH",
-    "INVALID_PASSWORD",
-    "LAST_COLUMN",
-    "LAST_JOB_ID",
-    "LAST_ROW",
-    "LINE_END",
-    "LOGGED_IN",
-    "MAX_CELLS",
-    "MAX_LINE",
-    "PASSWORD_PROMPT",
-    "TRIGGER_EVENT",
-    "USER_PROMPT",
-    "WELCOME",
-    "AnswerForm",
-    "Cell",
-    "CommandRow",
-    "LineReader",
-    "Mode",
-    "StatusCode",
-    "checksum",
-    "code_text",
-    "hex_lines",
-    "job_id",
-    "parse_cell",
-    "parse_cells",
-    "parse_tag",
-    "parse_wire_cell",
-]
-
 DEFAULT_PORT = 23
 """The telnet port (manual, published)."""
 
@@ -138,7 +104,7 @@ class AnswerForm(enum.Enum):
     """The code, a line with a size, lines of hexadecimal digits, a line with their checksum."""
 
 
-class Mode(enum.Enum):
+class CommandMode(enum.Enum):
     """In which mode of the camera a command is possible."""
 
     ANY = "any"
@@ -163,7 +129,7 @@ class CommandRow(NamedTuple):
     title: str
     arguments: str
     form: AnswerForm
-    mode: Mode
+    mode: CommandMode
     codes: Mapping[int, str]
     source: str
 
@@ -172,20 +138,30 @@ INFO_LINES = 5
 """Lines of ``GI`` (clients, derived)."""
 
 _NO_ACCESS = {-6: "the user has no full access"}
-_EVENT = {-1: "the event is no number from 0 to 8", -2: "not possible, or the camera is offline"}
+_EVENT = {
+    -1: "the event is no number from 0 to 8",
+    -2: "not possible, or the camera is offline",
+    **_NO_ACCESS,
+}
 _LOAD = "the camera is online, there is no such job, or it failed to load"
-_SET_EXTRA = {-3: "the cell is read-only (newer firmware)", -4: "wrong type (newer firmware)"}
+_NO_MEMORY = {-4: "out of memory", **_NO_ACCESS}
+_NOT_SET = {
+    -3: "the cell is read-only (newer firmware)",
+    -4: "wrong type (newer firmware)",
+    **_NO_ACCESS,
+}
+_ANY, _ONLINE, _OFFLINE = CommandMode
 _MANUAL = "manual: published"
 _CLIENTS = "clients: derived"
 
 _ROWS = (
-    CommandRow("GO", "Get Online", "", AnswerForm.BARE, Mode.ANY, {}, _CLIENTS),
+    CommandRow("GO", "Get Online", "", AnswerForm.BARE, _ANY, {}, _CLIENTS),
     CommandRow(
         "SO",
         "Set Online",
         "0 or 1",
         AnswerForm.CODE,
-        Mode.ANY,
+        _ANY,
         {
             -1: "neither 0 nor 1",
             -2: "not possible",
@@ -194,31 +170,15 @@ _ROWS = (
         },
         _MANUAL,
     ),
-    CommandRow(
-        "SE",
-        "Set Event",
-        "0 to 8",
-        AnswerForm.CODE,
-        Mode.ONLINE,
-        _EVENT | _NO_ACCESS,
-        _CLIENTS,
-    ),
-    CommandRow(
-        "SW",
-        "Set Event and Wait",
-        "0 to 8",
-        AnswerForm.CODE,
-        Mode.ONLINE,
-        _EVENT | _NO_ACCESS,
-        _CLIENTS,
-    ),
+    CommandRow("SE", "Set Event", "0 to 8", AnswerForm.CODE, _ONLINE, _EVENT, _CLIENTS),
+    CommandRow("SW", "Set Event and Wait", "0 to 8", AnswerForm.CODE, _ONLINE, _EVENT, _CLIENTS),
     CommandRow(
         "LF",
         "Load File",
         "FILE",
         AnswerForm.CODE,
-        Mode.OFFLINE,
-        {-1: "the file name is missing", -2: _LOAD, -4: "out of memory", **_NO_ACCESS},
+        _OFFLINE,
+        {-1: "the file name is missing", -2: _LOAD, **_NO_MEMORY},
         _CLIENTS,
     ),
     CommandRow(
@@ -226,7 +186,7 @@ _ROWS = (
         "Get File",
         "",
         AnswerForm.LINE,
-        Mode.ANY,
+        _ANY,
         {-2: "the active job was never saved"},
         _CLIENTS,
     ),
@@ -235,8 +195,8 @@ _ROWS = (
         "Set Job",
         "ID",
         AnswerForm.CODE,
-        Mode.OFFLINE,
-        {-1: "the id is no number, or negative", -2: _LOAD, -4: "out of memory", **_NO_ACCESS},
+        _OFFLINE,
+        {-1: "the id is no number, or negative", -2: _LOAD, **_NO_MEMORY},
         _CLIENTS,
     ),
     CommandRow(
@@ -244,7 +204,7 @@ _ROWS = (
         "Get Job",
         "",
         AnswerForm.LINE,
-        Mode.ANY,
+        _ANY,
         {-2: "the active job was never saved, or its name does not begin with a number"},
         _CLIENTS,
     ),
@@ -253,7 +213,7 @@ _ROWS = (
         "Get Value",
         "CELL or NAME",
         AnswerForm.LINE,
-        Mode.ANY,
+        _ANY,
         {-1: "no such cell or name", -2: "not possible"},
         _CLIENTS,
     ),
@@ -262,12 +222,11 @@ _ROWS = (
         "Set Integer",
         "CELL VALUE without a space, or NAME VALUE",
         AnswerForm.CODE,
-        Mode.ANY,
+        _ANY,
         {
             -1: "no such cell or name, or no integer",
             -2: "out of the control's range, or the cell has no control for integers",
-            **_SET_EXTRA,
-            **_NO_ACCESS,
+            **_NOT_SET,
         },
         _MANUAL,
     ),
@@ -276,12 +235,11 @@ _ROWS = (
         "Set Float",
         "CELL VALUE without a space, or NAME VALUE",
         AnswerForm.CODE,
-        Mode.ANY,
+        _ANY,
         {
             -1: "no such cell or name, or no number",
             -2: "the cell has no control for numbers",
-            **_SET_EXTRA,
-            **_NO_ACCESS,
+            **_NOT_SET,
         },
         _CLIENTS,
     ),
@@ -290,43 +248,26 @@ _ROWS = (
         "Set String",
         "CELL TEXT without a space, or NAME TEXT",
         AnswerForm.CODE,
-        Mode.ANY,
+        _ANY,
         {
             -1: "no such cell or name",
             -2: "too long, or the cell has no control for texts",
-            **_SET_EXTRA,
-            **_NO_ACCESS,
+            **_NOT_SET,
         },
         _MANUAL,
     ),
-    CommandRow("GI", "Get Info", "", AnswerForm.INFO, Mode.ANY, {-2: "not possible"}, _CLIENTS),
+    CommandRow("GI", "Get Info", "", AnswerForm.INFO, _ANY, {-2: "not possible"}, _CLIENTS),
     CommandRow(
         "EV",
         "Evaluate",
         " EXPRESSION",
         AnswerForm.SIZED,
-        Mode.ANY,
-        {-1: "no such cell", -2: "not possible", -4: "out of memory", **_NO_ACCESS},
+        _ANY,
+        {-1: "no such cell", -2: "not possible", **_NO_MEMORY},
         _MANUAL,
     ),
-    CommandRow(
-        "RI",
-        "Read Image",
-        "",
-        AnswerForm.HEX,
-        Mode.ANY,
-        {-4: "out of memory", **_NO_ACCESS},
-        _MANUAL,
-    ),
-    CommandRow(
-        "RB",
-        "Read BMP",
-        "",
-        AnswerForm.HEX,
-        Mode.ANY,
-        {-4: "out of memory", **_NO_ACCESS},
-        _MANUAL,
-    ),
+    CommandRow("RI", "Read Image", "", AnswerForm.HEX, _ANY, _NO_MEMORY, _MANUAL),
+    CommandRow("RB", "Read BMP", "", AnswerForm.HEX, _ANY, _NO_MEMORY, _MANUAL),
 )
 
 COMMANDS: Mapping[str, CommandRow] = {row.mnemonic: row for row in _ROWS}
@@ -346,11 +287,9 @@ _GENERAL_TEXTS = {
 
 
 def code_text(command: str, code: int) -> str:
-    """Return what a status code says in the answer to a command, in words.
+    """Return the meaning of a status code in the answer to a command, in words.
 
-    Args:
-        command: the command line, or its two letters.
-        code: the status code.
+    ``command``: the command line, or its two letters.
     """
     row = COMMANDS.get(command[:2].upper())
     texts = _GENERAL_TEXTS if row is None else {**_COMMON_TEXTS, **row.codes}
@@ -388,11 +327,7 @@ _JOB_NUMBER = re.compile(r"([0-9]{1,3})(?![0-9])", re.ASCII)
 
 
 def parse_cell(text: str) -> Cell:
-    """Read a cell as people write it, such as ``A1`` or ``b012``.
-
-    Raises:
-        ConfigurationError: it is none.
-    """
+    """Read a cell as people write it, ``A1`` or ``b012``; ConfigurationError: it is none."""
     match = _CELL.fullmatch(text)
     if match is None or int(match[2]) > LAST_ROW:
         raise ConfigurationError(
@@ -404,9 +339,8 @@ def parse_cell(text: str) -> Cell:
 def parse_cells(text: str) -> list[Cell]:
     """Read a cell or a rectangle of cells, such as ``B2:D4``: row by row, each from left to right.
 
-    Raises:
-        ConfigurationError: it is neither, its corners are not top left and bottom right, or it has
-            more than 1024 cells.
+    Raises ConfigurationError: it is neither, its corners are not top left and bottom right, or it
+    has more than 1024 cells.
     """
     first_text, colon, last_text = text.partition(":")
     first = parse_cell(first_text)
@@ -425,8 +359,7 @@ def parse_cells(text: str) -> list[Cell]:
 def parse_wire_cell(text: str) -> tuple[Cell, str] | None:
     """Read the cell at the beginning of a command's argument: a letter and exactly three digits.
 
-    Returns:
-        The cell and what stands behind it; None if no cell stands there.
+    Returns the cell and what stands behind it; None if no cell stands there.
     """
     match = _WIRE_CELL.match(text)
     if match is None or int(match[2]) > LAST_ROW:
@@ -438,10 +371,7 @@ def parse_tag(text: str) -> str:
     """Read a cell's name: letters, digits, underscores and dots, at most 127 (manual, published).
 
     Two names that differ in case only are the same (manual, published), so it is returned in lower
-    case.
-
-    Raises:
-        ConfigurationError: it is none, or it has the form of a cell.
+    case. Raises ConfigurationError: it is none, or it has the form of a cell.
     """
     if not _TAG.fullmatch(text) or _CELL_LIKE.fullmatch(text):
         raise ConfigurationError(
@@ -467,9 +397,6 @@ def checksum(digits: bytes) -> str:
     """Return the checksum of hexadecimal data: CRC-16 with polynomial 0x1021, first value 0.
 
     It is made of the digits' characters in upper case, without line ends (manual, published).
-
-    Args:
-        digits: the hexadecimal digits in upper case.
     """
     return f"{binascii.crc_hqx(digits, 0):04X}"
 
@@ -477,8 +404,7 @@ def checksum(digits: bytes) -> str:
 def hex_lines(data: bytes) -> tuple[int, bytes]:
     """Write data as the camera sends it.
 
-    Returns:
-        The number of hexadecimal digits, and the lines: 80 digits each, then the checksum's.
+    Returns the number of hexadecimal digits, and the lines: 80 digits each, then the checksum's.
     """
     digits = data.hex().upper().encode("ascii")
     lines = [digits[begin : begin + HEX_WIDTH] for begin in range(0, len(digits), HEX_WIDTH)]
@@ -505,7 +431,7 @@ class LineReader:
         self._searched = 0  # no end begins before this
 
     def __len__(self) -> int:
-        """Bytes that wait."""
+        """Return the number of bytes that wait."""
         return len(self._buffer)
 
     @property
@@ -520,8 +446,7 @@ class LineReader:
     def next_line(self) -> str | None:
         """Return the next line without its end, None if no whole one is there.
 
-        Raises:
-            FrameError: it is too long; the stream cannot be read on.
+        Raises FrameError: it is too long; the stream cannot be read on.
         """
         found = self._end.search(self._buffer, self._searched)
         size = found.start() if found is not None else len(self._buffer)

@@ -21,9 +21,7 @@ import unicodedata
 from dataclasses import dataclass
 from typing import NamedTuple, NoReturn
 
-from smartcam.exceptions import LayoutError
-
-__all__ = ["TYPES", "UNITS", "Field", "LayoutSpec", "Unit", "WireType", "parse_text", "to_text"]
+from smartcam.exceptions import InterpretationError, LayoutError
 
 MAX_TEXT = 20_000
 """Characters of a layout text. A container holds about 64 kB; a thousand fields, each of them
@@ -206,10 +204,9 @@ def to_text(spec: LayoutSpec) -> str:
 
 
 def parse_text(text: str, start: int = 0) -> LayoutSpec:
-    """Return what ``text`` says, read from ``start`` on.
+    """Return the fields and groups of a layout text, read from ``start`` on.
 
-    Raises:
-        LayoutError: with the position of the mistake in ``text``.
+    Raises LayoutError: with the position of the mistake in ``text``.
     """
     if len(text) - start > MAX_TEXT:
         raise LayoutError(
@@ -220,7 +217,24 @@ def parse_text(text: str, start: int = 0) -> LayoutSpec:
     return _Parser(text, start).layout()
 
 
-class _Token(NamedTuple):
+def misfit(
+    field: Field, offset: int, expected: str, got: object, where: str = "", more: str = ""
+) -> InterpretationError:
+    """Return the error of a value that cannot be what its field says.
+
+    ``offset``: of the value, bytes from the container's beginning. ``where`` goes before the field
+    in the text, ``more`` behind ``expected``.
+    """
+    return InterpretationError(
+        f"{where}{field.label} at offset {offset}: expected {expected}{more}, got {got}",
+        field=field.name,
+        offset=offset,
+        expected=expected,
+        got=got,
+    )
+
+
+class _Lexeme(NamedTuple):
     kind: str
     text: str
     position: int
@@ -251,7 +265,7 @@ class _Parser:
             if here.kind == "end" and (fields or group):
                 break
             if group is not None:
-                self._fail(f"expected the end, a group comes last, got {here}", here)
+                self._unexpected("the end, a group comes last")
             if self._at_group():
                 group = self._group(tuple(fields))
             else:
@@ -264,7 +278,7 @@ class _Parser:
     # -- rules -------------------------------------------------------------------------------
 
     def _at_group(self) -> bool:
-        """Whether ``(`` or ``name : (`` comes."""
+        """Return whether ``(`` or ``name : (`` comes."""
         ahead = [token.text for token in self._tokens[self._next : self._next + 3]]
         return ahead[:1] == ["("] or ahead[1:] == [":", "("]
 
@@ -292,11 +306,7 @@ class _Parser:
     def _repeat(self, head: tuple[Field, ...]) -> str | int:
         if self._take_mark("*"):
             return "*"
-        if not self._take_mark("["):
-            self._fail(
-                f"expected '*', '[number]' or '[name]' behind the group, got {self._peek()}",
-                self._peek(),
-            )
+        self._expect("[", "'*', '[number]' or '[name]' behind the group")
         token = self._take()
         repeat: str | int
         if token.kind == "number":
@@ -304,22 +314,18 @@ class _Parser:
         elif token.kind == "name":
             repeat = self._count_name(token, head)
         else:
-            self._fail(f"expected a number or the name of a count field, got {token}", token)
-        if not self._take_mark("]"):
-            self._fail(f"expected ']', got {self._peek()}", self._peek())
+            self._unexpected("a number or the name of a count field", token)
+        self._expect("]", "']'")
         return repeat
 
-    def _count_name(self, token: _Token, head: tuple[Field, ...]) -> str:
+    def _count_name(self, token: _Lexeme, head: tuple[Field, ...]) -> str:
         name = unicodedata.normalize("NFKC", token.text)
         for field in head:
             if field.name == name:
                 break
         else:
             known = ", ".join(field.name for field in head) or "none"
-            self._fail(
-                f"expected the name of a field before the group (there: {known}), got {token}",
-                token,
-            )
+            self._unexpected(f"the name of a field before the group (there: {known})", token)
         if not field.wire.is_integer or field.unit is not None or field.sequence:
             self._fail(
                 f"expected an integer field without a unit as the count, got {field.label}", token
@@ -328,8 +334,7 @@ class _Parser:
 
     def _field(self, what: str) -> Field:
         name = self._name(what)
-        if not self._take_mark(":"):
-            self._fail(f"expected ':' and a type behind {name!r}, got {self._peek()}", self._peek())
+        self._expect(":", f"':' and a type behind {name!r}")
         type_, length = self._type()
         unit = self._unit(type_)
         return Field(name, type_, length, unit, self._sequence(type_, unit))
@@ -337,12 +342,12 @@ class _Parser:
     def _name(self, what: str) -> str:
         token = self._take()
         if token.kind != "name":
-            self._fail(f"expected {what}, got {token}", token)
+            self._unexpected(what, token)
         name = unicodedata.normalize("NFKC", token.text)  # as Python does with attribute names
         if not token.text.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
-            self._fail(
-                f"expected a name that can be an attribute (letters, digits, '_'; no leading '_', "
-                f"no Python keyword), got {token}",
+            self._unexpected(
+                "a name that can be an attribute (letters, digits, '_'; no leading '_', no Python "
+                "keyword)",
                 token,
             )
         if name in self._names:
@@ -359,13 +364,9 @@ class _Parser:
             )
         if token.text != "string":
             return token.text, None
-        if not self._take_mark("["):
-            self._fail(
-                f"expected '[' and the string's length in bytes, got {self._peek()}", self._peek()
-            )
+        self._expect("[", "'[' and the string's length in bytes")
         length = self._number(self._take(), "bytes")
-        if not self._take_mark("]"):
-            self._fail(f"expected ']', got {self._peek()}", self._peek())
+        self._expect("]", "']'")
         return token.text, length
 
     def _unit(self, type_: str) -> str | None:
@@ -373,9 +374,9 @@ class _Parser:
         if token.kind != "name" or self._after().text == ":":
             return None
         if not TYPES[type_].is_number:
-            self._fail(f"expected no unit, a {type_} has none, got {token}", token)
+            self._unexpected(f"no unit, a {type_} has none")
         if token.text not in UNITS:
-            self._fail(f"expected a unit ({', '.join(UNITS)}), got {token}", token)
+            self._unexpected(f"a unit ({', '.join(UNITS)})")
         return self._take().text
 
     def _sequence(self, type_: str, unit: str | None) -> bool:
@@ -392,25 +393,24 @@ class _Parser:
         self._has_sequence = True
         return True
 
-    def _number(self, token: _Token, what: str) -> int:
+    def _number(self, token: _Lexeme, what: str) -> int:
         digits = token.text.lstrip("0")
         # the length first: int() refuses some thousand digits with an error of its own
         if token.kind != "number" or not 1 <= len(digits) <= 5 or int(digits) > MAX_COUNT:
-            self._fail(f"expected a number of {what} from 1 to {MAX_COUNT}, got {token}", token)
+            self._unexpected(f"a number of {what} from 1 to {MAX_COUNT}", token)
         return int(digits)
 
     def _expect_end(self, last: Field | None) -> None:
-        here = self._peek()
-        if here.kind == "end":
+        if self._peek().kind == "end":
             return
         if last is None:
-            self._fail(f"expected the end, a group comes last, got {here}", here)
+            self._unexpected("the end, a group comes last")
         self._fail_after(last, "',' or the end")
 
     # -- tokens ------------------------------------------------------------------------------
 
-    def _tokenize(self, start: int) -> list[_Token]:
-        tokens: list[_Token] = []
+    def _tokenize(self, start: int) -> list[_Lexeme]:
+        tokens: list[_Lexeme] = []
         position = start
         while position < len(self._text):
             match = _TOKEN.match(self._text, position)
@@ -418,21 +418,21 @@ class _Parser:
                 bad = self._text[position]
                 self._fail(
                     f"expected a name, a number or one of : , ( ) [ ] * @ #, got {bad!r}",
-                    _Token("mark", bad, position),
+                    _Lexeme("mark", bad, position),
                 )
             if match.lastgroup != "space":
-                tokens.append(_Token(match.lastgroup or "", match.group(), position))
+                tokens.append(_Lexeme(match.lastgroup or "", match.group(), position))
             position = match.end()
-        tokens.append(_Token("end", "", max(start, len(self._text))))
+        tokens.append(_Lexeme("end", "", max(start, len(self._text))))
         return tokens
 
-    def _peek(self) -> _Token:
+    def _peek(self) -> _Lexeme:
         return self._tokens[self._next]
 
-    def _after(self) -> _Token:
+    def _after(self) -> _Lexeme:
         return self._tokens[min(self._next + 1, len(self._tokens) - 1)]
 
-    def _take(self) -> _Token:
+    def _take(self) -> _Lexeme:
         token = self._tokens[self._next]
         if token.kind != "end":
             self._next += 1
@@ -444,15 +444,24 @@ class _Parser:
             return True
         return False
 
+    def _expect(self, mark: str, expected: str) -> None:
+        if not self._take_mark(mark):
+            self._unexpected(expected)
+
+    def _unexpected(self, expected: str, token: _Lexeme | None = None) -> NoReturn:
+        """Fail at a token; default the one that comes next."""
+        token = token or self._peek()
+        self._fail(f"expected {expected}, got {token}", token)
+
     def _fail_after(self, field: Field, expected: str) -> NoReturn:
         """Fail behind a whole field: say what could have followed."""
         here = self._peek()
         if here.kind == "name":
             self._fail(f"expected {expected}, got {here}: a comma is missing before it", here)
         extras = "" if field.unit or not field.wire.is_number else "a unit, "
-        self._fail(f"expected {extras}{expected}, got {here}", here)
+        self._unexpected(f"{extras}{expected}")
 
-    def _fail(self, message: str, token: _Token) -> NoReturn:
+    def _fail(self, message: str, token: _Lexeme) -> NoReturn:
         at = token.position
         raise LayoutError(
             f"layout: {message} {_show(self._text, at)}", text=self._text, position=at
@@ -466,7 +475,7 @@ def _suggest(word: str) -> str:
 
 
 def _show(text: str, position: int) -> str:
-    """Return where ``position`` is, with its line and a caret below it."""
+    """Return the line of ``position`` with a caret below it."""
     before = text[:position]
     line = before.count("\n") + 1
     begin = before.rfind("\n") + 1

@@ -7,18 +7,16 @@ import operator
 from itertools import repeat
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
-from smartcam.exceptions import ConfigurationError, InterpretationError
-from smartcam.interpreters.base import PlainInterpreter
-from smartcam.layout.text import UNITS
+from smartcam.exceptions import ConfigurationError
+from smartcam.interpreters._base import PlainInterpreter
+from smartcam.layout._text import UNITS, misfit
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from smartcam.interpreters.base import Context
+    from smartcam.interpreters._base import Context
     from smartcam.layout import Field, Layout
-
-__all__ = ["Localizations"]
 
 _DEFAULTS: dict[str, Any] = {
     "feature_id": b"",
@@ -51,7 +49,7 @@ BEST = 1.0 + 1e-6
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
-class Localizations(PlainInterpreter):
+class LocalizationsInterpreter(PlainInterpreter):
     """Gives a list of :class:`~smartcam.Localization`.
 
     Args:
@@ -169,18 +167,12 @@ class Localizations(PlainInterpreter):
             for field, value in zip(self.layout.fields, record, strict=True):
                 wrong = _wrong(field, value)
                 if wrong and not self._is_empty(data, number):
-                    raise InterpretationError(
-                        f"{field.label} at offset {offset}: expected {wrong}, got {value}",
-                        field=field.name,
-                        offset=offset,
-                        expected=wrong,
-                        got=value,
-                    )
+                    raise misfit(field, offset, wrong, value)
                 offset += field.size
 
 
 def _wrong(field: Field, value: float) -> str:
-    """Return what was expected where a number cannot be; "" where it can."""
+    """Return the expectation that a number does not meet; "" where it can be."""
     if field.name in _POSE and not math.isfinite(value):
         return "a finite number"
     if field.name == "quality" and not 0.0 <= value <= BEST:

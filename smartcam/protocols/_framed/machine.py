@@ -2,7 +2,7 @@
 
 Bytes go in, events come out; it imports no socket, loop or clock. Two rules: what is not in
 :data:`TRANSITIONS` is illegal, and bad input never raises out of ``receive_*``: by the role's
-:class:`~smartcam.protocols.base.Policy` it ends the link with a :class:`LinkFailed` event, or is
+:class:`~smartcam.protocols._base.Policy` it ends the link with a :class:`LinkFailed` event, or is
 dropped and counted.
 """
 
@@ -20,29 +20,16 @@ from smartcam.exceptions import (
     hex_excerpt,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import POLICIES, Policy, Role, Transport
-from smartcam.protocols.framed import frame_age
-from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer
+from smartcam.protocols._base import POLICIES, Policy, Role, Transport
+from smartcam.protocols._framed import frame_age
+from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from smartcam.protocols.base import Dialect
-    from smartcam.protocols.framed.dialect import Codec, FramedDialect
+    from smartcam.protocols._base import Dialect
+    from smartcam.protocols._framed.dialect import Codec, FramedDialect
     from smartcam.protocols.messages import Message
-
-__all__ = [
-    "TRANSITIONS",
-    "Counters",
-    "Event",
-    "LinkEnded",
-    "LinkFailed",
-    "LinkMachine",
-    "Machine",
-    "ResultBurst",
-    "State",
-]
-
 
 MANY_EVENTS = 64
 """Events of one read beyond which the next one takes fewer bytes: cutting frames, and making
@@ -204,6 +191,13 @@ class LinkMachine(Protocol):
     :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever the wire looks like.
     """
 
+    transport: Transport
+    """What carries it."""
+    replies: bool
+    """Whether what comes may make it say something by itself."""
+    counters: Counters
+    """What went through."""
+
     @property
     def dialect(self) -> Dialect:
         """What is spoken."""
@@ -212,21 +206,6 @@ class LinkMachine(Protocol):
     @property
     def kin(self) -> Sequence[Dialect]:
         """What it may be: more than one until :meth:`adopt` says which."""
-        ...
-
-    @property
-    def transport(self) -> Transport:
-        """What carries it."""
-        ...
-
-    @property
-    def replies(self) -> bool:
-        """Whether what comes may make it say something by itself."""
-        ...
-
-    @property
-    def counters(self) -> Counters:
-        """What went through."""
         ...
 
     @property
@@ -240,11 +219,10 @@ class LinkMachine(Protocol):
         ...
 
     def adopt(self, dialect: Dialect) -> None:
-        """It is this one of its kin."""
-        ...
+        """Speak this one of :attr:`kin` from now on."""
 
     def room(self) -> memoryview:
-        """Return where a stream's next bytes may be written; call :meth:`filled` next."""
+        """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
         ...
 
     def filled(self, count: int, now: float) -> bool:
@@ -256,14 +234,12 @@ class LinkMachine(Protocol):
 
     def receive_data(self, data: bytes) -> None:
         """Take bytes of a stream, or one whole datagram; never raises for what is in them."""
-        ...
 
     def receive_eof(self) -> None:
-        """The peer will send no more."""
-        ...
+        """Take note that the peer will send no more."""
 
     def events(self) -> list[Event]:
-        """Return what came since the last call, in order; the caller owns the list."""
+        """Return the events since the last call, in order; the caller owns the list."""
         ...
 
     def send(self, message: Message, *, answered: bool | None = None) -> None:
@@ -273,10 +249,9 @@ class LinkMachine(Protocol):
             LocalProtocolError: not now. Nothing has changed.
             UnsupportedError: the dialect has no such message.
         """
-        ...
 
     def data_to_send(self) -> list[bytes]:
-        """Return what is to be written, in order."""
+        """Return the bytes to write, in order."""
         ...
 
 
@@ -346,7 +321,7 @@ class Machine:
         self.state = State.IDLE
 
     def adopt(self, dialect: Dialect) -> None:
-        """It is this one of :attr:`kin`; statuses that :meth:`events` gave before are not redone.
+        """Speak this one of :attr:`kin`; statuses that :meth:`events` gave before are not redone.
 
         Raises:
             LocalProtocolError: it is none of them.
@@ -407,7 +382,7 @@ class Machine:
             self._receive_frames()
 
     def room(self) -> memoryview:
-        """Return where a stream's next bytes may be written; call :meth:`filled` next."""
+        """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
         return self._framer.room()
 
     def filled(self, count: int, now: float = 0.0) -> bool:
@@ -441,7 +416,7 @@ class Machine:
         return cut
 
     def receive_eof(self) -> None:
-        """The peer will send no more; call :meth:`events` next."""
+        """Take note that the peer will send no more; call :meth:`events` next."""
         if self._deaf:
             return
         self._events.append(LinkEnded(pending=self._framer.buffered))
@@ -449,7 +424,7 @@ class Machine:
         self.state = State.CLOSED
 
     def events(self) -> list[Event]:
-        """Return what came since the last call, in order; the caller owns the list."""
+        """Return the events since the last call, in order; the caller owns the list."""
         events, self._events = self._events, []
         return events
 
@@ -522,7 +497,7 @@ class Machine:
                 return
 
     def _is_overdue(self, now: float) -> bool:
-        """Whether the frame that is begun will not become whole; then it is rejected."""
+        """Return whether the frame that is begun will not become whole; then it is rejected."""
         framer, begun = self._framer, self._unfinished
         age = begun.age(self._begun, self._begun_at, now)
         if age < frame_age.HINT_TIME:
@@ -633,7 +608,7 @@ class Machine:
             self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
-        """Whether the client shall see it: an answer that nothing asked for is counted only."""
+        """Return whether the client sees it: an answer that nothing asked for is counted only."""
         self.counters.unknown_ids += not known
         if message_id in self._open:
             self._open.remove(message_id)

@@ -20,8 +20,6 @@ from smartcam.exceptions import FrameError, hex_excerpt
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-__all__ = ["DEFAULT_MAX_LENGTH", "Frame", "Framer", "HeaderLayout"]
-
 DEFAULT_MAX_LENGTH = 1 << 20
 """Bytes of payload accepted by default. The camera sends about 64 kB at most (HALCON script
 manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."""
@@ -98,7 +96,7 @@ class HeaderLayout:
         return self.magic + self._fields.pack(message_id, length)
 
     def reader(self, more: int = 0) -> Read:
-        """Return what reads a header at a place: magic, the two numbers, ``more`` bytes behind."""
+        """Return a reader of headers: magic, the two numbers, ``more`` bytes behind."""
         behind = f"{more}s" if more else ""
         return struct.Struct(f"<{len(self.magic)}s{2 * self.code}{behind}").unpack_from
 
@@ -139,9 +137,8 @@ class Framer:
     def expect(self, lengths: Mapping[int, range]) -> None:
         """Refuse a payload that is longer than its message may have, even if it is not too long.
 
-        Args:
-            lengths: bytes that the payload of a message may have, by its id. One that is not among
-                them may have any number.
+        ``lengths``: bytes that the payload of a message may have, by its id; any number where it is
+        not among them.
         """
         self._lengths = lengths
         self._always = min((self._max_length, *(one.stop - 1 for one in lengths.values())))
@@ -174,7 +171,7 @@ class Framer:
         self.buffer, self._start, self._large = b"".join((large[:filled], data)), 0, None
 
     def room(self) -> memoryview:
-        """Return where a transport may write the next bytes; call :meth:`filled` next.
+        """Return the buffer for a transport's next bytes; call :meth:`filled` next.
 
         The rest of a large frame, or a buffer that grows as long as it is filled each time: an
         idle camera has a small one, a fast one few reads.
@@ -188,8 +185,7 @@ class Framer:
     def filled(self, count: int) -> bool:
         """Take ``count`` bytes that were written into :meth:`room`; as :meth:`feed`.
 
-        Returns:
-            False where a large frame goes on, so that there is nothing to cut yet.
+        Returns False where a large frame goes on, so that there is nothing to cut yet.
         """
         if self._large is not None:
             self._fill(count)
@@ -201,7 +197,7 @@ class Framer:
             self._window = self._store = memoryview(bytearray(min(2 * count, MOST_READ)))
         if self._start < len(self.buffer):
             self.feed(data)
-        elif count >= LARGE and self._begins_large(data):
+        elif count >= LARGE and self._header_at(data, 0)[1] >= LARGE:
             self.buffer, self._start = data, 0  # not copied: it is cut before the next bytes come
             self._window = self._store
         else:
@@ -221,11 +217,8 @@ class Framer:
     def cut(self) -> tuple[int, int, int] | None:
         """Return the next whole frame as id and place of its payload, or None for "more bytes".
 
-        What is at the place gives :meth:`take`, before the next :meth:`feed`.
-
-        Raises:
-            FrameError: wrong magic, or a length that is impossible or above the limit. Nothing is
-                consumed.
+        What is at the place gives :meth:`take`, before the next :meth:`feed`. Raises FrameError:
+        wrong magic, or a length that is impossible or above the limit; nothing is consumed.
         """
         if self._large is not None:
             return None
@@ -260,15 +253,11 @@ class Framer:
         return bytes(self.buffer[begin:end])
 
     def following(self, read: Read, like: int, size: int) -> list[bytes]:
-        """Return what is in the whole frames that come next and are of the same kind.
+        """Return the payloads of the whole frames that come next and are of the same kind.
 
         Those with the id and the first ``size`` bytes of payload of the frame that begins at
         ``like``; their other bytes are returned. The first that differs ends it, errors included.
-
-        Args:
-            read: a header's reader with ``size`` bytes more.
-            like: where the frame begins that they are compared with.
-            size: of what is the same in each of them.
+        ``read``: a header's reader with ``size`` bytes more.
         """
         header, buffer, start = self._header, self.buffer, self._start
         found: list[bytes] = []
@@ -305,23 +294,18 @@ class Framer:
 
         None where not even the header is there. To be asked when :meth:`cut` has returned None.
         """
-        header = self._header
         buffer, start = (self.buffer, self._start) if self._large is None else (self._large, 0)
-        if self.buffered < header.size:
+        if self.buffered < self._header.size:
             return None
-        _, message_id, length = self._read(buffer, start)
-        if not header.id_first:
-            message_id, length = length, message_id
-        return message_id, header.size + length - header.length_includes
+        message_id, size = self._header_at(buffer, start)
+        return message_id, self._header.size + size
 
     def header_within(self, begin: int) -> int | None:
         """Return the place of another header in what is there of a frame, None for none.
 
         It has the magic number, the id of a message that is expected, and a length that this may
-        have. Dialects without a magic number have none.
-
-        Args:
-            begin: of the frame's bytes, where to begin.
+        have. Dialects without a magic number have none. ``begin``: of the frame's bytes, where to
+        begin.
         """
         header = self._header
         buffer, start = (self.buffer, self._start) if self._large is None else (self._large, 0)
@@ -329,10 +313,7 @@ class Framer:
         data = bytes(buffer[start + begin : start + self.buffered])
         at = data.find(header.magic) if header.magic else -1
         while 0 <= at <= len(data) - header.size:
-            _, message_id, length = self._read(data, at)
-            if not header.id_first:
-                message_id, length = length, message_id
-            size = length - header.length_includes
+            message_id, size = self._header_at(data, at)
             if size in self._lengths.get(message_id, ()) and size <= self._max_length:
                 return begin + at
             at = data.find(header.magic, at + 1)
@@ -370,18 +351,18 @@ class Framer:
         self.buffer, self._start, self._large = b"", 0, None
 
     def _fill(self, count: int) -> None:
-        """``count`` bytes more of a large frame are there."""
+        """Count bytes of a large frame that came, and finish it if it is whole."""
         self._filled += count
         large = self._large
         if large is not None and self._filled == len(large):
             self.buffer, self._start, self._large = large, 0, None
 
-    def _begins_large(self, data: memoryview) -> bool:
-        """Whether the first frame is a large one."""
-        header = self._header
-        _, first, second = self._read(data, 0)
-        length: int = second if header.id_first else first
-        return length - header.length_includes >= LARGE
+    def _header_at(self, buffer: Buffer, at: int) -> tuple[int, int]:
+        """Return message id and bytes of payload that the header at a place announces."""
+        _, message_id, length = self._read(buffer, at)
+        if not self._header.id_first:
+            message_id, length = length, message_id
+        return message_id, length - self._header.length_includes
 
     def _keep(self, start: int) -> None:
         """Keep the rest of a chunk that was a view."""

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from smartcam.layout import Layout
-    from smartcam.layout.text import Field
-
-__all__ = ["pack_texts"]
+    from smartcam.layout._text import Field
 
 _NUMBER = re.compile(
     r"(?P<whole>[+-]?[0-9]+)(?:\.0*)?|[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?"
@@ -64,11 +62,7 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
 
 
 def _fields(layout: Layout, count: int) -> Sequence[Field]:
-    """Return the field of each cell, where there are ``count`` cells.
-
-    Raises:
-        InterpretationError: they are not so many.
-    """
+    """Return the field of each cell, where there are ``count`` cells; else InterpretationError."""
     records = layout.repeat
     if not isinstance(records, int):
         left = max(0, count - len(layout.head))
@@ -84,11 +78,7 @@ def _fields(layout: Layout, count: int) -> Sequence[Field]:
 
 
 def _pack(field: Field, text: str | None) -> bytes:
-    """Return one field's bytes.
-
-    Raises:
-        ValueError, OverflowError: it is no value of the field.
-    """
+    """Return one field's bytes; ValueError, OverflowError: it is no value of the field."""
     if text is None:
         raise ValueError("it has no value")
     if field.type == "string":
@@ -111,11 +101,7 @@ def _pack(field: Field, text: str | None) -> bytes:
 
 
 def _real(text: str) -> float:
-    """Return a number.
-
-    Raises:
-        ValueError: it is none, or too large.
-    """
+    """Return a number; ValueError: it is none, or too large."""
     if not _NUMBER.fullmatch(text.strip()):
         raise ValueError("no number")
     number = float(text)
@@ -125,11 +111,7 @@ def _real(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    """Return a whole number, which may be written with decimals that are zeros.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return a whole number, which may be written with decimals that are zeros; else ValueError."""
     match = _NUMBER.fullmatch(text.strip())
     if match is None or match["whole"] is None:
         raise ValueError("no whole number")

@@ -21,11 +21,11 @@ from smartcam.exceptions import (
 )
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Dialect, Role, Transport
-from smartcam.protocols.framed.framing import Frame
-from smartcam.protocols.framed.machine import Counters, Event, LinkEnded, LinkFailed, State
-from smartcam.protocols.insight.answers import Answer, AnswerReader
-from smartcam.protocols.insight.words import (
+from smartcam.protocols._base import Dialect, Role, Transport
+from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._framed.machine import Counters, Event, LinkEnded, LinkFailed, State
+from smartcam.protocols._insight.answers import AnswerReader, CommandAnswer, unexpected
+from smartcam.protocols._insight.words import (
     COMMANDS,
     ENCODING,
     ERROR_VALUE,
@@ -44,12 +44,10 @@ from smartcam.protocols.insight.words import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
-    from smartcam.protocols.insight.dialect import InSightDialect
+    from smartcam.protocols._insight.dialect import InSightDialect
 
-    Script = Generator[str, Answer, None]
+    Script = Generator[str, CommandAnswer, None]
     """Yields command lines and is sent their answers; what it finds out it tells as messages."""
-
-__all__ = ["Command", "InSightMachine", "Piece", "Reply"]
 
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 """Status of a camera that is online: an event 8 is taken. It tells no more of itself."""
@@ -98,18 +96,13 @@ class Command(m.Request):
 
 
 def unsendable(text: str, limit: int) -> str | None:
-    """Return why a text cannot be a line to the camera, None if it can.
-
-    Args:
-        text: without its end.
-        limit: bytes that it may have.
-    """
+    """Return the reason why a text cannot be a line of ``limit`` bytes, None if it can."""
     if not all(ord(char) < 256 and char not in "\r\n\0" for char in text):
         return "only Latin-1 without line ends can be sent"
     return None if len(text) <= limit else f"at most {limit} bytes can be sent"
 
 
-class _Job(NamedTuple):
+class _PendingRequest(NamedTuple):
     """A request under way, or in line."""
 
     kind: type[m.Message]
@@ -119,7 +112,7 @@ class _Job(NamedTuple):
 class InSightMachine:
     """One connection's native mode, in the client's role; what a link needs.
 
-    See :class:`~smartcam.protocols.framed.machine.LinkMachine`. An answer belongs to the command
+    See :class:`~smartcam.protocols.LinkMachine`. An answer belongs to the command
     before it, and nothing else may come: a line that nothing was asked for ends the link.
 
     Args:
@@ -159,8 +152,10 @@ class InSightMachine:
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
         self._login: Iterator[None] = iter(())
-        self._waiting: collections.deque[_Job] = collections.deque()  # at most one of a kind
-        self._job: _Job | None = None
+        self._waiting: collections.deque[_PendingRequest] = (
+            collections.deque()
+        )  # at most one of a kind
+        self._job: _PendingRequest | None = None
         self._scripts: dict[type[m.Message], Callable[[Any], Script]] = {
             m.GetStatus: self._get_status,
             m.Query: self._query,
@@ -174,7 +169,7 @@ class InSightMachine:
         }
 
     def adopt(self, dialect: Dialect) -> None:
-        """There is one dialect."""
+        """Do nothing: there is one dialect."""
 
     # ------------------------------------------------------------------ bytes in
 
@@ -189,7 +184,7 @@ class InSightMachine:
         return self._reader.pending
 
     def room(self) -> memoryview:
-        """Return where the next bytes may be written; call :meth:`filled` next."""
+        """Return the buffer for the next bytes; call :meth:`filled` next."""
         return self._store
 
     def filled(self, count: int, now: float = 0.0) -> bool:
@@ -210,14 +205,14 @@ class InSightMachine:
             self._read()
 
     def receive_eof(self) -> None:
-        """The camera will send no more; call :meth:`events` next."""
+        """Take note that the camera will send no more; call :meth:`events` next."""
         if self.state in {State.FAILED, State.CLOSED}:
             return
         self._events.append(LinkEnded(pending=self.buffered))
         self._end(State.CLOSED)
 
     def events(self) -> list[Event]:
-        """Return what came since the last call, in order; the caller owns the list."""
+        """Return the events since the last call, in order; the caller owns the list."""
         events, self._events = self._events, []
         return events
 
@@ -246,7 +241,7 @@ class InSightMachine:
             raise FrameError(f"{line[:64]!r} came, nothing was asked", data=line.encode(ENCODING))
 
     def _end(self, state: State) -> None:
-        """Nothing more is said or read."""
+        """Say and read nothing more."""
         self.state = state
         self._job = None
         self._waiting.clear()
@@ -283,13 +278,13 @@ class InSightMachine:
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
         elif kind not in {job.kind for job in (self._job, *self._waiting) if job is not None}:
-            self._waiting.append(_Job(kind, self._scripts[kind](message)))
+            self._waiting.append(_PendingRequest(kind, self._scripts[kind](message)))
             self._begin_next()
         elif kind is not m.GetStatus:
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
 
     def data_to_send(self) -> list[bytes]:
-        """Return what is to be written, in order."""
+        """Return the bytes to write, in order."""
         outbox, self._outbox = self._outbox, []
         return outbox
 
@@ -335,11 +330,7 @@ class InSightMachine:
             if line is None:
                 yield
             elif said and not said.startswith(WELCOME):
-                raise FrameError(
-                    f"{said[:64]!r} came, the greeting or the login of an In-Sight camera was "
-                    "expected",
-                    data=said.encode(ENCODING),
-                )
+                raise unexpected(said, "the greeting or the login of an In-Sight camera")
 
     # ------------------------------------------------------------------ scripts
 
@@ -348,7 +339,7 @@ class InSightMachine:
             self._job = self._waiting.popleft()
             self._go_on(self._job, None)
 
-    def _go_on(self, job: _Job, answer: Answer | None) -> None:
+    def _go_on(self, job: _PendingRequest, answer: CommandAnswer | None) -> None:
         """Let a script take an answer; write its next line, or begin the next script."""
         try:
             line = next(job.script) if answer is None else job.script.send(answer)
@@ -360,18 +351,15 @@ class InSightMachine:
         self._write(line)
 
     def _tell(self, message: m.Message) -> None:
-        self._events.append(message)
+        self._events.append(message)  # of the list that is there behind a yield
 
     def _get_status(self, _message: m.Message | None = None) -> Script:
         online = (yield "GO").text.strip()
         if online not in {"0", "1"}:
-            raise FrameError(
-                f"{online[:64]!r} came, 0 (offline) or 1 (online) was expected",
-                data=online.encode(ENCODING),
-            )
+            raise unexpected(online, "0 (offline) or 1 (online)")
         self._tell(m.StatusReport(status=ONLINE if online == "1" else Status(0)))
 
-    def _name_job(self) -> Generator[str, Answer, int]:
+    def _name_job(self) -> Generator[str, CommandAnswer, int]:
         """Return the active job's id.
 
         One without an id has none, and so has one that the camera does not name.
@@ -381,9 +369,7 @@ class InSightMachine:
             return m.UNNAMED_APPLICATION
         said = text.strip()
         if not said.isdecimal() or len(said) > 9 or int(said) > LAST_JOB_ID:
-            raise FrameError(
-                f"{said[:64]!r} came, the id of a job was expected", data=said.encode(ENCODING)
-            )
+            raise unexpected(said, "the id of a job")
         return int(said)
 
     def _query(self, _message: m.Message) -> Script:
@@ -441,7 +427,7 @@ class InSightMachine:
             )
         )
 
-    def _value(self, cell: str) -> Generator[str, Answer, str | None]:
+    def _value(self, cell: str) -> Generator[str, CommandAnswer, str | None]:
         """Return a cell's text, None for one that is empty or does not exist."""
         answer = yield f"GV{cell}"
         return answer.text if answer.code == StatusCode.DONE else None

@@ -16,21 +16,20 @@ from collections import namedtuple
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
-from smartcam.exceptions import ConfigurationError, InterpretationError, hex_excerpt
-from smartcam.layout.text import UNITS
+from smartcam.exceptions import ConfigurationError, hex_excerpt
+from smartcam.layout._text import UNITS, misfit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from typing import ClassVar, TypeAlias
 
-    from smartcam.layout.text import Field, Unit
+    from smartcam.exceptions import InterpretationError
+    from smartcam.layout._text import Field, Unit
     from smartcam.models import ByteOrder
 
     Convert: TypeAlias = Callable[[Any], Any]
     ConvertAll: TypeAlias = Callable[[Sequence[Any]], list[Any]]
     Rows: TypeAlias = Iterator[tuple[Any, ...]]
-
-__all__ = ["Payload", "Record", "RecordCodec", "check_names", "named", "record_class"]
 
 Payload = bytes | bytearray | memoryview
 """What a container's data comes as."""
@@ -151,14 +150,9 @@ class RecordCodec:
     def read(self, rows: Rows, payload: Payload, offset: int, *, what: str = "") -> list[Record]:
         """Return the records whose values on the wire are ``rows``.
 
-        Args:
-            rows: what :meth:`unpack` or :attr:`unpack_all` gives.
-            payload: where they come from.
-            offset: where the first of them begins.
-            what: tells a record in an error.
-
-        Raises:
-            InterpretationError: a byte that is no bool, or a text that is not UTF-8.
+        ``rows``: of :meth:`unpack` or :attr:`unpack_all`; the first is at ``offset``. ``what``
+        tells a record in an error. Raises InterpretationError: a byte that is no bool, or a text
+        that is not UTF-8.
         """
         if not self._converters:
             return list(map(self.make, rows))
@@ -175,8 +169,7 @@ class RecordCodec:
     def read_one(self, payload: Payload) -> Record:
         """Return the record at the start; the caller has checked that it is there.
 
-        Raises:
-            InterpretationError: as :meth:`read`.
+        Raises as :meth:`read`.
         """
         values: Sequence[Any] = self._struct.unpack_from(payload)
         if self._converters:
@@ -196,8 +189,7 @@ class RecordCodec:
     def write(self, values: Sequence[Any], what: str) -> bytes:
         """Return one record's bytes; ``values`` in the order of the fields.
 
-        Raises:
-            ConfigurationError: a value that does not fit its field; ``what`` tells the record.
+        Raises ConfigurationError: a value that does not fit its field; ``what`` tells the record.
         """
         wire: list[Any] = []
         for field, value in zip(self.fields, values, strict=True):
@@ -212,13 +204,9 @@ class RecordCodec:
     def take(self, value: object, what: str, forced: Mapping[str, Any]) -> list[Any]:
         """Return the values of one record in the order of the fields.
 
-        Args:
-            value: mapping, record, or sequence of the values in order.
-            what: tells the record in an error.
-            forced: values of some fields that go before those of ``value``.
-
-        Raises:
-            ConfigurationError: a field is missing, unknown, or there are too few or too many.
+        ``value``: mapping, record, or sequence of the values in order. ``what`` tells a record in
+        an error. ``forced``: values of some fields that go before those of ``value``. Raises
+        ConfigurationError: a field is missing, unknown, or there are too few or too many.
         """
         names = [field.name for field in self.fields]
         given = named(value, names, what)
@@ -241,15 +229,18 @@ class RecordCodec:
                 except (KeyError, UnicodeDecodeError) as exc:
                     at = start + self.offsets[index]
                     where = f"{what} {number}: " if what else ""
-                    return _bad_value(self.fields[index], where, at, value, exc)
+                    if isinstance(exc, UnicodeDecodeError):
+                        got = f"{hex_excerpt(value)} ({exc.reason})"
+                        return misfit(self.fields[index], at + exc.start, "UTF-8 text", got, where)
+                    expected, got = "0x00 or 0xFF for a bool", f"0x{value:02X}"
+                    return misfit(self.fields[index], at, expected, got, where)
         raise AssertionError("the fast way failed and the slow way did not")
 
 
 def named(value: object, names: Sequence[str], what: str) -> dict[str, Any]:
     """Return a mapping's, a record's or a sequence's values by name.
 
-    Raises:
-        ConfigurationError: it is none of these, or a sequence of another length.
+    Raises ConfigurationError: it is none of these, or a sequence of another length.
     """
     given: Any = value
     if isinstance(value, Mapping):
@@ -280,23 +271,6 @@ def check_names(given: Mapping[str, Any], names: Sequence[str], what: str) -> No
     )
 
 
-def _bad_value(
-    field: Field, where: str, offset: int, value: Any, exc: Exception
-) -> InterpretationError:
-    if isinstance(exc, UnicodeDecodeError):
-        offset += exc.start
-        expected, got = "UTF-8 text", f"{hex_excerpt(value)} ({exc.reason})"
-    else:
-        expected, got = "0x00 or 0xFF for a bool", f"0x{value:02X}"
-    return InterpretationError(
-        f"{where}{field.label} at offset {offset}: expected {expected}, got {got}",
-        field=field.name,
-        offset=offset,
-        expected=expected,
-        got=got,
-    )
-
-
 def _offsets(fields: tuple[Field, ...]) -> list[int]:
     offsets: list[int] = []
     at = 0
@@ -307,7 +281,7 @@ def _offsets(fields: tuple[Field, ...]) -> list[int]:
 
 
 def _converters(field: Field, *, lenient: bool) -> tuple[Convert, ConvertAll] | None:
-    """Return what turns one value of the wire into a value, and what turns a column of them.
+    """Return the converters of one value of the wire, and of a column of them.
 
     None where they are the same. A comprehension takes a third of the time of a function call for
     each value.
@@ -335,7 +309,7 @@ def _text(raw: bytes) -> str:
 
 
 def _to_wire(field: Field, value: Any) -> Any:
-    """Return what ``struct`` packs; ValueError, TypeError or ArithmeticError where it cannot be."""
+    """Return the value that ``struct`` packs; ValueError, TypeError or ArithmeticError without."""
     if field.type == "bool":
         if value not in (True, False):
             raise ValueError("not a bool")

@@ -1,8 +1,8 @@
 """What a protocol is made of: dialects, roles with their policies, the entry point.
 
 A :class:`Dialect` is one wire variant as the client knows it, whatever its frames look like;
-``framed.py`` has the one of binary frames. Who may do what with broken input is a :class:`Policy`,
-chosen by role and transport.
+``framed/dialect.py`` has the one of binary frames. Who may do what with broken input is a
+:class:`Policy`, chosen by role and transport.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import enum
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, FrameError, MessageError, UnsupportedError
 from smartcam.protocols.messages import Message, Request, Sender, StatusReport, wire_fields
@@ -20,24 +20,10 @@ if TYPE_CHECKING:
 
     from smartcam.exceptions import RemoteProtocolError
     from smartcam.models import Capabilities
-    from smartcam.protocols.framed.framing import Frame
-    from smartcam.protocols.framed.machine import LinkMachine
+    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols._framed.machine import LinkMachine
 
     MachineFactory = Callable[..., LinkMachine]
-
-__all__ = [
-    "POLICIES",
-    "UNDOCUMENTED",
-    "Code",
-    "Dialect",
-    "Policy",
-    "Protocol",
-    "RawRequest",
-    "Role",
-    "Spelled",
-    "Transport",
-    "Verdict",
-]
 
 
 class Role(enum.Enum):
@@ -69,8 +55,8 @@ class Policy:
     """What one role does with broken input.
 
     Attributes:
-        fatal: which errors end the link: :exc:`~smartcam.exceptions.FrameError` for bytes that
-            make no frame, :exc:`~smartcam.exceptions.MessageError` for a short body or a message
+        fatal: which errors end the link: :exc:`~smartcam.FrameError` for bytes that
+            make no frame, :exc:`~smartcam.MessageError` for a short body or a message
             at the wrong time. Others are dropped and counted.
         exact_length: a known message must have exactly its documented length; otherwise a longer
             body is accepted and counted.
@@ -107,14 +93,14 @@ class Verdict(enum.Enum):
     REFUSED = "refused"
 
 
-class Code(NamedTuple):
+class CodeMeaning(NamedTuple):
     """What a result code means: in words, and what it says of the request."""
 
     text: str
     verdict: Verdict
 
 
-UNDOCUMENTED = Code("not documented", Verdict.REFUSED)
+UNDOCUMENTED = CodeMeaning("not documented", Verdict.REFUSED)
 """What a result code means that no document has."""
 
 
@@ -158,21 +144,26 @@ class Dialect(ABC):
         name: as in ``?dialect=``.
         about: one line for people.
         source: where it is described, with its grade.
+        quirks: names of the deviations from the dialect that this one has, as in ``?quirks=``.
     """
 
     name: str
     about: str
     source: str
+    quirks: tuple[str, ...] = ()
 
-    @property
-    def quirks(self) -> tuple[str, ...]:
-        """Names of the deviations from the dialect that this one has, as in ``?quirks=``."""
-        return ()
+    in_order: ClassVar[bool] = False
+    """Whether the camera does one thing after the other: when a request is answered, all that was
+    asked for before it is over, its result included."""
+    exclusive: ClassVar[bool] = True
+    """Whether the camera serves one client, and a newcomer takes it."""
+    has_login: ClassVar[bool] = False
+    """Whether a session that is refused is refused for good: a wrong password stays wrong."""
 
     @property
     def label(self) -> str:
         """Name and quirks, for people."""
-        return " with quirk ".join((self.name, *([", ".join(self.quirks)] if self.quirks else [])))
+        return f"{self.name} with quirk {', '.join(self.quirks)}" if self.quirks else self.name
 
     @property
     @abstractmethod
@@ -184,31 +175,13 @@ class Dialect(ABC):
     def application_ids(self) -> range:
         """The ids that applications may have."""
 
-    @property
-    def in_order(self) -> bool:
-        """Whether the camera does one thing after the other.
-
-        When a request is answered, all that was asked for before it is over, its result included.
-        """
-        return False
-
-    @property
-    def exclusive(self) -> bool:
-        """Whether the camera serves one client, and a newcomer takes it."""
-        return True
-
-    @property
-    def has_login(self) -> bool:
-        """Whether a session that is refused is refused for good: a wrong password stays wrong."""
-        return False
-
     @abstractmethod
-    def code(self, code: int, request: type[Message] | None = None) -> Code:
-        """Return what a result code means in the answer to a request."""
+    def code(self, code: int, request: type[Message] | None = None) -> CodeMeaning:
+        """Return the meaning of a result code in the answer to a request."""
 
     @abstractmethod
     def has(self, message_type: type[Message]) -> bool:
-        """Whether there is such a message."""
+        """Return whether there is such a message."""
 
     @abstractmethod
     def message_id(self, message: Message | type[Message]) -> int:
@@ -219,11 +192,11 @@ class Dialect(ABC):
         """
 
     def called(self, message: Message) -> str:
-        """Return what an error calls a message: its name, and its id or command."""
+        """Return a message's name for errors, with its id or command."""
         return f"{type(message).__name__} ({self.message_id(message):#04x})"
 
     def answers(self, request: type[Request]) -> bool:
-        """Whether the camera answers such a request."""
+        """Return whether the camera answers such a request."""
         return request.answer is not None and self.has(request.answer)
 
     def fields(self, message_type: type[Message]) -> tuple[str, ...]:
@@ -317,7 +290,7 @@ class Protocol:
         quirks: Iterable[str] = (),
         parameters: Mapping[str, str] | None = None,
     ) -> list[tuple[Dialect, ...]]:
-        """Return what to try, each on a fresh link: dialects that begin a session alike.
+        """Return the dialects to try: each group, which begins a session alike, on a fresh link.
 
         Args:
             transport: what carries them.

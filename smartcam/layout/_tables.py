@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.layout.text import UNITS
+from smartcam.layout._text import UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.layout.codec import Payload, RecordCodec
-    from smartcam.layout.text import Field
+    from smartcam.layout._codec import Payload, RecordCodec
+    from smartcam.layout._text import Field
     from smartcam.models import ByteOrder
-
-__all__ = ["TableCodec"]
 
 Rows = np.ndarray[tuple[int], np.dtype[np.void]]
 
@@ -40,8 +38,8 @@ class TableCodec:
     def __init__(self, codec: RecordCodec, byte_order: ByteOrder) -> None:
         fields = codec.fields
         self._codec = codec
-        self.dtype: np.dtype[np.void] = _wire_dtype(fields, byte_order)
-        self._native = _table_dtype(fields)
+        self.dtype: np.dtype[np.void] = _dtype(fields, byte_order)
+        self._native = _dtype(fields, sys.byteorder, converted=True)
         self._columns = [(field.name, _converter(field)) for field in fields]
         self._bools = [field.name for field in fields if field.type == "bool" and not codec.lenient]
         self._converts = any(field.type == "bool" or field.unit is not None for field in fields)
@@ -50,14 +48,8 @@ class TableCodec:
     def read(self, payload: Payload, offset: int, count: int, *, what: str) -> Rows:
         """Return ``count`` records from ``offset`` on: a view where it can be, read-only.
 
-        Args:
-            payload: the container; the caller has checked that the records are there.
-            offset: where the first record begins.
-            count: number of records.
-            what: tells a record in an error.
-
-        Raises:
-            InterpretationError: a byte is no bool.
+        The caller has checked that the ``payload`` has them. ``what`` tells a record in an error.
+        Raises InterpretationError: a byte is no bool.
         """
         dtype = self.dtype
         # numpy refuses an empty buffer
@@ -81,24 +73,19 @@ class TableCodec:
         return rows
 
 
-def _wire_dtype(fields: tuple[Field, ...], byte_order: ByteOrder) -> np.dtype[np.void]:
+def _dtype(
+    fields: tuple[Field, ...], byte_order: ByteOrder, *, converted: bool = False
+) -> np.dtype[np.void]:
+    """Return the dtype of a record on the wire, or in a table, where fields are converted."""
     order = "<" if byte_order == "little" else ">"
-    return np.dtype(
-        [(field.name, f"{order}{field.wire.numpy}{field.length or ''}") for field in fields],
-        align=False,
-    )
-
-
-def _table_dtype(fields: tuple[Field, ...]) -> np.dtype[np.void]:
-    order = "<" if sys.byteorder == "little" else ">"
     columns: list[tuple[str, str]] = []
     for field in fields:
-        if field.type == "bool":
-            columns.append((field.name, "?"))
-        elif field.unit is not None:
-            columns.append((field.name, f"{order}f8"))
-        else:
-            columns.append((field.name, f"{order}{field.wire.numpy}{field.length or ''}"))
+        column = f"{order}{field.wire.numpy}{field.length or ''}"
+        if converted and field.type == "bool":
+            column = "?"
+        elif converted and field.unit is not None:
+            column = f"{order}f8"
+        columns.append((field.name, column))
     return np.dtype(columns, align=False)
 
 
@@ -107,7 +94,7 @@ def _all_bools(column: np.ndarray[Any, Any]) -> bool:
 
 
 def _converter(field: Field) -> Callable[[Any], Any] | None:
-    """Return what makes a column of values of the wire's, None where copying does it."""
+    """Return the converter of a column of the wire's values, None where copying does it."""
     if field.type == "bool":
         return lambda wire: wire != 0
     if field.unit is None:

@@ -13,15 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import construct as c
 
 from smartcam.exceptions import MessageError, hex_excerpt
-from smartcam.protocols.base import Verdict
+from smartcam.protocols._base import Verdict
 from smartcam.protocols.messages import Wire
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
+    from smartcam.protocols._framed.dialect import FramedDialect
     from smartcam.protocols.messages import Sender
-
-__all__ = ["FieldView", "frame_view", "view_fields"]
-
 
 # what a body is longer than documented
 _SURPLUS: Any = c.Default(c.RawCopy(c.GreedyBytes), {"value": b""})
@@ -86,8 +83,7 @@ def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
 def view_fields(dialect: FramedDialect, sender: Sender, data: bytes) -> list[FieldView]:
     """Return every field of one complete frame, in order; bytes behind them as ``surplus``.
 
-    Raises:
-        MessageError: it is no complete frame of this dialect from this sender.
+    Raises MessageError: it is no complete frame of this dialect from this sender.
     """
     try:
         parsed = frame_view(dialect, sender).parse(data)

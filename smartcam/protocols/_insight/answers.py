@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.exceptions import FrameError
-from smartcam.protocols.insight.words import (
+from smartcam.protocols._insight.words import (
     ENCODING,
     INFO_LINES,
     AnswerForm,
@@ -17,8 +17,6 @@ from smartcam.protocols.insight.words import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
 
-__all__ = ["MAX_IMAGE", "Answer", "AnswerReader"]
-
 MAX_IMAGE = 1 << 26
 """Bytes of an image that are accepted: 20 million pixels of three bytes, and then some."""
 
@@ -26,7 +24,7 @@ _BMP_MAGIC = b"BM"
 _BMP_SIZE_AT = slice(2, 6)  # of the file, UINT32 little endian
 
 
-class Answer(NamedTuple):
+class CommandAnswer(NamedTuple):
     """One answer.
 
     Attributes:
@@ -40,8 +38,10 @@ class Answer(NamedTuple):
     data: bytes = b""
 
 
-class AnswerReader:
+class AnswerReader(LineReader):
     """Cuts answers from a stream; each has the form that its command says.
+
+    Who feeds it reads until nothing is left to be read; then no more than a line waits.
 
     Args:
         max_length: longest text of an answer that says its length, bytes.
@@ -49,33 +49,19 @@ class AnswerReader:
     """
 
     def __init__(self, *, max_length: int, on_piece: Callable[[str, bool], None]) -> None:
-        self._lines = LineReader()
+        super().__init__()
         self._max_length = max_length
         self._on_piece = on_piece
-        self._reading: Generator[None, None, Answer] | None = None
-
-    def __len__(self) -> int:
-        """Bytes that wait."""
-        return len(self._lines)
-
-    @property
-    def pending(self) -> bytes:
-        """Copy of those bytes."""
-        return self._lines.pending
-
-    def feed(self, data: bytes) -> None:
-        """Take what came; read until nothing is left to be read, then no more than a line waits."""
-        self._lines.feed(data)
+        self._reading: Generator[None, None, CommandAnswer] | None = None
 
     def expect(self, form: AnswerForm) -> None:
-        """The next answer has this form."""
+        """Read the next answer in this form."""
         self._reading = self._read(form)
 
-    def next_answer(self) -> Answer | None:
+    def next_answer(self) -> CommandAnswer | None:
         """Return the expected answer, None if it is not all there yet.
 
-        Raises:
-            FrameError: what came is no such answer; the stream cannot be read on.
+        Raises FrameError: what came is no such answer; the stream cannot be read on.
         """
         if self._reading is None:
             return None
@@ -83,46 +69,42 @@ class AnswerReader:
             next(self._reading)
         except StopIteration as stop:
             self._reading = None
-            answer: Answer = stop.value
+            answer: CommandAnswer = stop.value
             return answer
         return None
 
     def next_line(self) -> str | None:
-        """Return the next line, None if no whole one is there.
-
-        Raises:
-            FrameError: it is too long.
-        """
-        line = self._lines.next_line()
+        """Return the next line as :meth:`LineReader.next_line`, and tell of it."""
+        line = super().next_line()
         if line is not None:
             self._on_piece(line, True)
         return line
 
     def take_prompt(self, prompt: bytes) -> bool:
-        """Take a prompt, which has no line end, if it is what comes next and all of it is there."""
-        taken = self._lines.take_prompt(prompt)
+        """Take a prompt as :meth:`LineReader.take_prompt`, and tell of it."""
+        taken = super().take_prompt(prompt)
         if taken:
             self._on_piece(prompt.decode(ENCODING), False)
         return taken
 
     # ------------------------------------------------------------------ forms
 
-    def _read(self, form: AnswerForm) -> Generator[None, None, Answer]:
+    def _read(self, form: AnswerForm) -> Generator[None, None, CommandAnswer]:
         first = yield from self._line()
         if form is AnswerForm.BARE:
-            return Answer(StatusCode.DONE, first)
+            return CommandAnswer(StatusCode.DONE, first)
         code = _number(first, "a status code")
         if code != StatusCode.DONE or form is AnswerForm.CODE:
-            return Answer(code)
+            return CommandAnswer(code)
         if form is AnswerForm.HEX:
-            return Answer(code, data=(yield from self._image()))
+            return CommandAnswer(code, data=(yield from self._image()))
         if form is AnswerForm.SIZED:
-            return Answer(code, (yield from self._sized()))
+            return CommandAnswer(code, (yield from self._sized()))
         lines: list[str] = []
         for _ in range(INFO_LINES if form is AnswerForm.INFO else 1):
             line = yield from self._line()
             lines.append(line)
-        return Answer(code, "\n".join(lines))
+        return CommandAnswer(code, "\n".join(lines))
 
     def _line(self) -> Generator[None, None, str]:
         while (line := self.next_line()) is None:
@@ -133,7 +115,7 @@ class AnswerReader:
         size = _number((yield from self._line()), "a length")
         if not 0 <= size <= self._max_length:
             raise FrameError(f"a text of {size} bytes comes; 0 to {self._max_length} are accepted")
-        while (data := self._lines.take(size)) is None:
+        while (data := self.take(size)) is None:
             yield
         text = data.decode(ENCODING)
         self._on_piece(text, False)
@@ -178,7 +160,12 @@ def _bitmap_size(data: bytearray) -> int:
 def _number(line: str, what: str) -> int:
     text = line.strip()
     if not text.removeprefix("-").isdecimal() or not text.isascii() or len(text) > 12:
-        raise FrameError(
-            f"{line[:64]!r} came, {what} was expected", data=line.encode(ENCODING, "replace")
-        )
+        raise unexpected(line, what)
     return int(text)
+
+
+def unexpected(line: str, expected: str) -> FrameError:
+    """Return the error of a line that came where something else was expected."""
+    return FrameError(
+        f"{line[:64]!r} came, {expected} was expected", data=line.encode(ENCODING, "replace")
+    )

@@ -8,17 +8,6 @@ from typing import Any
 
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 
-__all__ = [
-    "MAX_NODES",
-    "MAX_YAML_TEXT",
-    "YAML_ALSO_RAISES",
-    "BadYamlError",
-    "compose",
-    "construct",
-    "load",
-    "yaml_module",
-]
-
 MAX_YAML_TEXT = 1 << 23
 """Characters of a YAML document: a container of 1 MiB as hex takes a quarter."""
 
@@ -46,30 +35,24 @@ class BadYamlError(ConfigurationError):
         self.line = line
 
 
-def load(text: str, *, what: str = "YAML", extra: str = "yaml") -> Any:
+def load(text: str, *, what: str = "YAML") -> Any:
     """Return the data of a document; None for an empty one.
 
-    Args:
-        text: the document.
-        what: what needs PyYAML, for the error.
-        extra: the extra that brings it.
-
-    Raises:
-        BadYamlError: it is no YAML, or goes beyond a bound.
-        MissingExtraError: PyYAML is not installed.
+    ``what``: what needs PyYAML, for the error. Raises BadYamlError: it is no YAML, or goes beyond a
+    bound; MissingExtraError: PyYAML is not installed.
     """
-    root = compose(text, what=what, extra=extra)
+    root = compose(text, what=what)
     return None if root is None else construct(root)
 
 
-def compose(text: str, *, what: str = "YAML", extra: str = "yaml") -> Any:
+def compose(text: str, *, what: str = "YAML") -> Any:
     """Return the node that a document is, which :func:`construct` makes data of; None: empty.
 
     Raises:
         BadYamlError: it is no YAML, or goes beyond a bound.
         MissingExtraError: PyYAML is not installed.
     """
-    yaml = yaml_module(what, extra)
+    yaml = yaml_module(what)
     if len(text) > MAX_YAML_TEXT:
         raise BadYamlError(f"{len(text)} characters, expected {MAX_YAML_TEXT} at most")
     try:
@@ -81,10 +64,9 @@ def compose(text: str, *, what: str = "YAML", extra: str = "yaml") -> Any:
 def construct(root: Any) -> Any:
     """Return the data of a node that :func:`compose` gave.
 
-    Raises:
-        BadYamlError: its aliases stand for too much, or a value cannot be what its tag says.
+    Raises BadYamlError: its aliases stand for too much, or a value cannot be what its tag says.
     """
-    yaml = yaml_module("YAML", "yaml")
+    yaml = yaml_module("YAML")
     loader = _loader(yaml)("")
     try:
         _count(root, {})
@@ -95,18 +77,14 @@ def construct(root: Any) -> Any:
         loader.dispose()
 
 
-def yaml_module(what: str, extra: str = "yaml") -> Any:
-    """Return PyYAML.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+def yaml_module(what: str) -> Any:
+    """Return PyYAML; MissingExtraError: it is not installed."""
     try:
         return importlib.import_module("yaml")
     except ImportError as exc:
         raise MissingExtraError(
-            f'{what} needs PyYAML, which is not installed: pip install "smartcam[{extra}]"',
-            extra=extra,
+            f'{what} needs PyYAML, which is not installed: pip install "smartcam[yaml]"',
+            extra="yaml",
         ) from exc
 
 
@@ -120,18 +98,10 @@ def _told(exc: Exception) -> BadYamlError:
     return BadYamlError(text, line=None if mark is None else mark.line + 1)
 
 
-def _too_much(node: Any) -> BadYamlError:
-    return BadYamlError(
-        f"expected {MAX_NODES} values at most, aliases counted with all that they stand for",
-        line=node.start_mark.line + 1,
-    )
-
-
 def _count(node: Any, known: dict[int, int]) -> int:
-    """Return how many values a node stands for, the aliases in it written out.
+    """Return the number of values that a node stands for, the aliases in it written out.
 
-    Raises:
-        BadYamlError: too many, or it contains itself.
+    Raises BadYamlError: too many, or it contains itself.
     """
     if node.id == "scalar":
         return 1
@@ -147,7 +117,11 @@ def _count(node: Any, known: dict[int, int]) -> int:
         for child in children:
             found += _count(child, known)
             if found > MAX_NODES:
-                raise _too_much(child)
+                raise BadYamlError(
+                    f"expected {MAX_NODES} values at most, aliases counted with all that they "
+                    "stand for",
+                    line=child.start_mark.line + 1,
+                )
         known[id(node)] = found
     return found
 

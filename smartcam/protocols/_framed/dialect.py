@@ -22,8 +22,15 @@ from smartcam.exceptions import (
 )
 from smartcam.models import Capabilities, Status, as_status, jsonable
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import UNDOCUMENTED, Code, Dialect, RawRequest, Spelled, Verdict
-from smartcam.protocols.framed.framing import Buffer, Frame, HeaderLayout
+from smartcam.protocols._base import (
+    UNDOCUMENTED,
+    CodeMeaning,
+    Dialect,
+    RawRequest,
+    Spelled,
+    Verdict,
+)
+from smartcam.protocols._framed.framing import Buffer, Frame, HeaderLayout
 from smartcam.protocols.messages import (
     Acknowledgement,
     ConnectAnswer,
@@ -40,8 +47,6 @@ from smartcam.protocols.messages import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-
-__all__ = ["Codec", "FramedDialect", "MessageRow", "StatusBits", "WireQuirk"]
 
 
 class MessageRow(NamedTuple):
@@ -181,11 +186,11 @@ class Codec:
         return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS + 1)
 
     def fits(self, size: int) -> bool:
-        """Whether a body has the documented length."""
+        """Return whether a body has the documented length."""
         return size >= self.size if self.has_data else size == self.size
 
     def _refuses(self, payload: bytes) -> bool:
-        """Whether a body that is too short is a result code that is not good."""
+        """Return whether a body that is too short is a result code that is not good."""
         code = self._code
         if code is None or len(payload) != code.size:
             return False
@@ -202,10 +207,8 @@ class Codec:
     def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
         """Return the message whose body is at a place; bytes behind it are ignored.
 
-        An answer that is nothing but a refusing code is taken as such: the rest is 0.
-
-        Raises:
-            MessageError: the body is shorter than its message.
+        An answer that is nothing but a refusing code is taken as such: the rest is 0. Raises
+        MessageError: the body is shorter than its message.
         """
         if end - begin < self.size:
             payload = bytes(buffer[begin:end])
@@ -259,7 +262,7 @@ class WireQuirk(NamedTuple):
     about: str
     source: str
     rows: tuple[MessageRow, ...]
-    codes: Mapping[int, Code] | None = None
+    codes: Mapping[int, CodeMeaning] | None = None
 
 
 _ABILITIES: Mapping[str, type[Message]] = {
@@ -277,9 +280,9 @@ _ABILITIES: Mapping[str, type[Message]] = {
 }
 """The message that each ability rests on."""
 
-SWITCH_CODES: Mapping[int, Code] = {
-    0: Code("done", Verdict.DONE),
-    1: Code("id invalid", Verdict.REFUSED),
+SWITCH_CODES: Mapping[int, CodeMeaning] = {
+    0: CodeMeaning("done", Verdict.DONE),
+    1: CodeMeaning("id invalid", Verdict.REFUSED),
 }
 """What the answer to a switch says where no other has a code (SC manual p. 34, published)."""
 
@@ -289,9 +292,7 @@ class FramedDialect(Dialect):
     """A dialect of binary frames, as data.
 
     Args:
-        name: as in ``?dialect=``.
-        about: one line for people.
-        source: where it is described, with its grade.
+        name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
         header: what a frame's header looks like.
         word: ``struct`` code of the bodies' ordinary integers: ``I`` or ``H``.
         table: its messages.
@@ -299,24 +300,21 @@ class FramedDialect(Dialect):
         codes: what the codes of its answers mean.
         status_by_itself: the status comes with the session and at every change.
         wire_quirks: deviations by their names.
-        applied: names of those that this one has.
     """
 
     header: HeaderLayout
     word: Literal["I", "H"]
     table: tuple[MessageRow, ...]
     status_bits: StatusBits = StatusBits()
-    codes: Mapping[int, Code] = field(default_factory=lambda: SWITCH_CODES)
+    codes: Mapping[int, CodeMeaning] = field(default_factory=lambda: SWITCH_CODES)
     status_by_itself: bool = True
     wire_quirks: Mapping[str, WireQuirk] = field(default_factory=dict[str, WireQuirk])
-    applied: tuple[str, ...] = ()
     _encoders: dict[type[Message], Codec] = field(
         init=False, repr=False, default_factory=dict[type[Message], Codec]
     )
-    _decoders: dict[tuple[Sender, int], Codec] = field(
-        init=False, repr=False, default_factory=dict[tuple[Sender, int], Codec]
+    _decoders: dict[Sender, dict[int, Codec]] = field(
+        init=False, repr=False, default_factory=lambda: {sender: {} for sender in Sender}
     )
-
     _answers: dict[int, int | None] = field(
         init=False, repr=False, default_factory=dict[int, int | None]
     )
@@ -332,7 +330,7 @@ class FramedDialect(Dialect):
         for row in self.table:
             codec = Codec(row, self)
             self._encoders[row.type] = codec
-            self._decoders[row.type.sender, row.message_id] = codec
+            self._decoders[row.type.sender][row.message_id] = codec
         for row in self.table:
             if issubclass(row.type, Request):
                 answer = self._encoders.get(row.type.answer) if row.type.answer else None
@@ -342,25 +340,20 @@ class FramedDialect(Dialect):
                 frame = self.encode(row.type())
                 self.constant[row.type] = frame, row.message_id, self.answer_id(row.message_id)
 
-    @property
-    def quirks(self) -> tuple[str, ...]:
-        """Names of the deviations from the dialect that this one has, as in ``?quirks=``."""
-        return self.applied
-
     def with_quirks(self, names: Iterable[str]) -> FramedDialect:
         """Return the dialect with these deviations, always the same one for the same names.
 
         Raises:
             ConfigurationError: it knows no such deviation.
         """
-        key = tuple(sorted({*names, *self.applied}))
+        key = tuple(sorted({*names, *self.quirks}))
         unknown = [name for name in key if name not in self.wire_quirks]
         if unknown:
             known = ", ".join(self.wire_quirks) or "none"
             raise ConfigurationError(
                 f"dialect {self.name} has no quirk {unknown[0]!r}; it has {known}"
             )
-        if key == self.applied:
+        if key == self.quirks:
             return self
         variant = self._variants.get(key)
         if variant is None:
@@ -371,7 +364,7 @@ class FramedDialect(Dialect):
                 self,
                 table=tuple(other.get(row.type, row) for row in self.table),
                 codes=codes[0] if codes else self.codes,
-                applied=key,
+                quirks=key,
             )
             object.__setattr__(variant, "_variants", self._variants)  # one for all of them
         return variant
@@ -397,12 +390,12 @@ class FramedDialect(Dialect):
         """The ids that applications may have: 0 is not allowed (SC manual p. 34, published)."""
         return range(1, 1 << 8 * struct.calcsize("<" + self.word))
 
-    def code(self, code: int, request: type[Message] | None = None) -> Code:
-        """Return what a result code means; one that is not documented refuses."""
+    def code(self, code: int, request: type[Message] | None = None) -> CodeMeaning:
+        """Return the meaning of a result code; one that is not documented refuses."""
         return self.codes.get(code, UNDOCUMENTED)
 
     def has(self, message_type: type[Message]) -> bool:
-        """Whether there is such a message."""
+        """Return whether there is such a message."""
         return message_type in self._encoders
 
     def fields(self, message_type: type[Message]) -> tuple[str, ...]:
@@ -473,11 +466,11 @@ class FramedDialect(Dialect):
 
     def message_type(self, sender: Sender, message_id: int) -> type[Message]:
         """Return the message with this id from this sender, :class:`UnknownMessage` if none."""
-        codec = self._decoders.get((sender, message_id))
+        codec = self.decoders(sender).get(message_id)
         return codec.type if codec is not None else UnknownMessage
 
     def encoder(self, message_type: type[Message]) -> Codec:
-        """Return what encodes a message.
+        """Return the codec of a message.
 
         Raises:
             UnsupportedError: the dialect has no such message.
@@ -488,20 +481,16 @@ class FramedDialect(Dialect):
         return codec
 
     def decoders(self, sender: Sender) -> dict[int, Codec]:
-        """Return what decodes the messages of one sender, by their ids."""
-        return {
-            row.message_id: self._encoders[row.type]
-            for row in self.table
-            if row.type.sender is sender
-        }
+        """Return the codecs of one sender's messages, by their ids."""
+        return self._decoders[sender]
 
     def lengths(self, sender: Sender) -> dict[int, range]:
         """Return the lengths that the bodies of one sender's messages may have, by their ids."""
         return {number: codec.lengths for number, codec in self.decoders(sender).items()}
 
     def knows(self, sender: Sender, message_id: int) -> bool:
-        """Whether there is a message with this id from this sender."""
-        return (sender, message_id) in self._decoders
+        """Return whether there is a message with this id from this sender."""
+        return message_id in self.decoders(sender)
 
     def answer_id(self, request_id: int) -> int | None:
         """Return the id of the answer to a request, None if the camera never answers it.
@@ -545,8 +534,8 @@ class FramedDialect(Dialect):
         return self.encode_frame(self.to_frame(message)) if constant is None else constant[0]
 
     def surplus(self, sender: Sender, frame: Frame) -> int:
-        """Return how many bytes a known message's body is longer than documented."""
-        codec = self._decoders.get((sender, frame.message_id))
+        """Return the number of bytes that a known message's body is longer than documented."""
+        codec = self.decoders(sender).get(frame.message_id)
         if codec is None or codec.has_data:
             return 0
         return len(frame.payload) - codec.size
@@ -557,7 +546,7 @@ class FramedDialect(Dialect):
         Raises:
             MessageError: the body is shorter than its message.
         """
-        codec = self._decoders.get((sender, frame.message_id))
+        codec = self.decoders(sender).get(frame.message_id)
         if codec is None:
             return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
         return codec.decode(frame.payload, 0, len(frame.payload))

@@ -27,25 +27,11 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.layout import Layout
-from smartcam.layout.text import TYPES
+from smartcam.layout._text import TYPES
 from smartcam.registry import INTERPRETERS
 
 if TYPE_CHECKING:
     from smartcam.models import ByteOrder
-
-__all__ = [
-    "Context",
-    "Function",
-    "Interpreter",
-    "PlainInterpreter",
-    "Reader",
-    "Spec",
-    "plain",
-    "resolve",
-    "run",
-    "run_plain",
-    "run_sequence",
-]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -234,7 +220,7 @@ class Interpreter(ABC):
     """Whether a layout may or must be given."""
 
     def __init__(self, layout: Layout | None = None) -> None:
-        name = type(self).__name__.lower()
+        name = type(self).__name__.removesuffix("Interpreter").lower()
         if layout is not None and self.layout_use == "none":
             raise ConfigurationError(f"interpreter {name}: expected no layout, got '{layout}'")
         if layout is None and self.default_layout is not None:
@@ -272,7 +258,7 @@ class PlainInterpreter(Interpreter):
     """
 
     def __init_subclass__(cls) -> None:
-        """A class whose :meth:`read` is newer than its :meth:`read_all` does not inherit that."""
+        """Replace an inherited :meth:`read_all` that is older than the class's :meth:`read`."""
         read, read_all = (
             next(place for place, base in enumerate(cls.__mro__) if name in vars(base))
             for name in ("read", "read_all")
@@ -301,7 +287,7 @@ class PlainInterpreter(Interpreter):
         return values
 
     def interpret(self, reader: Reader) -> object:
-        """Return what :meth:`read` returns."""
+        """Return the value of a container by :meth:`read`."""
         return self.read(reader.data, reader.context)
 
 
@@ -320,7 +306,7 @@ class _FunctionInterpreter(Interpreter):
         self._function = function
 
     def interpret(self, reader: Reader) -> object:
-        """Return what the function returns."""
+        """Return the value of a container by the function."""
         return self._function(reader)
 
     def __repr__(self) -> str:
@@ -328,7 +314,7 @@ class _FunctionInterpreter(Interpreter):
 
 
 def run(interpreter: Interpreter, reader: Reader) -> object:
-    """Return what ``interpreter`` makes of a container.
+    """Return the value of a container by an interpreter.
 
     Whatever an interpreter raises comes out as an InterpretationError, so a slip in somebody's
     plug-in is an outcome like any other.
@@ -366,7 +352,7 @@ def plain(interpreter: Interpreter) -> PlainInterpreter | None:
 
 
 def run_plain(interpreter: PlainInterpreter, data: bytes, context: Context) -> object:
-    """Return what :func:`run` returns; raises as :func:`run`."""
+    """Return the value of a container by a plain interpreter; raises as :func:`run`."""
     try:
         return interpreter.read(data, context)
     except InterpretationError:
@@ -398,33 +384,34 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
         ConfigurationError: the interpreter needs a layout, or takes none.
     """
     if spec is None:
-        return _make("raw", INTERPRETERS.load("raw"), None, lenient=lenient)
-    if isinstance(spec, str):
-        return _resolve_text(spec, lenient=lenient)
-    if isinstance(spec, Layout):
+        name, layout = "raw", None
+    elif isinstance(spec, str):
+        name, layout = _split_text(spec, lenient=lenient)
+    elif isinstance(spec, Layout):
+        name = "record"
         layout = Layout(spec.text, lenient=True) if lenient and not spec.lenient else spec
-        return _make("record", INTERPRETERS.load("record"), layout, lenient=lenient)
-    return _make(getattr(spec, "__name__", repr(spec)), spec, None, lenient=lenient)
+    else:
+        return _make(getattr(spec, "__name__", repr(spec)), spec, None, lenient=lenient)
+    return _make(name, INTERPRETERS.load(name), layout, lenient=lenient)
 
 
-def _resolve_text(spec: str, *, lenient: bool) -> Interpreter:
+def _split_text(spec: str, *, lenient: bool) -> tuple[str, Layout | None]:
+    """Return the interpreter's name and the layout of a text."""
     head, colon, rest = spec.partition(":")
     name = head.strip()
     if not colon and "(" not in spec:
-        return _make(name, INTERPRETERS.load(name), None, lenient=lenient)
+        return name, None
     if colon and name in INTERPRETERS and not _is_type(rest):
-        layout = Layout(spec, lenient=lenient, start=len(head) + 1)
-        return _make(name, INTERPRETERS.load(name), layout, lenient=lenient)
+        return name, Layout(spec, lenient=lenient, start=len(head) + 1)
     _check_name(spec, name, rest)
-    layout = Layout(spec, lenient=lenient)
-    return _make("record", INTERPRETERS.load("record"), layout, lenient=lenient)
+    return "record", Layout(spec, lenient=lenient)
 
 
 _FIRST_WORD = re.compile(r"\s*([^\W\d]\w*)\s*(:?)")
 
 
 def _is_type(rest: str) -> bool:
-    """Whether a field's type comes: ``table: int32`` is a field that is named ``table``."""
+    """Return whether a field's type comes: ``table: int32`` is a field that is named ``table``."""
     word = _FIRST_WORD.match(rest)
     return word is not None and word[1] in TYPES and not word[2]
 

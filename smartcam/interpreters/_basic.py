@@ -1,0 +1,84 @@
+"""The interpreters that a layout, or nothing, tells all: raw, record, table, strings50."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from smartcam.interpreters._base import PlainInterpreter, Reader
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from smartcam.interpreters._base import Context
+    from smartcam.layout import Layout
+
+WIDTH = 50
+_TEXT = struct.Struct(f"{WIDTH}s")
+
+
+class RawInterpreter(PlainInterpreter):
+    """``raw``: the container's bytes as they are, hex in JSON; takes no layout."""
+
+    layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
+
+    def read(self, data: bytes, context: Context) -> bytes:
+        """Return the bytes behind the application id."""
+        return data
+
+
+class Strings50Interpreter(PlainInterpreter):
+    """``strings50``: texts of 50 bytes each (the thesis' ``50ByteStrings``); takes no layout."""
+
+    layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
+
+    def read(self, data: bytes, context: Context) -> list[str]:
+        """Return the texts in order; empty ones are kept, so places stay what they are.
+
+        Raises:
+            InterpretationError: bytes are left behind the last whole string, or one is not UTF-8.
+        """
+        try:
+            return [raw.partition(b"\0")[0].decode() for (raw,) in _TEXT.iter_unpack(data)]
+        except (struct.error, UnicodeDecodeError):
+            pass
+        reader = Reader(data)  # it says where
+        return [reader.get_string(offset, WIDTH) for offset in reader.records(WIDTH)]
+
+
+class RecordInterpreter(PlainInterpreter):
+    """``record``: what :meth:`smartcam.Layout.parse` gives; needs a layout."""
+
+    layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
+    layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
+
+    def read(self, data: bytes, context: Context) -> Any:
+        """Return the record, or the list of records.
+
+        Raises:
+            InterpretationError: the bytes do not fit the layout.
+        """
+        return self.layout.parse(data, context.byte_order)
+
+
+class TableInterpreter(PlainInterpreter):
+    """``table``: what :meth:`smartcam.Layout.parse_table` gives; needs a layout."""
+
+    layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
+    layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
+
+    def read(self, data: bytes, context: Context) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+        """Return the records as a structured array of one dimension, read-only.
+
+        Raises:
+            InterpretationError: the bytes do not fit the layout.
+        """
+        return self.layout.parse_table(data, context.byte_order)
+
+    def read_all(
+        self, containers: Sequence[bytes], context: Context
+    ) -> list[np.ndarray[tuple[int], np.dtype[np.void]]]:
+        """Return a table for each container."""
+        return self.layout.parse_tables(containers, context.byte_order)
