@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
 
     from smartcam.client import SmartCamera
-    from smartcam.testing.threads import ThreadedCamera, ThreadedFleet
+    from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
 
 __all__ = ["camera", "emulated_camera", "emulated_fleet"]
 
@@ -59,16 +59,14 @@ _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Pytest: the options of the suites that judge cameras and clients."""
-    from smartcam.conformance.camera import pytest_options as cameras
-    from smartcam.conformance.client import pytest_options as clients
+    from smartcam.conformance._pytest_options import add_options
 
-    cameras.add_options(parser)
-    clients.add_options(parser)
+    add_options(parser)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Pytest: what was found of clients; what was found of a camera, its judge tells itself."""
-    from smartcam.conformance.client.pytest_options import terminal_summary
+    from smartcam.conformance._pytest_options import terminal_summary
 
     terminal_summary(terminalreporter)
 
@@ -76,7 +74,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Pytest: say which marker there is."""
     config.addinivalue_line("markers", MARKER)
-    pytest.register_assert_rewrite("smartcam.testing.suites.interpreters")
+    pytest.register_assert_rewrite("smartcam.testing._suites.interpreters")
 
 
 # ---------------------------------------------------------------------- fixtures
@@ -89,7 +87,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
     It lives in a thread with an event loop of its own, so it serves synchronous and asynchronous
     tests, and programs that a test starts. The marker ``smartcam`` says what it is.
     """
-    from smartcam.testing.threads import ThreadedCamera
+    from smartcam.testing._threads import ThreadedCamera
 
     said = _said(request)
     options = {key: value for key, value in said.items() if key in EMULATOR}
@@ -104,7 +102,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
     """Emulated cameras by name: two, or those of a scenario; otherwise as emulated_camera."""
     from smartcam.emulator import Scenario
-    from smartcam.testing.threads import ThreadedFleet
+    from smartcam.testing._threads import ThreadedFleet
 
     said = _said(request)
     options = {key: value for key, value in said.items() if key in FLEET}
@@ -148,7 +146,7 @@ def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> S
 
 
 def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Return what the markers of a test say; the nearest goes before those of class and module."""
+    """Return the markers' options of a test; the nearest goes before those of class and module."""
     said: dict[str, Any] = {}
     for marker in reversed(list(request.node.iter_markers("smartcam"))):
         if marker.args:
@@ -167,7 +165,7 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 
 def _scenario_path(request: pytest.FixtureRequest, given: str | Path) -> Path:
-    """Return where a scenario is: beside the test, below the project's root, or as given."""
+    """Return a scenario's path: beside the test, below the project's root, or as given."""
     folders = (request.path.parent, request.config.rootpath)
     found = (folder / given for folder in folders)
     return next((path for path in found if path.exists()), Path(given))

@@ -6,37 +6,49 @@
         emulator.url    # bvs://127.0.0.1:PORT?dialect=handbook
 """
 
-from smartcam.emulator import faults
-from smartcam.emulator.application import Application
-from smartcam.emulator.bvs.device import Device
-from smartcam.emulator.bvs.quirks import Quirks
-from smartcam.emulator.camera import EmulatedCamera
-from smartcam.emulator.clock import Clock, ManualClock, RealClock
-from smartcam.emulator.faults import FiredFault
-from smartcam.emulator.fleet import EmulatedFleet
-from smartcam.emulator.generators import Run, register_generator
-from smartcam.emulator.scenario.file import load_scenario, load_scenarios, scenario_schema
-from smartcam.emulator.scenario.scenario import Scenario
-from smartcam.emulator.scenario.states import DeviceState
-from smartcam.emulator.scenario.timeline import Cue
-from smartcam.emulator.scene import TableScene
-from smartcam.emulator.traffic import LogEntry, Visit
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.emulator import faults
+    from smartcam.emulator._application import Application
+    from smartcam.emulator._bvs.device import Device
+    from smartcam.emulator._bvs.quirks import Quirks
+    from smartcam.emulator._camera import EmulatedCamera
+    from smartcam.emulator._clock import ManualClock
+    from smartcam.emulator._fleet import EmulatedFleet
+    from smartcam.emulator._generators import Run, register_generator
+    from smartcam.emulator._insight.camera import EmulatedInSight
+    from smartcam.emulator._insight.commands import InSightQuirks
+    from smartcam.emulator._insight.job import Job
+    from smartcam.emulator._scenario.file import load_scenario, load_scenarios, scenario_schema
+    from smartcam.emulator._scenario.scenario import Scenario
+    from smartcam.emulator._scenario.states import DeviceState
+    from smartcam.emulator._scenario.timeline import Cue
+    from smartcam.emulator._scene import TablePose, TableScene
+    from smartcam.emulator._traffic import LogEntry, Visit
+    from smartcam.emulator.faults import FiredFault
 
 __all__ = [
     "Application",
-    "Clock",
     "Cue",
     "Device",
     "DeviceState",
     "EmulatedCamera",
     "EmulatedFleet",
+    "EmulatedInSight",
     "FiredFault",
+    "InSightQuirks",
+    "Job",
     "LogEntry",
     "ManualClock",
     "Quirks",
-    "RealClock",
     "Run",
     "Scenario",
+    "TablePose",
     "TableScene",
     "Visit",
     "faults",
@@ -45,3 +57,28 @@ __all__ = [
     "register_generator",
     "scenario_schema",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "": "faults",
+            "_application": "Application",
+            "_bvs.device": "Device",
+            "_bvs.quirks": "Quirks",
+            "_camera": "EmulatedCamera",
+            "_clock": "ManualClock",
+            "_fleet": "EmulatedFleet",
+            "_generators": "Run register_generator",
+            "_insight.camera": "EmulatedInSight",
+            "_insight.commands": "InSightQuirks",
+            "_insight.job": "Job",
+            "_scenario.file": "load_scenario load_scenarios scenario_schema",
+            "_scenario.scenario": "Scenario",
+            "_scenario.states": "DeviceState",
+            "_scenario.timeline": "Cue",
+            "_scene": "TablePose TableScene",
+            "_traffic": "LogEntry Visit",
+            "faults": "FiredFault",
+        },
+    )

@@ -11,60 +11,64 @@ Names are resolved when they are first used.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.testing.logs import CameraLog
-    from smartcam.testing.proxy.proxy import LinkProxy
-    from smartcam.testing.suites.interpreters import InterpreterSuite, Sample
-    from smartcam.testing.suites.protocols import (
-        Came,
-        CameraSuite,
-        Conversation,
-        ProtocolSuite,
-        Sent,
-        Site,
-        WireSuite,
-        World,
+    from smartcam.testing._logs import CameraLog
+    from smartcam.testing._suites.interpreters import ContainerSample, InterpreterSuite
+    from smartcam.testing._suites.protocols.cameras_under_test import (
+        COUNTER,
+        ECHO,
+        FREE,
+        NOBODYS,
+        OTHER,
+        SLOW,
+        SLOW_TIME,
+        CameraKind,
+        LiveCamera,
     )
-    from smartcam.testing.threads import ThreadedCamera, ThreadedFleet
+    from smartcam.testing._suites.protocols.conversations import Came, Conversation, Sent
+    from smartcam.testing._suites.protocols.suite import CameraSuite, ProtocolSuite, WireSuite
+    from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
+    from smartcam.testing.proxy._proxy import LinkProxy
 
 __all__ = [
+    "COUNTER",
+    "ECHO",
+    "FREE",
+    "NOBODYS",
+    "OTHER",
+    "SLOW",
+    "SLOW_TIME",
     "Came",
+    "CameraKind",
     "CameraLog",
     "CameraSuite",
+    "ContainerSample",
     "Conversation",
     "InterpreterSuite",
     "LinkProxy",
+    "LiveCamera",
     "ProtocolSuite",
-    "Sample",
     "Sent",
-    "Site",
     "ThreadedCamera",
     "ThreadedFleet",
     "WireSuite",
-    "World",
 ]
 
-_MODULES = {
-    "CameraLog": "logs",
-    "InterpreterSuite": "suites.interpreters",
-    "LinkProxy": "proxy.proxy",
-    "Sample": "suites.interpreters",
-    "ThreadedCamera": "threads",
-    "ThreadedFleet": "threads",
-}
-"""Where a name stands; what is not here stands in ``suites.protocols``."""
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_MODULES.get(name, 'suites.protocols')}")
-    value = globals()[name] = getattr(module, name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_logs": "CameraLog",
+            "_suites.interpreters": "ContainerSample InterpreterSuite",
+            "_suites.protocols.cameras_under_test": "COUNTER ECHO FREE NOBODYS OTHER SLOW "
+            "SLOW_TIME CameraKind LiveCamera",
+            "_suites.protocols.conversations": "Came Conversation Sent",
+            "_suites.protocols.suite": "CameraSuite ProtocolSuite WireSuite",
+            "proxy._proxy": "LinkProxy",
+            "_threads": "ThreadedCamera ThreadedFleet",
+        },
+    )

@@ -17,100 +17,78 @@ them. *Device faults* are things that happen to the camera. They count what its 
 Connect, and the messages of the session.
 
 There is no chance in any of it: the same list and the same messages give the same bytes.
+
+A fault that is new is a class here, with a ``kind``, and stands in one of the unions below. What it
+does is a row in ``_wire_effects.py`` (by what it makes of a message) or ``_device_effects.py``. The
+tests then ask for a row in ``docs/emulator.md`` and the schema (``smartcam-emulator --schema``).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias, get_args
+import dataclasses
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias, get_args
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import (
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
-from smartcam.emulator.faults.base import (
+from smartcam.emulator._data import Seconds
+from smartcam.emulator.faults._base import (
     MAX_BYTES,
     MESSAGE_NAMES,
     BaseFault,
+    CameraWireFault,
     DeviceFault,
+    EndingFault,
+    FaultBytes,
+    MessageName,
     WireFault,
-)
-from smartcam.emulator.faults.device import (
-    BusyForEver,
-    ByteOrder,
-    ClearFaults,
-    Condition,
-    DigitalInput,
-    ExtraResult,
-    LateResult,
-    MovePart,
-    NoResult,
-    Overtrigger,
-    Reboot,
-    Refuse,
-    RemovePart,
-    SecondClient,
-    Start,
-    Stop,
-    SwitchApplication,
-)
-from smartcam.emulator.faults.wire import (
-    Close,
-    Coalesce,
-    Corrupt,
-    Delay,
-    Drop,
-    Duplicate,
-    HalfOpen,
-    Insert,
-    Reset,
-    Split,
-    Truncate,
+    known_name,
 )
 from smartcam.exceptions import ConfigurationError
+from smartcam.models import Status
+from smartcam.protocols import messages as m
 from smartcam.settings import validation_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from smartcam.protocols import messages as m
-
 __all__ = [
     "FAULTS",
-    "MAX_BYTES",
-    "MAX_FAULTS",
-    "MAX_FIRED",
-    "MESSAGE_NAMES",
-    "BaseFault",
     "BusyForEver",
-    "ByteOrder",
+    "ChangeByteOrder",
     "ClearFaults",
     "Close",
     "Coalesce",
     "Condition",
     "Corrupt",
     "Delay",
-    "DeviceFault",
     "DigitalInput",
     "Drop",
     "Duplicate",
     "ExtraResult",
     "Fault",
-    "FiredFault",
     "HalfOpen",
     "Insert",
     "LateResult",
     "MovePart",
     "NoResult",
+    "OperatorStart",
+    "OperatorStop",
+    "OperatorSwitch",
     "Overtrigger",
-    "Reboot",
+    "PowerCycle",
     "Refuse",
     "RemovePart",
     "Reset",
     "SecondClient",
     "Split",
-    "Start",
-    "Stop",
-    "SwitchApplication",
     "Truncate",
-    "WireFault",
     "make_faults",
 ]
 
@@ -120,35 +98,391 @@ MAX_FAULTS = 10_000
 MAX_FIRED = 1000
 """Records kept of faults that have happened; the oldest go first."""
 
+
+# ---------------------------------------------------------------------- on the wire
+
+
+class Delay(WireFault):
+    """The message comes later.
+
+    On TCP everything behind it waits too, unless ``overtaken``. On UDP it is this datagram alone.
+    """
+
+    kind: Literal["delay"] = "delay"
+    seconds: Seconds = Field(
+        description="How much later, s, counted from when it was sent. Several delays add up."
+    )
+    overtaken: bool = Field(
+        default=False,
+        description=(
+            "TCP: later messages pass it. A network never does that to a stream; a camera with "
+            "several tasks might (inferred)."
+        ),
+    )
+
+
+class Split(CameraWireFault):
+    """The message comes in two pieces: two writes on TCP, two datagrams on UDP."""
+
+    kind: Literal["split"] = "split"
+    after: int = Field(
+        ge=1,
+        le=MAX_BYTES,
+        description="Bytes in the first piece, header included. Shorter messages stay whole.",
+    )
+    pause: Seconds = Field(
+        default=0.0,
+        description=(
+            "Between the pieces, s. At 0 they are two writes one right after the other, which a "
+            "client may still read at once."
+        ),
+    )
+
+
+class Coalesce(CameraWireFault):
+    """The message waits for those behind it; they come in one write, or one datagram.
+
+    Source: several messages may come in one TCP segment (newest SC manual p. 40, published).
+    """
+
+    kind: Literal["coalesce"] = "coalesce"
+    count: int = Field(default=1, ge=1, le=1000, description="Messages it waits for.")
+    seconds: Seconds = Field(
+        default=1.0, description="How long it waits for them at most, s, before it goes without."
+    )
+
+
+class Truncate(CameraWireFault):
+    """Only the message's beginning comes."""
+
+    kind: Literal["truncate"] = "truncate"
+    keep: int = Field(
+        ge=0, le=MAX_BYTES, description="Bytes that come, header included. A shorter one is whole."
+    )
+    then: Literal["close", "reset", "stall", "continue"] = Field(
+        default="close",
+        description=(
+            "What follows: `close` and `reset` end the connection as the faults of that name do; "
+            "`stall`: nothing more is said on it, while the camera goes on listening; "
+            "`continue`: the next message as if nothing was missing."
+        ),
+    )
+
+
+class Corrupt(WireFault):
+    """One byte of the message is another; exactly one of ``xor`` and ``value`` says which."""
+
+    kind: Literal["corrupt"] = "corrupt"
+    offset: int = Field(
+        ge=-MAX_BYTES,
+        le=MAX_BYTES,
+        description=(
+            "Which byte, from the first one of the header; negative: from the end, -1 the last. "
+            "A message without that byte stays as it is."
+        ),
+    )
+    xor: int | None = Field(default=None, ge=1, le=255, description="Bits that are turned over.")
+    value: int | None = Field(default=None, ge=0, le=255, description="What stands there instead.")
+
+    @model_validator(mode="after")
+    def _check_change(self) -> Corrupt:
+        if (self.xor is None) is (self.value is None):
+            raise ValueError("exactly one of xor and value says what stands there")
+        return self
+
+
+class Drop(WireFault):
+    """The message is lost.
+
+    Source: UDP does not guarantee delivery (newest SC manual p. 40, published).
+    """
+
+    kind: Literal["drop"] = "drop"
+
+
+class Duplicate(WireFault):
+    """The message comes more than once, one right behind the other."""
+
+    kind: Literal["duplicate"] = "duplicate"
+    copies: int = Field(default=1, ge=1, le=100, description="How often beside the first time.")
+
+
+class Insert(CameraWireFault):
+    """Something that the camera did not say; exactly one of ``data`` and ``message`` is it.
+
+    Faults behind it in the list leave what stands before or after the message alone; what stands
+    instead of it counts as the message.
+    """
+
+    kind: Literal["insert"] = "insert"
+    data: FaultBytes | None = Field(
+        default=None, description="The bytes; hex digits in a file. They need not make a frame."
+    )
+    message: MessageName | None = Field(
+        default=None, description="A message, in the dialect spoken: name or class of its type."
+    )
+    fields: dict[str, int | str] = Field(
+        default_factory=dict[str, int | str],
+        description="The message's fields: all without a default; `data` as hex digits.",
+    )
+    where: Literal["before", "after", "instead"] = Field(
+        default="before", description="Where it stands: beside the message or in place of it."
+    )
+
+    @field_validator("message")
+    @classmethod
+    def _check_message(cls, value: str | None) -> str | None:
+        return None if value is None else known_name(value)
+
+    @field_validator("fields")
+    @classmethod
+    def _check_fields(
+        cls, value: dict[str, int | str], info: ValidationInfo
+    ) -> dict[str, int | str]:
+        name = info.data.get("message")
+        if value and name is None:
+            raise ValueError("fields belong to a message")
+        if name is not None:
+            _build(name, value)
+        return value
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Insert:
+        if (self.data is None) is (self.message is None):
+            raise ValueError("exactly one of data and message is inserted")
+        if isinstance(self.message, str):
+            _build(self.message, self.fields)
+        return self
+
+    @property
+    def word(self) -> m.Message | None:
+        """The message that is inserted, None for bytes."""
+        return _build(self.message, self.fields) if isinstance(self.message, str) else None
+
+
+def _wire_value(where: str, wire: m.Wire, value: int | str) -> bytes | int:
+    if wire is m.Wire.DATA and isinstance(value, str):
+        return bytes.fromhex(value)
+    if wire is not m.Wire.DATA and isinstance(value, int):
+        return value
+    raise ValueError(f"{where} is {'hex digits' if wire is m.Wire.DATA else 'a number'}")
+
+
+def _build(name: str, fields: Mapping[str, int | str]) -> m.Message:
+    """Return a message.
+
+    Raises:
+        ValueError: a field is missing, unknown, or of another type.
+    """
+    kind = MESSAGE_NAMES[name]
+    wire = dict(m.wire_fields(kind))
+    values: dict[str, Any] = {}
+    for key, value in fields.items():
+        if key not in wire:
+            raise ValueError(f"{name} has no field {key!r}; it has {', '.join(wire) or 'none'}")
+        values[key] = _wire_value(f"{name}.{key}", wire[key], value)
+    if isinstance(values.get("status"), int):
+        values["status"] = Status(values["status"])
+    try:
+        return kind(**values)
+    except TypeError:
+        needed = [f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING]
+        missing = ", ".join(key for key in needed if key not in values)
+        raise ValueError(f"{name} needs values for {missing}") from None
+
+
+class HalfOpen(EndingFault):
+    """From that message on nothing is sent and nothing is read on this connection.
+
+    It stays open, as when a cable is pulled; the session stays with it until another client
+    connects. It ends with a reset after ``seconds``, when the emulator stops or when the faults are
+    cleared; so long it counts among the connections, of which there are 32 at most. On UDP
+    datagrams in both directions are lost for that time.
+    """
+
+    kind: Literal["half_open"] = "half_open"
+    seconds: Seconds | None = Field(
+        default=None, description="How long, s; None: until the emulator stops."
+    )
+
+
+class Reset(EndingFault):
+    """The connection ends by a reset (RST). On UDP the camera forgets the session in silence.
+
+    What the client has not read when the reset comes may be lost to it.
+    """
+
+    kind: Literal["reset"] = "reset"
+
+
+class Close(EndingFault):
+    """The connection ends in order (FIN). On UDP the camera forgets the session in silence."""
+
+    kind: Literal["close"] = "close"
+
+
+# ---------------------------------------------------------------------- of the device
+
+Place = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+
+
+class Refuse(DeviceFault):
+    """The port is closed: who connects is refused. Connections that are open stay.
+
+    On UDP the session stays, and datagrams in both directions are lost; the client's system may be
+    told that nobody listens.
+    """
+
+    kind: Literal["refuse"] = "refuse"
+    seconds: Seconds = Field(description="How long, s.")
+
+
+class BusyForEver(DeviceFault):
+    """BUSY is set and stays, and no inspection begins; everything else goes on as ever."""
+
+    kind: Literal["busy_for_ever"] = "busy_for_ever"
+    seconds: Seconds | None = Field(
+        default=None,
+        description="How long, s; None: until a reboot, or until the faults are cleared.",
+    )
+
+
+class Overtrigger(DeviceFault):
+    """Triggers are dropped as if the last image were still analysed: Overtriggered rises.
+
+    Source: SC manual p. 30 (published for a trigger during an inspection).
+    """
+
+    kind: Literal["overtrigger"] = "overtrigger"
+    count: int = Field(default=1, ge=1, le=1_000_000, description="Triggers, from the next one on.")
+
+
+class SecondClient(DeviceFault):
+    """Another client connects and gets the session by the camera's own rules.
+
+    On TCP the first one's connection is closed, unless the quirk ``second_client`` refuses
+    newcomers; on UDP it is told nothing. The camera talks to the other one until a client connects,
+    or until the faults are cleared.
+
+    Source: the newcomer wins (SC manual p. 28, published for UDP; inferred for TCP).
+    """
+
+    kind: Literal["second_client"] = "second_client"
+
+
+class PowerCycle(DeviceFault):
+    """The camera restarts, as by its power switch."""
+
+    kind: Literal["reboot"] = "reboot"
+    seconds: Seconds | None = Field(
+        default=None, description="Until it is up again, s; None: the quirk `reboot_time`."
+    )
+
+
+class OperatorSwitch(DeviceFault):
+    """An operator loads another application behind the client's back."""
+
+    kind: Literal["switch_application"] = "switch_application"
+    application: int = Field(ge=1, le=0xFFFFFFFF, description="Its id.")
+    running: bool = Field(default=False, description="Whether it runs when it is loaded.")
+
+
+class OperatorStop(DeviceFault):
+    """An operator stops the application."""
+
+    kind: Literal["stop"] = "stop"
+
+
+class OperatorStart(DeviceFault):
+    """An operator starts the application."""
+
+    kind: Literal["start"] = "start"
+
+
+class Condition(DeviceFault):
+    """System Error or Overheat comes or goes.
+
+    Source: SC manual p. 30 and p. 33 (published).
+    """
+
+    kind: Literal["condition"] = "condition"
+    condition: Literal["system_error", "overheat"] = Field(description="Which of the two.")
+    active: bool = Field(default=True, description="Whether it comes or goes.")
+
+
+class LateResult(DeviceFault):
+    """An inspection takes longer: the one under way, else the next that begins."""
+
+    kind: Literal["late_result"] = "late_result"
+    seconds: Seconds = Field(description="How much longer, s.")
+
+
+class NoResult(DeviceFault):
+    """An inspection sends nothing: the one under way, else the next that begins."""
+
+    kind: Literal["no_result"] = "no_result"
+
+
+class ExtraResult(DeviceFault):
+    """An inspection sends its container more than once: the one under way, else the next.
+
+    Source: a program may have several "send results" tools (inferred).
+    """
+
+    kind: Literal["extra_result"] = "extra_result"
+    count: int = Field(default=1, ge=1, le=100, description="How often beside the first time.")
+
+
+class DigitalInput(DeviceFault):
+    """A sensor triggers the camera by its digital input."""
+
+    kind: Literal["digital_input"] = "digital_input"
+
+
+class ChangeByteOrder(DeviceFault):
+    """Result containers and input data are in another byte order from now on."""
+
+    kind: Literal["byte_order"] = "byte_order"
+    endian: int = Field(
+        ge=0, le=0xFFFFFFFF, description="The status message's field: 0 little, 1 big (inferred)."
+    )
+
+
+class MovePart(DeviceFault):
+    """A part of the scene lies somewhere else; a new name is a new part."""
+
+    kind: Literal["move_part"] = "move_part"
+    part: str = Field(min_length=1, max_length=200, description="Its name.")
+    x: Place = Field(description="To the right, m.")
+    y: Place = Field(description="Away from the table's front, m.")
+    theta: Place = Field(default=0.0, description="Counter-clockwise, rad.")
+
+
+class RemovePart(DeviceFault):
+    """A part is taken from the scene."""
+
+    kind: Literal["remove_part"] = "remove_part"
+    part: str = Field(min_length=1, max_length=200, description="Its name.")
+
+
+class ClearFaults(DeviceFault):
+    """Faults that wait are forgotten and those that last end, as by ``clear_faults()``."""
+
+    kind: Literal["clear_faults"] = "clear_faults"
+
+
+# ---------------------------------------------------------------------- any of them
+
+_OnMessage: TypeAlias = Delay | Split | Coalesce | Truncate | Corrupt | Drop | Duplicate | Insert
+_OnConnection: TypeAlias = HalfOpen | Reset | Close
+_OfState: TypeAlias = (
+    Refuse | BusyForEver | Overtrigger | SecondClient | PowerCycle | OperatorSwitch
+)
+_ByOperator: TypeAlias = OperatorStop | OperatorStart | Condition
+_OfRun: TypeAlias = LateResult | NoResult | ExtraResult | DigitalInput | ChangeByteOrder
+_OfScene: TypeAlias = MovePart | RemovePart
 _Any: TypeAlias = (
-    Delay
-    | Split
-    | Coalesce
-    | Truncate
-    | Corrupt
-    | Drop
-    | Duplicate
-    | Insert
-    | HalfOpen
-    | Reset
-    | Close
-    | Refuse
-    | BusyForEver
-    | Overtrigger
-    | SecondClient
-    | Reboot
-    | SwitchApplication
-    | Stop
-    | Start
-    | Condition
-    | LateResult
-    | NoResult
-    | ExtraResult
-    | DigitalInput
-    | ByteOrder
-    | MovePart
-    | RemovePart
-    | ClearFaults
+    _OnMessage | _OnConnection | _OfState | _ByOperator | _OfRun | _OfScene | ClearFaults
 )
 
 Fault: TypeAlias = Annotated[_Any, Field(discriminator="kind")]

@@ -1,0 +1,56 @@
+"""How cameras behave that speak different dialects, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import ResultCode
+
+if TYPE_CHECKING:
+    from smartcam.emulator._bvs.quirks import Quirks
+    from smartcam.protocols._framed.dialect import FramedDialect
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Behaviour:
+    """What a camera does beside answering what is asked."""
+
+    coded: bool = False  # its answers tell a result code
+    acknowledges: bool = False  # every request is answered with one
+    tells_bad_messages: bool = False  # unknown and malformed requests are answered with one, too
+    answers_disconnect: bool = False  # so is Disconnect
+    runs_always: bool = False  # there is no run mode to enter or leave; not Ready is BUSY
+    status_with_session: bool = True  # a status comes after Connect
+    reports_changes: bool = True  # a status comes with every change of it
+    sticky_errors: bool = False  # error bits stay until they are reset
+
+    @property
+    def refused(self) -> int:
+        """Code of a switch that cannot be done."""
+        return ResultCode.INSPECTION_ERROR if self.coded else 1
+
+
+SMART_CAMERA = Behaviour()
+"""BVS SC, in every dialect but ``bid``."""
+
+
+def behaviour_of(dialect: FramedDialect, quirks: Quirks) -> Behaviour:
+    """Return the behaviour of a camera that speaks ``dialect``.
+
+    Source: BVS ID guide p. 52, 58, 206, 210, 227 (published for ``bid``); the rest is told at the
+    quirks.
+    """
+    if not dialect.has(m.TriggerAnswer):
+        return Behaviour(coded="code" in dialect.quirks)
+    return Behaviour(
+        coded=True,
+        acknowledges=True,
+        tells_bad_messages=quirks.bad_message == "code",
+        answers_disconnect=quirks.disconnect_answer == "code",
+        runs_always=True,
+        status_with_session=False,
+        reports_changes=quirks.push_status,
+        sticky_errors=True,
+    )

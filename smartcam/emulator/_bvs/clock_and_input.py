@@ -1,0 +1,102 @@
+"""The device's calendar clock and its input queue."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any
+
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+LOST_CLOCK = datetime(1970, 1, 1, tzinfo=UTC)
+"""What the clock shows after a restart: it is lost (published for a sibling, the value inferred).
+The camera's clock has no time zone; UTC stands here because a time of ours needs one."""
+
+_UNITS = ("year", "month", "day", "hour", "minute", "second")
+
+
+@dataclass(eq=False)
+class CalendarClock:
+    """Year to second, without a time zone."""
+
+    _time: datetime  # what it showed when it was set
+    _set_at: int  # the device's time then, nanoseconds
+
+    def __post_init__(self) -> None:
+        self._time = self._time.replace(tzinfo=UTC)
+
+    def read(self, now: int) -> datetime:
+        """Return the time it shows; it stops at the end of the year 9999."""
+        try:
+            return self._time + timedelta(microseconds=(now - self._set_at) // 1000)
+        except OverflowError:
+            return datetime.max.replace(tzinfo=UTC)
+
+    def set(self, message: m.SetClock, now: int) -> bool:
+        """Set it; what is no time is dropped: False.
+
+        Source: mvBlueGEMINI manual p. 30 (published): invalid values may be dropped or converted.
+        """
+        try:
+            time = LOST_CLOCK.replace(**{name: getattr(message, name) for name in _UNITS})
+        except (ValueError, OverflowError):
+            return False
+        self._time, self._set_at = time, now
+        return True
+
+    def answer(self, now: int, *, code: int = 0) -> m.ClockAnswer:
+        """Return the time it shows as a message."""
+        time = self.read(now)
+        return m.ClockAnswer(code=code, **{name: getattr(time, name) for name in _UNITS})
+
+
+class InputQueue:
+    """Input containers, one for each inspection.
+
+    Source: SC manual p. 30 and p. 33 (published): with more containers than inspections one is
+    dropped, with fewer one is reused. Which one, and the depth: unknown.
+    """
+
+    def __init__(self, depth: int) -> None:
+        self._depth = depth  # containers kept
+        self._queue: deque[Mapping[str, Any]] = deque()
+        self._last: Mapping[str, Any] | None = None
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def put(self, values: Mapping[str, Any]) -> bool:
+        """Queue a container; False if the oldest was dropped for it."""
+        fits = len(self._queue) < self._depth
+        if not fits:
+            self._queue.popleft()
+        self._queue.append(values)
+        return fits
+
+    def take(self) -> tuple[Mapping[str, Any] | None, bool]:
+        """Return the next container, or the last one again and False.
+
+        None stands for the one before the first: zeros.
+        """
+        fits = bool(self._queue)
+        if fits:
+            self._last = self._queue.popleft()
+        return self._last, fits
+
+    def clear(self) -> None:
+        """Forget everything, the last one too."""
+        self._queue.clear()
+        self._last = None
+
+
+@dataclass(slots=True)
+class RunChange:
+    """What faults change of one inspection."""
+
+    late: int = 0  # how much longer it takes, nanoseconds
+    silent: bool = False  # it sends nothing
+    extra: int = 0  # how often its container comes beside the first time

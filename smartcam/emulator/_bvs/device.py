@@ -1,0 +1,843 @@
+"""The camera behind the wire: a model that is moved by time differences.
+
+It knows no socket, loop or clock. Messages of the active session go in by :meth:`Device.handle`,
+time by :meth:`Device.tick`; what the camera says is taken with :meth:`Device.take_output`.
+
+Inside, time is whole nanoseconds and every future thing is a row of one small table: instant by
+kind. What falls on the same instant happens in the order of :class:`_Event`.
+
+Facts stand in ``docs/protocol.md``. Where the documents are silent the choice is a field of
+:class:`~smartcam.emulator.Quirks`, or is marked *inferred* here.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import logging
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.emulator._bvs.behaviour import SMART_CAMERA, Behaviour
+from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK, CalendarClock, InputQueue, RunChange
+from smartcam.emulator._bvs.quirks import Quirks
+from smartcam.emulator._clock import NANOSECONDS, nanoseconds
+from smartcam.emulator._scenario.states import DeviceState, risen_states
+from smartcam.emulator._scene import TableScene
+from smartcam.exceptions import ConfigurationError, InterpretationError
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import ResultCode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from contextlib import AbstractContextManager
+    from datetime import datetime
+
+    from smartcam.emulator._application import Application
+    from smartcam.models import ByteOrder
+
+_log = logging.getLogger("smartcam.emulator")
+
+PROTOCOL_VERSION = 1
+"""What Connect is answered with (SC manual p. 29, published)."""
+
+OPERATOR_CONDITIONS = Status.OVERHEAT | Status.SYSTEM_ERROR
+"""Bits that nothing in the model sets: :meth:`Device.set_condition` does."""
+
+_NUMBERS = 1 << 32  # sequence numbers are UINT32
+
+# the status is put together as a plain number: with an IntFlag each step of that costs a call
+_BUSY = Status.BUSY.value
+_RUNNING = Status.RUNNING.value
+_WAITING = Status.WAITING_FOR_TRIGGER.value
+_OVERTRIGGERED = Status.OVERTRIGGERED.value
+_OVERHEAT = Status.OVERHEAT.value
+_SYSTEM_ERROR = Status.SYSTEM_ERROR.value
+_INPUT_CONTAINER = Status.INPUT_CONTAINER.value
+
+
+class Mode(enum.Enum):
+    """What the camera is doing."""
+
+    STOPPED = "stopped"
+    RUNNING = "running"
+    SWITCHING = "switching"
+    REBOOTING = "rebooting"
+
+
+class _Event(enum.IntEnum):
+    """Kinds of future things, in the order in which they happen at one instant."""
+
+    INSPECTED = 0
+    OVERTRIGGER_ENDS = 1
+    LOADED = 2
+    BOOTED = 3
+    BUSY_ENDS = 4
+    FREE_RUN = 5
+
+    __hash__ = int.__hash__  # Enum's own is a function in Python
+
+
+class _Inspection(NamedTuple):
+    """An inspection under way: what was fixed when it began."""
+
+    number: int
+    turn: int
+    time: float
+    input: Mapping[str, Any] | None
+    change: RunChange
+
+
+class Device:
+    """One camera.
+
+    Args:
+        applications: the programs stored on it; at least one, ids differ.
+        active: id of the loaded one; default the first.
+        running: in run mode from the beginning.
+        quirks: what is not known about real cameras.
+        clock_time: what its clock shows at first; a time without a zone is taken as it is.
+        scene: the table it looks at.
+        behaviour: how it behaves in its dialect.
+
+    Attributes:
+        around: every operator's action (:meth:`start`, :meth:`stop`, :meth:`trigger`,
+            :meth:`switch_application`, :meth:`reboot`, :meth:`set_condition`,
+            :meth:`set_endian`) happens inside this context. A server puts one here that first
+            brings the device's time up and afterwards sends what the action caused.
+
+    Raises:
+        ConfigurationError: no application, one id twice, or ``active`` is none of them.
+    """
+
+    def __init__(
+        self,
+        applications: Iterable[Application],
+        *,
+        active: int | None = None,
+        running: bool = False,
+        quirks: Quirks | None = None,
+        clock_time: datetime = LOST_CLOCK,
+        scene: TableScene | None = None,
+        behaviour: Behaviour = SMART_CAMERA,
+    ) -> None:
+        self.behaviour: Behaviour = behaviour
+        self._applications = _by_id(applications)
+        self.quirks: Quirks = quirks or Quirks()
+        self.scene: TableScene = scene or TableScene()
+        self.around: Callable[[], AbstractContextManager[object]] = nullcontext
+        self._on_entered: Callable[[DeviceState], None] | None = None
+        self._entered: list[DeviceState] = []
+        self._bits = 0  # of the status word, as last seen
+        first = next(iter(self._applications)) if active is None else active
+        self._take_up(self._applications[self._known(first)])
+        self._now = 0
+        self._mode = Mode.STOPPED
+        self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
+        self._session = False
+        self._owes_switch = False  # the session's
+        self._output: list[m.Message] = []
+        self._reported: tuple[int, int] | None = None
+        self._conditions = 0
+        self._endian = 0
+        self._next_number = 0
+        self._processing = False
+        self._held_busy = False
+        self._trigger_drops = 0  # triggers still to be dropped
+        self._change = RunChange()  # of the inspection under way, else of the next
+        # a reference value is there until the next one, it does not queue
+        depth = 1 if behaviour.acknowledges else self.quirks.input_queue_depth
+        self._inputs = InputQueue(depth)
+        self._clock = CalendarClock(clock_time, self._now)
+        if running or behaviour.runs_always:
+            self._enter_run_mode()
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def applications(self) -> Mapping[int, Application]:
+        """The stored applications by id."""
+        return self._applications
+
+    @property
+    def active_application(self) -> int:
+        """Id of the loaded application; the old one during a switch."""
+        return self._active.id
+
+    @property
+    def mode(self) -> Mode:
+        """What it is doing."""
+        return self._mode
+
+    @property
+    def running(self) -> bool:
+        """Whether it is in run mode."""
+        return self._mode is Mode.RUNNING
+
+    @property
+    def processing(self) -> bool:
+        """Whether an inspection is under way."""
+        return self._processing
+
+    @property
+    def rebooting(self) -> bool:
+        """Whether it is off the network because it restarts."""
+        return self._mode is Mode.REBOOTING
+
+    @property
+    def connected(self) -> bool:
+        """Whether a client has a session."""
+        return self._session
+
+    @property
+    def endian(self) -> int:
+        """The status message's endian field: 0 little, 1 big."""
+        return self._endian
+
+    @property
+    def next_number(self) -> int:
+        """Sequence number of the next run."""
+        return self._next_number
+
+    @property
+    def queued_inputs(self) -> int:
+        """Input containers that wait for an inspection."""
+        return len(self._inputs)
+
+    @property
+    def time(self) -> float:
+        """Seconds since the device was made."""
+        return self._now / NANOSECONDS
+
+    @property
+    def clock_time(self) -> datetime:
+        """What its clock shows; the zone means nothing."""
+        return self._clock.read(self._now)
+
+    @property
+    def status(self) -> Status:
+        """The status word.
+
+        Source: SC manual p. 30 and p. 33 (published); BUSY during an inspection is a quirk; a
+        camera with a System Error takes no trigger (inferred).
+        """
+        return Status(self._status_word())
+
+    def _status_word(self) -> int:
+        word = self._conditions
+        mode = self._mode
+        if mode is Mode.SWITCHING or self._held_busy:
+            word |= _BUSY
+        if self.behaviour.runs_always and (mode is not Mode.RUNNING or self._faulty):
+            word |= _BUSY  # not Ready
+        if mode is Mode.RUNNING:
+            word |= _RUNNING
+            if self._processing:
+                word |= _BUSY if self.quirks.busy_while_processing else 0
+            elif self._active.triggered and self._takes_runs:
+                word |= _WAITING
+        return word
+
+    # ------------------------------------------------------------------ the wire
+
+    def handle(self, message: m.Message) -> None:
+        """Take a message of the client; without a session everything but Connect is ignored.
+
+        The caller sees to it that only one client's messages come here. Never raises.
+        """
+        if self._mode is Mode.REBOOTING:
+            return
+        if isinstance(message, m.Connect):
+            self.connect()
+        elif isinstance(message, m.Disconnect):
+            answered = self._session and self.behaviour.answers_disconnect
+            self.disconnect()
+            self._output = [m.DisconnectAnswer()] if answered else []
+        elif self._session:
+            self._obey(message)
+        self._advance(self._now)
+
+    def connect(self) -> None:
+        """Begin a session: the answer, then a status, whatever it is.
+
+        Source: SC manual p. 28, 29 (published); that in ``bid`` no status comes: inferred.
+        """
+        self._session, self._owes_switch = True, False
+        self._enter(DeviceState.CONNECTED)
+        self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
+        self._reported = None
+        if self.behaviour.status_with_session:
+            self._report()
+        else:
+            self._reported = (self._status_word(), self._endian)
+
+    def disconnect(self) -> None:
+        """End the session; the camera goes on with what it does, in silence.
+
+        Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
+        """
+        if self._session:
+            self._enter(DeviceState.DISCONNECTED)
+        self._session = self._owes_switch = False  # an answer is for who asked
+        self._output = []
+
+    def watch(self, on_entered: Callable[[DeviceState], None]) -> None:
+        """Have every state told that the device enters from now on.
+
+        It is told right behind the event that brought the device there; behind a message or an
+        operator's action by the next :meth:`tell_entered`.
+        """
+        self._on_entered = on_entered
+        self._bits = self._status_word()
+
+    def tell_entered(self) -> None:
+        """Tell of the states that were entered since the last time."""
+        while self._entered and self._on_entered is not None:
+            states, self._entered = self._entered, []
+            for state in states:
+                self._on_entered(state)
+
+    def take_output(self) -> list[m.Message]:
+        """Return the camera's messages since the last call, in order; the caller owns the list."""
+        output, self._output = self._output, []
+        return output
+
+    def tick(self, dt: float) -> None:
+        """Let ``dt`` seconds pass; what happens in them happens at its own instant.
+
+        Raises:
+            ConfigurationError: a negative time.
+        """
+        if not dt >= 0:
+            raise ConfigurationError(f"device: the time goes forwards, got {dt} s")
+        self._advance(self._now + nanoseconds(dt))
+
+    def next_event_in(self) -> float | None:
+        """Return the seconds until something happens by itself, None where nothing will."""
+        if not self._events:
+            return None
+        return max(0, min(when for when, _ in self._events.values()) - self._now) / NANOSECONDS
+
+    # ------------------------------------------------------------------ the operator
+
+    def start(self) -> None:
+        """Enter run mode, as by the camera's own pages."""
+        with self.around():
+            self._enter_run_mode()
+            self._advance(self._now)
+
+    def stop(self) -> None:
+        """Leave run mode, as by the camera's own pages."""
+        with self.around():
+            self._leave_run_mode()
+
+    def trigger(self) -> bool:
+        """Trigger by the digital input; True if an inspection began."""
+        with self.around():
+            taken = self._trigger()
+            self._advance(self._now)
+        return taken
+
+    def switch_application(self, application: int, *, running: bool = False) -> bool:
+        """Load another application behind the client's back.
+
+        It is stopped for that, whatever the quirks say about a client's switch.
+
+        Args:
+            application: its id.
+            running: enter run mode when it is loaded.
+
+        Returns:
+            False if the camera is switching or rebooting already.
+
+        Raises:
+            ConfigurationError: no application has that id.
+        """
+        target = self._applications[self._known(application)]
+        with self.around():
+            if self._mode in {Mode.SWITCHING, Mode.REBOOTING}:
+                return False
+            self._load(target, answer=False, running=running)
+            self._advance(self._now)
+        return True
+
+    def reboot(self, seconds: float | None = None) -> None:
+        """Restart the camera, as by its power switch.
+
+        Args:
+            seconds: until it is up again; None: what the quirk ``reboot_time`` says.
+        """
+        with self.around():
+            self._reboot(seconds)
+
+    def set_condition(self, condition: Status, on: bool) -> None:
+        """Set or clear Overheat or System Error.
+
+        With a System Error the inspection under way is void, and none begins until it is cleared
+        (inferred); a reboot clears it.
+
+        Raises:
+            ConfigurationError: another bit; those follow from what the camera does.
+        """
+        if condition & ~OPERATOR_CONDITIONS:
+            raise ConfigurationError(
+                f"device: only {OPERATOR_CONDITIONS} can be set, got {condition}"
+            )
+        with self.around():
+            bits = condition.value
+            self._conditions = self._conditions | bits if on else self._conditions & ~bits
+            if self._faulty:
+                self._void_run()
+            self._report()
+
+    def set_endian(self, endian: int) -> None:
+        """Set the byte order of result containers and input data: 0 little, 1 big.
+
+        Other values are reported as they are and build little endian.
+        """
+        with self.around():
+            self._endian = endian
+            self._report()
+
+    # ------------------------------------------------------------------ faults
+
+    def hold_busy(self, seconds: float | None = None) -> None:
+        """Set BUSY and keep it; no inspection begins meanwhile.
+
+        Args:
+            seconds: how long; None: until a reboot or :meth:`end_faults`.
+        """
+        with self.around():
+            if self._mode is Mode.REBOOTING:
+                return
+            self._held_busy = True
+            self._events.pop(_Event.BUSY_ENDS, None)
+            if seconds is not None:
+                self._after(seconds, _Event.BUSY_ENDS, self._end_busy)
+            self._report()
+            self._advance(self._now)
+
+    def drop_triggers(self, count: int) -> None:
+        """Drop so many triggers as if the last image were still analysed."""
+        self._trigger_drops += count
+
+    def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
+        """Change the inspection under way, else the next that begins.
+
+        Args:
+            late: seconds that it takes longer.
+            silent: it sends nothing.
+            extra: how often its container comes beside the first time.
+        """
+        with self.around():
+            self._change.late += nanoseconds(late)
+            self._change.silent |= silent
+            self._change.extra += extra
+            if self._processing:
+                when, action = self._events[_Event.INSPECTED]
+                self._events[_Event.INSPECTED] = (when + nanoseconds(late), action)
+
+    def end_faults(self) -> None:
+        """Undo what still lasts of them: BUSY falls, the next triggers are taken as ever."""
+        with self.around():
+            self._forget_faults()
+            self._report()
+
+    def _end_busy(self) -> None:
+        self._held_busy = False
+        self._report()
+
+    def _forget_faults(self) -> None:
+        self._held_busy = False
+        self._events.pop(_Event.BUSY_ENDS, None)
+        self._trigger_drops = 0
+        self._change = RunChange()
+
+    # ------------------------------------------------------------------ requests
+
+    def _obey(self, message: m.Message) -> None:
+        match message:
+            case m.Trigger():
+                self._acknowledge(message, self._ready_code)
+                self._trigger()
+            case m.Query():
+                self._say(self._name_active())
+            case m.SwitchApplication(application=application):
+                self._switch(application)
+            case m.GetClock():
+                code = ResultCode.OK_DATE_TIME if self.behaviour.coded else 0
+                self._say(self._clock.answer(self._now, code=code))
+            case m.SetClock():
+                done = self._clock.set(message, self._now)
+                self._acknowledge(message, ResultCode.OK if done else ResultCode.ERROR)
+            case m.SetInput(data=data):
+                done = self._take_input(data)
+                self._acknowledge(message, ResultCode.OK if done else ResultCode.ERROR)
+            case m.SetSequenceNumber(number=number):
+                self._next_number = number
+            case m.Start():
+                self._enter_run_mode()
+            case m.Stop():
+                self._leave_run_mode()
+            case m.Reboot():
+                self._reboot()
+            case m.GetStatus():
+                self._say_status()
+            case m.ResetErrors():
+                self._reset_errors(message)
+            case m.UnknownMessage(message_id=message_id):
+                self._complain(message_id, ResultCode.INVALID_COMMAND)
+            case m.MalformedMessage(message_id=message_id):
+                self._complain(message_id, ResultCode.ERROR)
+            case _:
+                pass
+
+    def _acknowledge(self, request: m.Request, code: int) -> None:
+        """Answer a request that other cameras do not answer."""
+        answer = request.answer
+        if self.behaviour.acknowledges and answer and issubclass(answer, m.Acknowledgement):
+            self._say(answer(code=code))
+
+    def _complain(self, message_id: int, code: int) -> None:
+        """Say what is wrong with a message; a smart camera ignores it (SC manual p. 28)."""
+        if self.behaviour.tells_bad_messages:
+            self._say(m.UnknownMessage(message_id=message_id, payload=code.to_bytes(2, "little")))
+
+    @property
+    def _ready_code(self) -> int:
+        return ResultCode.BUSY if self._status_word() & _BUSY else ResultCode.OK
+
+    def _name_active(self) -> m.QueryAnswer:
+        """Tell the active application; ``bid`` does not while another one is loaded."""
+        if self.behaviour.acknowledges and self._mode is Mode.SWITCHING:
+            return m.QueryAnswer(code=ResultCode.BUSY, application=0)
+        code = ResultCode.OK_INSPECTION_ID if self.behaviour.coded else 0
+        return m.QueryAnswer(code=code, application=self._active.id)
+
+    def _reset_errors(self, request: m.ResetErrors) -> None:
+        """Clear the sticky bits; a status follows, whatever was set (BVS ID guide p. 227)."""
+        self._conditions &= ~(_OVERTRIGGERED | _INPUT_CONTAINER)
+        self._acknowledge(request, ResultCode.OK)
+        self._say_status()
+
+    def _enter_run_mode(self) -> None:
+        if self._mode is not Mode.STOPPED:
+            return
+        self._set_mode(Mode.RUNNING)
+        if not self._active.triggered:
+            self._plan_free_run(self._now, 0)
+        self._report()
+
+    def _leave_run_mode(self) -> None:
+        if self._mode is not Mode.RUNNING:
+            return
+        self._set_mode(Mode.STOPPED)
+        self._void_run()
+        self._events.pop(_Event.FREE_RUN, None)
+        self._report()
+
+    def _trigger(self) -> bool:
+        """Begin an inspection, or drop the trigger and say so.
+
+        A stopped, switching or untriggered application ignores it (mvBlueGEMINI manual p. 31 and
+        the newest SC manual p. 48, published).
+        """
+        if self._mode is not Mode.RUNNING or not self._active.triggered or not self._takes_runs:
+            return False
+        if self._processing or self._trigger_drops:
+            self._trigger_drops = max(0, self._trigger_drops - 1)
+            self._conditions |= _OVERTRIGGERED
+            if not self.behaviour.sticky_errors:
+                self._after(
+                    self.quirks.overtriggered_time, _Event.OVERTRIGGER_ENDS, self._end_overtrigger
+                )
+            self._report()
+            return False
+        self._begin_run()
+        return True
+
+    def _switch(self, application: int) -> None:
+        always = self.behaviour.runs_always
+        if always and self._status_word() & _BUSY:
+            self._say(m.SwitchAnswer(code=ResultCode.BUSY, application=self._active.id))
+            return
+        if self._mode is Mode.SWITCHING:
+            return  # not answered: inferred
+        target = self._applications.get(application)  # 0 is never among them
+        stopped = always or self._mode is not Mode.RUNNING
+        how = "allow" if stopped else self.quirks.switch_while_running
+        if target is None or how == "refuse":
+            self._say(m.SwitchAnswer(code=self.behaviour.refused, application=self._active.id))
+        elif how == "allow":
+            self._load(target, answer=True, running=False)
+
+    def _load(self, target: Application, *, answer: bool, running: bool) -> None:
+        """Begin to load ``target``; the status says BUSY until it is there."""
+        self._void_run()
+        self._events.pop(_Event.FREE_RUN, None)
+        self._set_mode(Mode.SWITCHING)
+        self._owes_switch = answer
+        finish = functools.partial(self._finish_load, target, running=running)
+        self._after(target.load_time, _Event.LOADED, finish)
+        self._report()
+
+    def _reboot(self, seconds: float | None = None) -> None:
+        """Go down: the session is gone without a word.
+
+        Source: mvBlueGEMINI manual p. 31 (published for the sibling).
+        """
+        if self._mode is Mode.REBOOTING:
+            return
+        self.disconnect()
+        self._set_mode(Mode.REBOOTING)
+        self._processing = False
+        self._events = {}
+        self._forget_faults()
+        duration = self.quirks.reboot_time if seconds is None else seconds
+        self._after(duration, _Event.BOOTED, self._finish_boot)
+
+    # ------------------------------------------------------------------ time
+
+    def _after(self, seconds: float, event: _Event, action: Callable[[], None]) -> None:
+        self._events[event] = (self._now + nanoseconds(seconds), action)
+
+    def _advance(self, target: int) -> None:
+        """Let everything happen that is due until ``target``."""
+        while self._events:
+            when, event = min([(row[0], event) for event, row in self._events.items()])
+            if when > target:
+                break
+            _, action = self._events.pop(event)
+            self._now = max(self._now, when)
+            action()
+            if self._entered:
+                self.tell_entered()
+        self._now = target
+
+    def _end_overtrigger(self) -> None:
+        self._conditions &= ~_OVERTRIGGERED
+        self._report()
+
+    def _take_up(self, application: Application) -> None:
+        """Make an application the active one."""
+        self._active = application
+        self._period = application.period
+        self._containers: dict[tuple[int, ByteOrder], m.ResultContainer] = {}
+        self._runs = 0  # since it was loaded
+
+    def _finish_load(self, target: Application, *, running: bool) -> None:
+        self._take_up(target)
+        self._forget_inputs()
+        self._set_mode(Mode.STOPPED)
+        message = m.SwitchAnswer(code=0, application=target.id)
+        answer, self._owes_switch = self._owes_switch, False
+        before = self.quirks.switch_answer == "before_status"
+        if answer and before:
+            self._say(message)
+        self._report()
+        if answer and not before:
+            self._say(message)
+        if running or self.behaviour.runs_always:
+            self._enter_run_mode()
+
+    def _finish_boot(self) -> None:
+        """Come up: the last application, stopped; numbering at 0, the clock is lost.
+
+        Source: newest SC manual p. 48 (numbering) and BVS ID guide p. 231 (clock), published;
+        stopped, and a cleared System Error: inferred.
+        """
+        self._set_mode(Mode.STOPPED)
+        self._forget_inputs()
+        self._conditions &= _OVERHEAT
+        self._next_number = self._runs = 0
+        self._clock = CalendarClock(LOST_CLOCK, self._now)
+        if self.behaviour.runs_always:
+            self._enter_run_mode()
+
+    # ------------------------------------------------------------------ inspections
+
+    @property
+    def _faulty(self) -> bool:
+        return bool(self._conditions & _SYSTEM_ERROR)
+
+    @property
+    def _takes_runs(self) -> bool:
+        return not self._faulty and not self._held_busy
+
+    @property
+    def _byte_order(self) -> ByteOrder:
+        return "big" if self._endian == 1 else "little"
+
+    def _plan_free_run(self, origin: int, count: int) -> None:
+        """Plan run ``count`` of a free-running application, counted from its start: no drift."""
+        when = origin + nanoseconds(count / (self._active.rate or 1.0))
+        self._events[_Event.FREE_RUN] = (
+            when,
+            functools.partial(self._begin_free_run, origin, count),
+        )
+
+    def _begin_free_run(self, origin: int, count: int) -> None:
+        self._plan_free_run(origin, count + 1)
+        if not self._takes_runs or self._processing:  # the last one is late
+            return
+        self._begin_run()
+        if not self._change.late:
+            # a run never reaches into the next, however both were rounded
+            (ends, action), (following, _) = (
+                self._events[_Event.INSPECTED],
+                self._events[_Event.FREE_RUN],
+            )
+            self._events[_Event.INSPECTED] = (min(ends, following), action)
+
+    def _begin_run(self) -> None:
+        """Take the next number and the next input container."""
+        change = self._change
+        run = _Inspection(self._next_number, self._runs, self.time, self._next_input(), change)
+        self._next_number = (self._next_number + 1) % _NUMBERS
+        self._runs += 1
+        self._processing = True
+        self._enter(DeviceState.INSPECTING)
+        ends = self._now + nanoseconds(self._active.processing_time) + change.late
+        self._events[_Event.INSPECTED] = (ends, functools.partial(self._finish_run, run))
+        self._report()
+
+    def _finish_run(self, run: _Inspection) -> None:
+        """Send the result, then Waiting for Trigger rises again (the order is a quirk)."""
+        self._processing = False
+        self._change = RunChange()
+        result = self._result(run)
+        if self.quirks.waiting_before_result:
+            self._report()
+        if result is not None and not run.change.silent:
+            for _ in range(1 + run.change.extra):
+                self._say(result)
+        self._report()
+
+    def _result(self, run: _Inspection) -> m.ResultContainer | None:
+        """Return the result; one that comes again and again is built once."""
+        if self._period is None:
+            return self._build_result(run)
+        key = (run.turn % self._period, self._byte_order)
+        result = self._containers.get(key)
+        if result is None:
+            result = self._build_result(run)
+            if result is not None:
+                self._containers[key] = result
+        return result
+
+    def _build_result(self, run: _Inspection) -> m.ResultContainer | None:
+        application = self._active
+        try:
+            data = application.container(
+                number=run.number,
+                turn=run.turn,
+                time=run.time,
+                scene=self.scene,
+                values=run.input,
+                byte_order=self._byte_order,
+            )
+        except Exception:  # noqa: BLE001  a generator is somebody's code; the camera goes on
+            _log.exception("! application %d, run %d: no result", application.id, run.number)
+            return None
+        return None if data is None else m.ResultContainer(application=application.id, data=data)
+
+    def _void_run(self) -> None:
+        """Drop the inspection under way: no result comes from it (inferred)."""
+        if self._processing:
+            self._change = RunChange()
+        self._processing = False
+        self._events.pop(_Event.INSPECTED, None)
+
+    # ------------------------------------------------------------------ input data
+
+    def _take_input(self, data: bytes) -> bool:
+        """Queue a container; one that does not fit the layout is dropped (inferred): False."""
+        layout = self._active.input_layout
+        if layout is None or self._mode is Mode.SWITCHING:
+            return False
+        try:
+            values: Any = layout.parse(data, self._byte_order)
+        except InterpretationError as exc:
+            _log.debug("= input data dropped: %s", exc)
+            return False
+        if not self._inputs.put(values._asdict()):
+            self._in_step(fits=False)
+            self._report()
+        return True
+
+    def _next_input(self) -> Mapping[str, Any] | None:
+        if self._active.input_layout is None:
+            return None
+        values, fits = self._inputs.take()
+        self._in_step(fits=fits)
+        return values
+
+    def _in_step(self, *, fits: bool) -> None:
+        """Set the bit where containers and inspections are out of step, clear it where not.
+
+        A reference value, which does not queue, cannot be.
+        """
+        self._conditions &= ~_INPUT_CONTAINER
+        if not fits and not self.behaviour.acknowledges:
+            self._conditions |= _INPUT_CONTAINER
+
+    def _forget_inputs(self) -> None:
+        """Empty the queue, as for a newly loaded application (inferred)."""
+        self._inputs.clear()
+        self._in_step(fits=True)
+
+    # ------------------------------------------------------------------ output
+
+    def _say(self, message: m.Message) -> None:
+        if self._session:
+            self._output.append(message)
+
+    def _enter(self, state: DeviceState) -> None:
+        if self._on_entered is not None:
+            self._entered.append(state)
+
+    def _set_mode(self, mode: Mode) -> None:
+        self._mode = mode
+        self._enter(DeviceState(mode.value))
+
+    def _note_bits(self, word: int) -> None:
+        """Look which bits of the status word have risen."""
+        risen, self._bits = word & ~self._bits, word
+        self._entered += risen_states(risen)
+
+    def _report(self) -> None:
+        """Send the status if it differs from the one the client has."""
+        now = (self._status_word(), self._endian)
+        if self._on_entered is not None:
+            self._note_bits(now[0])
+        if now != self._reported and self.behaviour.reports_changes:
+            self._reported = now
+            self._say(_status_report(*now))
+
+    def _say_status(self) -> None:
+        """Send the status, whatever the client has."""
+        self._reported = now = (self._status_word(), self._endian)
+        self._say(_status_report(*now))
+
+    def _known(self, application: int) -> int:
+        if application not in self._applications:
+            known = ", ".join(str(key) for key in self._applications)
+            raise ConfigurationError(f"no application has the id {application}; there are {known}")
+        return application
+
+
+@functools.lru_cache(maxsize=64)
+def _status_report(word: int, endian: int) -> m.StatusReport:
+    return m.StatusReport(status=Status(word), endian=endian)
+
+
+def _by_id(applications: Iterable[Application]) -> dict[int, Application]:
+    table: dict[int, Application] = {}
+    for application in applications:
+        if application.id in table:
+            raise ConfigurationError(f"application id {application.id} is there twice")
+        table[application.id] = application
+    if not table:
+        raise ConfigurationError("a camera needs at least one application")
+    return table

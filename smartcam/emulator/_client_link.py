@@ -1,0 +1,424 @@
+"""One client's way to the camera, and the way of its messages while faults act on them.
+
+Each link has a :class:`~smartcam.protocols._framed.machine.Machine` in the camera's role. It is
+faulty only while wire faults wait or something of theirs is under way. What the camera says then
+goes ``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; what a client sends goes
+``FaultyLink.take -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
+
+from smartcam.emulator._clock import OneTimer, nanoseconds
+from smartcam.emulator.faults._delay_line import DelayLine
+from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
+from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import POLICIES, Policy, Role, Transport
+from smartcam.protocols._framed.framing import Frame, Framer
+from smartcam.protocols._framed.machine import Machine
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from contextlib import AbstractContextManager
+
+    from smartcam.emulator._bvs.device import Device
+    from smartcam.emulator._clock import Clock
+    from smartcam.emulator.faults import Fault
+    from smartcam.emulator.faults._delay_line import Ending
+    from smartcam.emulator.faults._matching import FaultQueue
+    from smartcam.protocols._framed.dialect import FramedDialect
+
+_log = logging.getLogger("smartcam.emulator")
+
+MAX_INPUT = 1 << 16
+"""Bytes of payload the camera takes: input data has the container's limit of about 64 kB (HALCON
+script manual p. 35, published for that side)."""
+
+WRITE_LIMIT = 1 << 20
+"""Bytes kept for a client that does not read, or held back by faults; more end its connection."""
+
+_ENDED = "connection ended"
+_UNSENT = "not sent"
+
+BAD_FRAME: Mapping[str, Policy] = {
+    "skip": POLICIES[Role.CAMERA, Transport.TCP],
+    "close": Policy(fatal=(FrameError,), exact_length=True),
+}
+"""What the quirk ``bad_frame`` means on TCP; a broken body or an unknown id never matters."""
+
+
+def _policy(owner: LinkOwner, transport: Transport) -> Policy:
+    """Return the policy for broken input."""
+    tcp = transport is Transport.TCP
+    policy = BAD_FRAME[owner.device.quirks.bad_frame] if tcp else POLICIES[Role.CAMERA, transport]
+    return dataclasses.replace(policy, tells=owner.device.behaviour.tells_bad_messages)
+
+
+class LinkOwner(Protocol):
+    """What links want from the emulator behind them."""
+
+    spoken: FramedDialect
+    clock: Clock
+    queue: FaultQueue  # the faults that wait
+    device: Device  # the camera behind the wire
+
+    def step(self) -> AbstractContextManager[object]:
+        """Bring the device's time up; afterwards deliver what it said."""
+        ...
+
+    def received(self, link: ClientLink, message: m.Message) -> None:
+        """A link received a message."""
+        ...
+
+    def serves(self, link: ClientLink) -> bool:
+        """Whether the link has the session."""
+        ...
+
+    def lost(self, link: ClientLink) -> None:
+        """A link is gone; harmless when said twice."""
+        ...
+
+    def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
+        """A connection has ended."""
+        ...
+
+    def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+        """A machine saw a frame, or bytes that make none."""
+        ...
+
+    def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
+        """What faults made of a message has passed, or is lost."""
+        ...
+
+
+class ClientLink(ABC):
+    """One client's way to the camera."""
+
+    def __init__(self, owner: LinkOwner, transport: Transport, peer: str) -> None:
+        self.peer = peer
+        self.closed: bool = False
+        self.hearing: str | None = None
+        """Kinds of the faults that acted on what the camera hears just now."""
+        self._owner = owner
+        self._machine = Machine(
+            owner.spoken,
+            Role.CAMERA,
+            transport,
+            max_length=MAX_INPUT,
+            policy=_policy(owner, transport),
+            trace=self._trace,
+        )
+        self._faulty: FaultyLink | None = None  # there while faults act
+
+    def say(self, message: m.Message) -> None:
+        """Put a message behind those that :meth:`flush` will write."""
+        if self._owner.queue.said and self._faulty is None:
+            self._enter_faulty()
+        try:
+            self._machine.send(message)
+        except LocalProtocolError as exc:
+            _log.warning("! %s: not sent: %s", self.peer, exc)
+            return
+        if self._faulty is not None:
+            self._faulty.say(message, b"".join(self._machine.data_to_send()))
+
+    def flush(self) -> None:
+        """Write everything said."""
+        faulty = self._faulty
+        if faulty is None:
+            self._write_frames(self._machine.data_to_send())
+            return
+        faulty.run()
+        if faulty.idle:
+            self._faulty = None
+
+    @abstractmethod
+    def close(self, reason: str) -> None:
+        """End the link; nothing is read or written any more."""
+
+    def dismiss(self, reason: str) -> None:
+        """End the link because another client has the session; a dead one stays as it is."""
+        if self._faulty is None or not self._faulty.dead:
+            self.close(reason)
+
+    def unseated(self) -> None:  # noqa: B027  only where links have an order of their own
+        """The client has given the session back; it may stay."""
+
+    def heard(self) -> None:
+        """The camera heard something: write what it said to it."""
+        self.flush()
+
+    def feed(self, data: bytes) -> None:
+        """Feed the machine and pass its messages on."""
+        self._machine.receive_data(data)
+        for event in self._machine.events():
+            if isinstance(event, m.Message) and not self.closed:
+                self._owner.received(self, event)
+
+    @abstractmethod
+    def write(self, data: bytes) -> bool:
+        """Write bytes that belong together; False if it was not possible."""
+
+    @abstractmethod
+    def part(self, how: Literal["close", "reset"]) -> None:
+        """End the link as a fault has it."""
+
+    @abstractmethod
+    def stop_listening(self) -> None:
+        """Read nothing more."""
+
+    @abstractmethod
+    def heal(self) -> None:
+        """End what a fault does to the link for long."""
+
+    def overflow(self) -> None:
+        """Faults hold back too much."""
+        self.close(f"more than {WRITE_LIMIT} bytes are held back")
+
+    @abstractmethod
+    def _write_frames(self, frames: list[bytes]) -> None:
+        """Write frames as they are."""
+
+    def _take(self, data: bytes) -> None:
+        """Take what came: bytes of a stream, or one datagram."""
+        if self._faulty is None and not self._owner.queue.heard:
+            self.feed(data)
+        else:
+            self._enter_faulty().take(data)
+
+    def _enter_faulty(self) -> FaultyLink:
+        if self._faulty is None:
+            self._write_frames(self._machine.data_to_send())
+            self._faulty = FaultyLink(self, self._owner, self._machine)
+        return self._faulty
+
+    def _leave(self) -> None:
+        self.closed = True
+        if self._faulty is not None:
+            self._faulty.close()
+
+    def _trace(self, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+        if self._faulty is None or sender is m.Sender.CLIENT:
+            self._owner.traced(self, sender, what)
+
+
+@dataclass(eq=False)
+class FaultyLink:
+    """Both directions of one link."""
+
+    _link: ClientLink
+    _owner: LinkOwner
+    _machine: Machine
+
+    def __post_init__(self) -> None:
+        self.muted: str | None = None  # kind of the fault that keeps the camera silent on this link
+        self.dead: bool = False  # nothing is read either
+        self._outgoing = self._line(m.Sender.CAMERA, self._wake_outgoing, self._carry_out)
+        self._incoming = self._line(m.Sender.CLIENT, self._wake_incoming, self._carry_in)
+        self._framer: Framer | None = None  # where it is, the client's bytes go through it
+        self._revival = OneTimer(self._owner.clock, self._revive)
+
+    def _line(
+        self,
+        sender: m.Sender,
+        wake: Callable[[], None],
+        carry: Callable[[list[tuple[WireMessage, bytes]]], None],
+    ) -> DelayLine[WireMessage]:
+        return DelayLine(
+            self._owner.clock,
+            ordered=self._machine.transport is Transport.TCP,
+            wake=wake,
+            carry=carry,
+            end=self._end,
+            lost=lambda one: self._lose(sender, one),
+        )
+
+    @property
+    def idle(self) -> bool:
+        """Whether messages may go the short way again, as far as this link is concerned."""
+        return (
+            self.muted is None
+            and not self.dead
+            and self._framer is None
+            and not self._outgoing
+            and not self._incoming
+        )
+
+    @property
+    def unheard(self) -> bool:
+        """Whether something of the client's is held back."""
+        return bool(self._incoming)
+
+    def close(self) -> None:
+        """Drop what is under way, and every timer."""
+        self._revival.set(None)
+        self._outgoing.close()
+        self._incoming.close()
+
+    def heal(self) -> None:
+        """Listen and talk again."""
+        self._revival.set(None)
+        self.muted, self.dead = None, False
+
+    # ------------------------------------------------------------------ out
+
+    def say(self, message: m.Message, data: bytes) -> None:
+        """Take a message that the camera says, and its bytes; :meth:`run` next."""
+        dialect, queue = self._owner.spoken, self._owner.queue
+        frame = Frame(dialect.message_id(message), data[dialect.header.size :])
+        faults = queue.by_message(queue.said, message)
+        self._put(self._outgoing, apply_faults(WireMessage.of(frame, data), faults, dialect))
+
+    def run(self) -> None:
+        """Write everything for which it is time."""
+        self._outgoing.run()
+
+    def _carry_out(self, batch: list[tuple[WireMessage, bytes]]) -> None:
+        silent = self._link.closed or self.muted is not None
+        written = not silent and self._link.write(b"".join(data for _, data in batch))
+        for message, data in batch:
+            if written:
+                message.passed += data
+            elif data:
+                message.faults.append(self._why)
+            if not message.parts:
+                self._owner.passed(self._link, m.Sender.CAMERA, message)
+
+    def _wake_outgoing(self) -> None:
+        with self._owner.step():
+            self._outgoing.run()
+            self._link.flush()
+
+    # ------------------------------------------------------------------ in
+
+    def take(self, data: bytes) -> None:
+        """Take bytes of the client: of a stream, or one datagram."""
+        if self.dead:
+            return
+        heard = self._owner.queue.heard
+        if self._machine.transport is Transport.UDP:
+            self._take_message(cut_datagram(data, self._owner.spoken))
+            return
+        if self._framer is None:
+            data = self._finish_frame(data) if heard else data
+            if not heard or self._machine.buffered:
+                self._link.feed(data)
+                return
+            self._framer = Framer(self._owner.spoken.header, MAX_INPUT)
+        for message in cut(data, self._framer, self._owner.spoken):
+            if self.dead or self._link.closed:
+                return
+            self._take_message(message)
+        self._stop_cutting()
+
+    def _stop_cutting(self) -> None:
+        """Give the bytes of an unfinished frame to the machine where no fault may need it whole."""
+        if self._framer is not None and not self._owner.queue.heard and not self._incoming:
+            rest, self._framer = self._framer.pending, None
+            self._link.feed(rest)
+
+    def _finish_frame(self, data: bytes) -> bytes:
+        """Let the frame pass that was under way when the faults were given; return the rest."""
+        done = 0
+        while self._machine.buffered and done < len(data):
+            self._link.feed(data[done : done + 1])
+            done += 1
+        return data[done:]
+
+    def _take_message(self, message: WireMessage) -> None:
+        queue, frame = self._owner.queue, message.what
+        faults: list[Fault] = []
+        if isinstance(frame, Frame):
+            faults = queue.by_frame(queue.heard, frame)
+        self._put(self._incoming, apply_faults(message, faults, self._owner.spoken))
+        self._incoming.run()
+
+    def _carry_in(self, batch: list[tuple[WireMessage, bytes]]) -> None:
+        for message, data in batch:
+            gone = self.dead or self._link.closed
+            if gone:
+                message.faults.append(self._why)
+            if gone or (message.faults and not data):
+                self._owner.passed(self._link, m.Sender.CLIENT, message)
+                continue
+            message.passed += data
+            self._link.hearing = ", ".join(message.faults) or None
+            self._link.feed(data)
+            self._link.hearing = None
+
+    def _wake_incoming(self) -> None:
+        with self._owner.step():
+            self._incoming.run()
+            self._stop_cutting()
+            self._link.heard()
+
+    # ------------------------------------------------------------------ both
+
+    def _put(self, line: DelayLine[WireMessage], sent: list[WireMessage]) -> None:
+        if line.size + sum(one.size for one in sent) > WRITE_LIMIT:
+            self._link.overflow()
+        outgoing = line is self._outgoing
+        if self._link.closed or (outgoing and self.muted is not None):
+            for one in sent:
+                self._lose(m.Sender.CAMERA if outgoing else m.Sender.CLIENT, one)
+        else:
+            line.put(sent)
+
+    def _lose(self, sender: m.Sender, message: WireMessage) -> None:
+        message.faults.append(self._why)
+        self._owner.passed(self._link, sender, message)
+
+    @property
+    def _why(self) -> str:
+        """Why something is lost now."""
+        return self.muted or (_ENDED if self._link.closed else _UNSENT)
+
+    def _end(self, ending: Ending) -> None:
+        self._outgoing.run()  # what the camera said to the message that ends it
+        if self._link.closed:
+            return
+        if ending.how in {"close", "reset"}:
+            self._link.part("close" if ending.how == "close" else "reset")
+            return
+        self.muted = ending.cause
+        self._outgoing.close()
+        if ending.how == "half_open":
+            self.dead = True
+            self._incoming.close()
+            self._link.stop_listening()
+            if ending.seconds is not None:
+                self._revival.set(nanoseconds(self._owner.clock.now + ending.seconds))
+
+    def _revive(self) -> None:
+        with self._owner.step():
+            self._link.heal()
+
+
+@dataclass(eq=False)
+class SecondClientSession:
+    """The second client of a fault: it has the session and nothing behind it."""
+
+    _dialect: FramedDialect
+    _traced: Callable[[Frame], None]  # told of all the camera says to it; none of it is on a wire
+    peer: ClassVar[str] = "second client"
+
+    def say(self, message: m.Message) -> None:
+        """Take a message."""
+        try:
+            frame = self._dialect.to_frame(message)
+            self._dialect.encode_frame(frame)
+        except LocalProtocolError:
+            return  # a link would not have sent it either
+        self._traced(frame)
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+    def dismiss(self, reason: str) -> None:
+        """Another client has the session; nothing is there to be closed."""

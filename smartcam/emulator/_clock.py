@@ -1,0 +1,148 @@
+"""The time of an emulated camera: the real one, or one that a test moves by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+NANOSECONDS = 1_000_000_000
+"""In a second. Devices and the manual clock count whole nanoseconds, so that instants that are the
+same stay the same however they were summed up."""
+
+
+def nanoseconds(seconds: float) -> int:
+    """Return seconds as whole nanoseconds."""
+    return round(seconds * NANOSECONDS)
+
+
+class TimerHandle(Protocol):
+    """What :meth:`Clock.call_at` returns."""
+
+    def cancel(self) -> None:
+        """Do not call; harmless after the call."""
+        ...
+
+
+class Clock(ABC):
+    """Tells the time and calls back at an instant of it. Seconds, from any origin."""
+
+    @property
+    @abstractmethod
+    def now(self) -> float:
+        """The time, seconds."""
+
+    @abstractmethod
+    def call_at(self, when: float, callback: Callable[[], None]) -> TimerHandle:
+        """Call ``callback`` once when the time has come to ``when``."""
+
+
+class RealClock(Clock):
+    """The running event loop's clock; usable inside a running loop only."""
+
+    @property
+    def now(self) -> float:
+        """The loop's time, seconds."""
+        return asyncio.get_running_loop().time()
+
+    def call_at(self, when: float, callback: Callable[[], None]) -> TimerHandle:
+        """Call ``callback`` by a timer of the loop."""
+        return asyncio.get_running_loop().call_at(when, callback)
+
+
+@dataclass(eq=False)
+class OneTimer:
+    """One timer of a clock, set again whenever something else is next."""
+
+    _clock: Clock
+    _callback: Callable[[], None]  # called when the time has come; the timer is not set then
+
+    def __post_init__(self) -> None:
+        self._handle: TimerHandle | None = None
+        self._when: int | None = None
+
+    def set(self, when: int | None) -> None:
+        """Set it to an instant, nanoseconds; None: not at all."""
+        if when == self._when:
+            return
+        if self._handle is not None:
+            self._handle.cancel()
+        self._handle, self._when = None, when
+        if when is not None:
+            self._handle = self._clock.call_at(when / NANOSECONDS, self._due)
+
+    def _due(self) -> None:
+        self._handle = self._when = None
+        self._callback()
+
+
+@dataclass(slots=True, eq=False)
+class _Timer:
+    """A callback of a manual clock."""
+
+    callback: Callable[[], None] | None
+
+    def cancel(self) -> None:
+        self.callback = None
+
+
+class ManualClock(Clock):
+    """A clock that stands still until :meth:`advance` moves it.
+
+    One clock may serve several cameras: they are moved together.
+    """
+
+    def __init__(self) -> None:
+        self._now = 0
+        self._timers: list[tuple[int, int, _Timer]] = []
+        self._numbers = itertools.count()
+        self._advancing = False
+
+    @property
+    def now(self) -> float:
+        """Seconds that the clock was moved so far."""
+        return self._now / NANOSECONDS
+
+    def call_at(self, when: float, callback: Callable[[], None]) -> TimerHandle:
+        """Call ``callback`` inside the :meth:`advance` that reaches ``when``."""
+        timer = _Timer(callback)
+        entry = (nanoseconds(when), next(self._numbers), timer)
+        heapq.heappush(self._timers, entry)
+        return timer
+
+    def advance(self, seconds: float) -> None:
+        """Move the time and everything that depends on it.
+
+        All that happens inside the interval happens before this returns, in order of time, each
+        at its own instant; what devices send by it is written to their sockets.
+        Call it in the thread of the event loop.
+
+        Args:
+            seconds: how far; not negative.
+
+        Raises:
+            ConfigurationError: a negative time, or a call from inside another one.
+        """
+        if not seconds >= 0:
+            raise ConfigurationError(f"clock: the time goes forwards, got {seconds} s")
+        if self._advancing:
+            raise ConfigurationError("clock: advance() was called inside advance()")
+        target = self._now + nanoseconds(seconds)
+        self._advancing = True
+        try:
+            while self._timers and self._timers[0][0] <= target:
+                when, _, timer = heapq.heappop(self._timers)
+                if timer.callback is not None:
+                    self._now = max(self._now, when)
+                    timer.callback()
+            self._now = target
+        finally:
+            self._advancing = False

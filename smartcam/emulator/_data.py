@@ -1,0 +1,16 @@
+"""What the data have in common of which emulated cameras are made."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+"""A time of up to an hour."""
+
+
+class EmulatorData(BaseModel):
+    """Base of the data: they do not change, and a field that they lack is refused."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")

@@ -1,0 +1,117 @@
+"""Several emulated cameras that are started and stopped together."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from smartcam._server import Server
+from smartcam.emulator._camera import EmulatedCamera
+from smartcam.emulator._scenario.file import load_scenarios
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from smartcam.emulator._clock import Clock
+    from smartcam.emulator._scenario.scenario import Scenario
+
+
+class EmulatedFleet(Server):
+    """Emulated cameras by name; an asynchronous context manager.
+
+    ::
+
+        async with EmulatedFleet("cell.yaml") as fleet:
+            fleet["left"].url
+
+    Args:
+        scenarios: the path of a scenario file, or scenarios with different names.
+        host: address to listen on; nothing but this.
+        transport: ``"tcp"`` or ``"udp"``; default what each scenario says.
+        dialect: name of the wire dialect; default what each scenario says.
+        quirks: fields of :class:`~smartcam.emulator.Quirks` that go before those of each scenario.
+        clock: the time of all; default real time.
+
+    Raises:
+        ConfigurationError: something given is wrong.
+        MissingExtraError: a file was given and PyYAML is not installed.
+    """
+
+    def __init__(
+        self,
+        scenarios: Iterable[Scenario] | str | Path,
+        *,
+        host: str = "127.0.0.1",
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        given = (
+            load_scenarios(scenarios, dialect=dialect)
+            if isinstance(scenarios, (str, Path))
+            else tuple(scenarios)
+        )
+        self._cameras: dict[str, EmulatedCamera] = {}
+        for scenario in given:
+            if scenario.name in self._cameras:
+                raise ConfigurationError(f"emulator: two cameras are called {scenario.name!r}")
+            own = scenario.quirks.model_dump(exclude_unset=True)
+            self._cameras[scenario.name] = EmulatedCamera(
+                scenario=scenario,
+                host=host,
+                transport=transport,
+                dialect=dialect,
+                quirks={**own, **quirks} if quirks else None,
+                clock=clock,
+            )
+        self._stack = contextlib.AsyncExitStack()
+
+    def __getitem__(self, name: str) -> EmulatedCamera:
+        """Return a camera.
+
+        Raises:
+            ConfigurationError: none is called so.
+        """
+        try:
+            return self._cameras[name]
+        except KeyError as exc:
+            there = ", ".join(self._cameras)
+            raise ConfigurationError(
+                f"the fleet has no camera {name!r}; there are {there}"
+            ) from exc
+
+    def __iter__(self) -> Iterator[EmulatedCamera]:
+        return iter(self._cameras.values())
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    @property
+    def cameras(self) -> dict[str, EmulatedCamera]:
+        """All by name, in order; a new mapping each time."""
+        return dict(self._cameras)
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """Their addresses by name."""
+        return {name: camera.url for name, camera in self._cameras.items()}
+
+    async def start(self) -> None:
+        """Start all; does nothing where they are started already.
+
+        Raises:
+            ConfigurationError: one cannot listen; none is started.
+
+        Cancellation: leaves all stopped.
+        """
+        async with contextlib.AsyncExitStack() as stack:
+            for camera in self._cameras.values():
+                await stack.enter_async_context(camera)
+            self._stack = stack.pop_all()
+
+    async def stop(self) -> None:
+        """Stop all. Harmless when done twice."""
+        await self._stack.aclose()

@@ -1,0 +1,163 @@
+"""Where an application's values may come from beside constants: functions with a name.
+
+A generator takes a :class:`Run` and returns what ``Layout.build`` takes: a mapping for a record, a
+list of mappings for ``( ... )*``. :func:`register_generator` adds one that scenario files can name;
+in Python the function itself can be given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from smartcam.emulator._scene import Observation, TableScene
+    from smartcam.layout import Field, Layout
+
+Values: TypeAlias = Mapping[str, Any] | Sequence[Any]
+
+
+class Run(NamedTuple):
+    """One inspection, as its application sees it.
+
+    Attributes:
+        number: the run's sequence number.
+        turn: runs of this application before it, since it was loaded.
+        time: seconds since the device was made.
+        layout: layout of the result.
+        scene: the table the camera looks at.
+        input: the input container's values, None for an application without one.
+        parameters: ``parameters`` of the application.
+    """
+
+    number: int
+    turn: int
+    time: float
+    layout: Layout
+    scene: TableScene
+    input: Mapping[str, Any] | None
+    parameters: Mapping[str, Any]
+
+
+Generator: TypeAlias = Callable[[Run], Values]
+
+
+def zeros(fields: Sequence[Field]) -> dict[str, Any]:
+    """Return the values of a tool that did not run: zero, False or an empty string for each field.
+
+    Source: HALCON script manual p. 2 (published).
+    """
+    empty: dict[str, Any] = {"string": "", "bool": False}
+    return {field.name: empty.get(field.type, 0) for field in fields}
+
+
+def wrap_number(field: Field, number: int) -> int:
+    """Return a sequence number as ``field`` can hold it: it starts over where it overflows."""
+    low, high = field.wire.low, field.wire.high
+    if low is None or high is None:
+        return number
+    return (number - low) % (high - low + 1) + low
+
+
+def find_generator(name: str) -> Generator:
+    """Return the generator of that name.
+
+    Raises:
+        ConfigurationError: there is none; the text names those there are.
+    """
+    try:
+        return _GENERATORS[name]
+    except KeyError as exc:
+        raise ConfigurationError(
+            f"generator {name!r} is unknown; known are {', '.join(generator_names())}"
+        ) from exc
+
+
+def generator_names() -> list[str]:
+    """Return the names of all generators, sorted."""
+    return sorted(_GENERATORS)
+
+
+def register_generator(name: str, function: Generator) -> None:
+    """Let applications name ``function`` as their generator.
+
+    Raises:
+        ConfigurationError: the name is taken by another function.
+    """
+    if _GENERATORS.get(name, function) is not function:
+        raise ConfigurationError(f"generator {name!r} is there already")
+    _GENERATORS[name] = function
+
+
+def _tangram(run: Run) -> Values:
+    """The table's pieces as the camera's own calibration gives them: metres and radians."""
+
+    def record(seen: Observation) -> dict[str, Any]:
+        pose = run.scene.to_table(seen)
+        return _localization(seen, x=pose.x, y=pose.y, theta=pose.theta)
+
+    return _records(run, record)
+
+
+def _tangram_pixels(run: Run) -> Values:
+    """The table's pieces in pixels of the image; theta in radians."""
+
+    def record(seen: Observation) -> dict[str, Any]:
+        return _localization(seen, x=seen.u, y=seen.v, theta=seen.theta)
+
+    return _records(run, record)
+
+
+def _localization(seen: Observation, *, x: float, y: float, theta: float) -> dict[str, Any]:
+    return {
+        "feature_id": seen.name,
+        "quality": seen.quality,
+        "photo_index": 0,
+        "x": x,
+        "y": y,
+        "theta": theta,
+    }
+
+
+def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Values:
+    """Return the fields that the layout has; ``pieces`` in the parameters picks and orders."""
+    found = {seen.name: seen for seen in run.scene.measure()}
+    wanted: Sequence[str] = run.parameters.get("pieces", list(found))
+    names = {field.name for field in run.layout.fields}
+    records = [
+        {key: value for key, value in record(found[name]).items() if key in names}
+        for name in wanted
+        if name in found
+    ]
+    if run.layout.repeat is None:
+        return records[0] if records else zeros(run.layout.fields)
+    return records
+
+
+def _sequence(run: Run) -> Values:
+    """The run's number in the ``@sequence`` field, else in ``field`` or the layout's first."""
+    fields = run.layout.head or run.layout.fields
+    marked = run.layout.sequence_field
+    name = run.parameters.get("field", marked.name if marked is not None else fields[0].name)
+    values = zeros(run.layout.fields)
+    for field in run.layout.fields:
+        if field.name == name:
+            values[name] = wrap_number(field, run.number)
+    return values if run.layout.repeat is None else [values]
+
+
+def _input(run: Run) -> Values:
+    """The input container's values, in the fields of the same names."""
+    values = zeros(run.layout.fields)
+    values.update((key, value) for key, value in (run.input or {}).items() if key in values)
+    return values if run.layout.repeat is None else [values]
+
+
+_GENERATORS: dict[str, Generator] = {
+    "tangram": _tangram,
+    "tangram_pixels": _tangram_pixels,
+    "sequence": _sequence,
+    "input": _input,
+}

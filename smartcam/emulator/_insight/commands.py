@@ -1,0 +1,242 @@
+"""What the emulated In-Sight camera answers to a line, to the byte."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from pydantic import Field
+
+from smartcam.emulator._data import EmulatorData
+from smartcam.emulator._insight.image import bitmap
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols._insight import words
+from smartcam.protocols._insight.words import StatusCode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from smartcam.emulator._insight.device import InSightDevice
+
+
+class InSightQuirks(EmulatorData):
+    """What is not known of real cameras."""
+
+    event_answer: Literal["code", "sized"] = Field(
+        default="code",
+        description=(
+            "what answers SE: the code alone, or the code, a length and a text as for EV, which "
+            "CognexNativePy 1.0.12 expects"
+        ),
+    )
+    image_size: Literal["digits", "bytes"] = Field(
+        default="digits",
+        description=(
+            "what the size line of RI and RB counts: hexadecimal digits, as published for RJ and "
+            "RS, or bytes of the bitmap file"
+        ),
+    )
+    transfer_pause: float = Field(
+        default=0.0,
+        ge=0,
+        le=60,
+        allow_inf_nan=False,
+        description="seconds between the size line of an image and its data",
+    )
+
+
+class Respond(Protocol):
+    """Takes what answers a command."""
+
+    def __call__(self, data: bytes, *, more: bool = False) -> None:
+        """Send bytes; with ``more`` the rest comes in another call."""
+
+
+class InSightCommands:
+    """A camera's commands; the arguments are those of the emulator.
+
+    Raises:
+        ConfigurationError: something given is wrong.
+    """
+
+    def __init__(
+        self,
+        device: InSightDevice,
+        *,
+        evaluations: Mapping[str, str] | None = None,
+        info: Mapping[str, str] | None = None,
+        quirks: InSightQuirks | None = None,
+    ) -> None:
+        self.quirks: InSightQuirks = InSightQuirks() if quirks is None else quirks
+        self._device = device
+        self._evaluations = dict(evaluations or {})
+        self._info = {**_INFO, **(info or {})}
+        if len(self._info) != len(_INFO):
+            raise ConfigurationError(f"info: known are {', '.join(_INFO)}")
+        for what, texts in (("info", self._info), ("evaluations", self._evaluations)):
+            for name, text in texts.items():
+                _check_sendable(f"{what}: {name}", text)
+        self._at_once: Mapping[str, Callable[[str], bytes]] = {
+            "GO": lambda _: _line(str(int(device.online))),
+            "SO": self._set_online,
+            "GF": lambda _: _found(None if device.job is None else device.job.file),
+            "GJ": lambda _: _found(None if device.job is None else device.job.id),
+            "GV": self._get_value,
+            "SI": lambda argument: self._set_value(argument, "int", _integer),
+            "SF": lambda argument: self._set_value(argument, "float", _number),
+            "SS": lambda argument: self._set_value(argument, "string", str),
+            "GI": self._get_info,
+            "EV": self._evaluate,
+        }
+        self._in_time: Mapping[str, Callable[[str, Respond], None]] = {
+            "SE": self._set_event,
+            "SW": self._set_event_and_wait,
+            "LF": lambda argument, respond: self._load(argument or None, respond),
+            "SJ": self._set_job,
+            "RI": self._read_image,
+            "RB": self._read_image,
+        }
+
+    def execute(self, line: str, respond: Respond) -> None:
+        """Do what a line without its end says; the answer comes at once or in the device's time."""
+        mnemonic, argument = line[:2].upper(), line[2:]
+        row = words.COMMANDS.get(mnemonic)
+        if row is None or (argument and not row.arguments):
+            respond(_coded(StatusCode.UNRECOGNIZED))
+        elif mnemonic in self._at_once:
+            respond(self._at_once[mnemonic](argument))
+        else:
+            self._in_time[mnemonic](argument, respond)
+
+    # ------------------------------------------------------------------ mode and events
+
+    def _set_online(self, argument: str) -> bytes:
+        if argument not in {"0", "1"}:
+            return _coded(StatusCode.INVALID_ARGUMENT)
+        return _coded(self._device.request_online(argument == "1"))
+
+    def _set_event(self, argument: str, respond: Respond) -> None:
+        def told(code: StatusCode) -> None:
+            sized = code == StatusCode.DONE and self.quirks.event_answer == "sized"
+            respond(_sized("") if sized else _coded(code))
+
+        self._event(argument, told, at_image=True)
+
+    def _set_event_and_wait(self, argument: str, respond: Respond) -> None:
+        self._event(argument, lambda code: respond(_coded(code)), at_image=False)
+
+    def _event(self, argument: str, told: Callable[[StatusCode], None], *, at_image: bool) -> None:
+        event = _integer(argument)
+        if event is None or not 0 <= event <= words.TRIGGER_EVENT:
+            told(StatusCode.INVALID_ARGUMENT)
+        else:
+            self._device.request_event(event, told, at_image=at_image)
+
+    # ------------------------------------------------------------------ jobs
+
+    def _set_job(self, argument: str, respond: Respond) -> None:
+        number = _integer(argument)
+        self._load(None if number is None or number < 0 else number, respond)
+
+    def _load(self, job: str | int | None, respond: Respond) -> None:
+        if job is None:
+            respond(_coded(StatusCode.INVALID_ARGUMENT))
+        else:
+            self._device.request_job(job, lambda code: respond(_coded(code)))
+
+    # ------------------------------------------------------------------ cells
+
+    def _get_value(self, argument: str) -> bytes:
+        cell = words.parse_wire_cell(argument)
+        key = self._named(argument) if cell is None else cell[0].wire
+        if key is None or (cell is not None and cell[1]):
+            return _coded(StatusCode.INVALID_ARGUMENT)
+        return _found(self._device.cells.get(key))
+
+    def _set_value(
+        self, argument: str, kind: str, read: Callable[[str], int | float | str | None]
+    ) -> bytes:
+        key, rest = self._target(argument)
+        value = read(rest)
+        if key is None or value is None:
+            return _coded(StatusCode.INVALID_ARGUMENT)
+        return _coded(self._device.request_value(key, kind, value))
+
+    def _target(self, argument: str) -> tuple[str | None, str]:
+        """Return under what the cell to be set is kept, None if there is no such, and the rest."""
+        cell = words.parse_wire_cell(argument)
+        if cell is not None:
+            return cell[0].wire, cell[1]
+        name, _, rest = argument.partition(" ")
+        return self._named(name), rest
+
+    def _named(self, name: str) -> str | None:
+        """Return under what a cell with a name is kept, None if there is no such.
+
+        Cells are kept in upper case, so one without its three digits is not found.
+        """
+        key, job = name.lower(), self._device.job
+        return key if job is not None and key in job.sources else None
+
+    # ------------------------------------------------------------------ the rest
+
+    def _get_info(self, _argument: str) -> bytes:
+        lines = (_line(f"{name}: {value}") for name, value in self._info.items())
+        return _coded(StatusCode.DONE) + b"".join(lines)
+
+    def _evaluate(self, argument: str) -> bytes:
+        text = self._evaluations.get(argument.strip())
+        return _coded(StatusCode.FAILED) if text is None else _sized(text)
+
+    def _read_image(self, _argument: str, respond: Respond) -> None:
+        data = bitmap(self._device.image)
+        digits, lines = words.hex_lines(data)
+        respond(_found(digits if self.quirks.image_size == "digits" else len(data)), more=True)
+        self._device.after(self.quirks.transfer_pause, lambda: respond(lines))
+
+
+_INFO = {
+    "Serial Number": "100000001",
+    "Application Version": "6.1.0",
+    "Monitor Version": "6.1.0",
+    "MAC Address": "00-D0-24-00-00-01",
+    "Date of Build": "Jan 01 2020",
+}
+"""The names stand in a public client's tests (derived); the values are the emulator's."""
+
+_INTEGER = re.compile(r"[+-]?[0-9]{1,10}")
+_NUMBER = re.compile(r"[+-]?([0-9]{1,20}(\.[0-9]{0,20})?|\.[0-9]{1,20})([eE][+-]?[0-9]{1,2})?")
+
+
+def _line(text: str) -> bytes:
+    return text.encode(words.ENCODING) + words.LINE_END
+
+
+def _coded(code: StatusCode) -> bytes:
+    return _line(str(int(code)))
+
+
+def _found(value: str | int | None) -> bytes:
+    """Return the answer with what was asked for; None: not possible."""
+    if value is None:
+        return _coded(StatusCode.FAILED)
+    return _coded(StatusCode.DONE) + _line(str(value))
+
+
+def _sized(text: str) -> bytes:
+    return _found(len(text)) + _line(text)
+
+
+def _check_sendable(where: str, text: str) -> None:
+    try:
+        text.encode(words.ENCODING)
+    except UnicodeEncodeError as exc:
+        raise ConfigurationError(f"{where}: only Latin-1 can be sent, got {text!r:.80}") from exc
+
+
+def _integer(text: str) -> int | None:
+    return int(text) if _INTEGER.fullmatch(text) else None
+
+
+def _number(text: str) -> float | None:
+    return float(text) if _NUMBER.fullmatch(text) else None

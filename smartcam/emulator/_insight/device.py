@@ -1,0 +1,308 @@
+"""The emulated In-Sight camera itself: its jobs, its mode and its runs, without sockets and words.
+
+Its time is what :meth:`InSightDevice.advance_to` tells it. What the public documents leave open is
+decided in ``docs/insight.md``.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import logging
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from smartcam.emulator._clock import nanoseconds
+from smartcam.emulator._insight.image import check_image, grey_pattern
+from smartcam.emulator._insight.job import CellValue, Control, Job, make_job, shown
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols._insight.words import TRIGGER_EVENT, StatusCode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Told: TypeAlias = Callable[[StatusCode], None]
+
+_log = logging.getLogger("smartcam.emulator")
+
+
+class _PendingEvent:
+    """An acquisition and what follows, or a soft event."""
+
+    def __init__(self, told: Told | None) -> None:
+        self.over: bool = False
+        self._told = told
+
+    def tell(self, code: StatusCode) -> None:
+        """Tell how it went; only the first call does."""
+        told, self._told = self._told, None
+        if told is not None:
+            told(code)
+
+    def end(self, code: StatusCode) -> None:
+        """Finish, one way or the other."""
+        self.over = True
+        self.tell(code)
+
+
+class InSightDevice:
+    """A camera with jobs and an image.
+
+    What a client's command asks for returns or tells the status code that answers it.
+
+    Its arguments are those of :class:`~smartcam.emulator.EmulatedInSight`.
+
+    Raises:
+        ConfigurationError: something given is wrong.
+    """
+
+    def __init__(
+        self,
+        jobs: Iterable[Job | Mapping[str, Any]] = (),
+        *,
+        active: str | None = None,
+        online: bool = False,
+        image: Any = None,
+    ) -> None:
+        self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])  # by file name
+        # the active one, None for one that was never saved
+        self.job: Job | None = next(iter(self.jobs.values()), None)
+        self.runs: int = 0  # acquisitions with a result since it was made
+        self._image: NDArray[np.uint8] = grey_pattern() if image is None else check_image(image)
+        self._now = 0
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._numbers = itertools.count()
+        self._wanted_online = online  # by clients
+        self._allowed_online = True  # by the operator or an input
+        self._loading = False
+        self._run: _PendingEvent | None = None
+        self._turn = 0  # acquisitions since the job was loaded
+        self._cells: dict[str, str] = {}
+        self._generation = 0  # of free running: an older one has ended
+        if active is not None:
+            self.job = self.find(active)
+        self._begin_job()
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def online(self) -> bool:
+        """Whether it is online: wanted by clients, and not held offline (manual, published)."""
+        return self._wanted_online and self._allowed_online
+
+    @property
+    def busy(self) -> bool:
+        """Whether a run or the loading of a job is under way."""
+        return self._loading or self._run is not None
+
+    @property
+    def cells(self) -> Mapping[str, str]:
+        """What the cells show, by ``A012`` or by name in lower case; none while a job is loaded."""
+        return {} if self._loading else dict(self._cells)
+
+    @property
+    def image(self) -> NDArray[np.uint8]:
+        """What it sees. Setting it raises ConfigurationError for what is no 8 bit grey image."""
+        return self._image
+
+    @image.setter
+    def image(self, image: Any) -> None:
+        self._image = check_image(image)
+
+    def find(self, job: str | int) -> Job:
+        """Return a job by its file name, with the extension or without, or by its id.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        for one in self.jobs.values():
+            if one.id == job if isinstance(job, int) else one.is_called(job):
+                return one
+        known = ", ".join(self.jobs) or "none"
+        raise ConfigurationError(f"job {job!r} is not on the camera; there are: {known}")
+
+    # ------------------------------------------------------------------ time
+
+    @property
+    def now(self) -> int:
+        """Its time, nanoseconds since it was made."""
+        return self._now
+
+    @property
+    def due(self) -> int | None:
+        """When something happens next by itself, nanoseconds; None if nothing will."""
+        return self._agenda[0][0] if self._agenda else None
+
+    def advance_to(self, now: int) -> None:
+        """Bring its time up, nanoseconds, and do what was due, in order, each at its own time.
+
+        An earlier time than before changes nothing.
+        """
+        while self._agenda and self._agenda[0][0] <= now:
+            at, _, action = heapq.heappop(self._agenda)
+            self._now = max(self._now, at)
+            action()
+        self._now = max(self._now, now)
+
+    def after(self, seconds: float, action: Callable[[], None]) -> None:
+        """Do something when so much time has passed; at once for none."""
+        if seconds <= 0:
+            action()
+            return
+        at = self._now + max(1, nanoseconds(seconds))
+        heapq.heappush(self._agenda, (at, next(self._numbers), action))
+
+    # ------------------------------------------------------------------ the operator
+
+    def set_online(self, online: bool) -> None:
+        """Go online, or be held offline by hand or an input: ``SO1`` alone does not undo that."""
+        self._switch(wanted=self._wanted_online or online, allowed=online)
+
+    def trigger(self) -> bool:
+        """Trigger by the input; False if the camera does not take it, as for ``SE8``."""
+        return self._begin_run(TRIGGER_EVENT, None, at_image=False)
+
+    def load(self, job: str | int) -> None:
+        """Load a job by hand, at once and in either mode; a run under way ends without a result.
+
+        Raises:
+            ConfigurationError: there is none, or another one is being loaded.
+        """
+        found = self.find(job)
+        if self._loading:
+            raise ConfigurationError(f"job {job!r}: another one is being loaded")
+        self._break_run()
+        self.job = found
+        self._begin_job()
+
+    # ------------------------------------------------------------------ what clients ask for
+
+    def request_online(self, online: bool) -> StatusCode:
+        """Go online or offline for a client (``SO``)."""
+        if self._loading:
+            return StatusCode.FAILED
+        self._switch(wanted=online, allowed=self._allowed_online)
+        return StatusCode.STILL_OFFLINE if online and not self.online else StatusCode.DONE
+
+    def request_job(self, job: str | int, told: Told) -> None:
+        """Load a job for a client (``LF``, ``SJ``); the code is told at its end, or at once."""
+        try:
+            found = self.find(job)
+        except ConfigurationError:
+            told(StatusCode.FAILED)
+            return
+        if self.online or self._loading:
+            told(StatusCode.FAILED)
+            return
+        self._loading = True
+
+        def loaded() -> None:
+            self._loading = False
+            self.job = found
+            self._begin_job()
+            told(StatusCode.DONE)
+
+        self.after(found.load_time, loaded)
+
+    def request_event(self, event: int, told: Told, *, at_image: bool) -> None:
+        """Cause an event, 0 to 8, for a client; ``told`` is told the code.
+
+        That is when the image is there (``SE``), or when the cells are (``SW``).
+        """
+        if not self._begin_run(event, told, at_image=at_image):
+            told(StatusCode.FAILED)
+
+    def request_value(self, key: str, kind: str, value: CellValue) -> StatusCode:
+        """Set a control of some kind for a client (``SI``, ``SF``, ``SS``)."""
+        source = None if self.job is None else self.job.sources.get(key)
+        if not isinstance(source, Control) or source.kind != kind or self._loading:
+            return StatusCode.FAILED
+        if not source.admits(value):
+            return StatusCode.FAILED
+        self._cells[key] = shown(value)
+        return StatusCode.DONE
+
+    # ------------------------------------------------------------------ inside
+
+    def _begin_job(self) -> None:
+        self._turn = 0
+        self._cells = {} if self.job is None else self.job.fresh_cells()
+        self._generation += 1
+        self._run_freely()
+
+    def _switch(self, *, wanted: bool, allowed: bool) -> None:
+        before = self.online
+        self._wanted_online, self._allowed_online = wanted, allowed
+        if self.online == before:
+            return
+        self._generation += 1
+        if self.online:
+            self._run_freely()
+        else:
+            self._break_run()
+
+    def _begin_run(self, event: int, told: Told | None, *, at_image: bool) -> bool:
+        job = _UNSAVED if self.job is None else self.job
+        acquires = event == TRIGGER_EVENT
+        if not self.online or self.busy or (acquires and not job.triggered):
+            return False
+        run = self._run = _PendingEvent(told)
+
+        def seen() -> None:
+            if run.over:
+                return
+            if at_image:
+                run.tell(StatusCode.DONE)
+            self.after(job.processing_time, done)
+
+        def done() -> None:
+            if run.over:
+                return
+            self._run = None
+            if acquires:
+                self._finish_acquisition(job)
+            run.end(StatusCode.DONE)
+
+        self.after(job.acquisition_time if acquires else 0.0, seen)
+        return True
+
+    def _finish_acquisition(self, job: Job) -> None:
+        self.runs += 1
+        self._turn += 1
+        job.update_cells(self._cells, self._turn)
+
+    def _break_run(self) -> None:
+        run, self._run = self._run, None
+        if run is not None:
+            run.end(StatusCode.FAILED)
+
+    def _run_freely(self) -> None:
+        job = self.job
+        if job is None or job.rate is None or not self.online:
+            return
+        generation, period = self._generation, 1 / job.rate
+
+        def turn() -> None:
+            if generation == self._generation:
+                self._finish_acquisition(job)
+                self.after(period, turn)
+
+        self.after(period, turn)
+
+
+_UNSAVED = Job(file="unsaved")
+
+
+def _by_file(jobs: list[Job]) -> dict[str, Job]:
+    by_file: dict[str, Job] = {}
+    by_id: dict[int, Job] = {}
+    for job in jobs:
+        if by_file.setdefault(job.file, job) is not job:
+            raise ConfigurationError(f"job {job.file}: there are two of that name")
+        if job.id is not None and by_id.setdefault(job.id, job) is not job:
+            raise ConfigurationError(
+                f"jobs {by_id[job.id].file} and {job.file} have the same id, {job.id}"
+            )
+    return by_file

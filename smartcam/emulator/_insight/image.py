@@ -1,0 +1,61 @@
+"""Images of the emulated In-Sight camera: 8 bit grey, sent as a bitmap file."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAX_PIXELS = 1 << 23
+"""Of an image; larger ones are refused. The camera's sensors have up to 5 megapixels."""
+
+_FILE_HEADER = struct.Struct("<2sIHHI")
+_INFO_HEADER = struct.Struct("<IiiHHIIiiII")
+_PALETTE = b"".join(bytes((grey, grey, grey, 0)) for grey in range(256))
+
+
+def grey_pattern(width: int = 64, height: int = 48) -> NDArray[np.uint8]:
+    """Return a picture, in pixels, that shows which way round it is: grey rises right and down."""
+    across = np.linspace(0, 191, width)
+    down = np.linspace(0, 64, height)
+    return (across[np.newaxis, :] + down[:, np.newaxis]).astype(np.uint8)
+
+
+def check_image(image: Any) -> NDArray[np.uint8]:
+    """Return a copy of an 8 bit grey image.
+
+    Raises:
+        ConfigurationError: it is none, is empty, or has more than 8 megapixels.
+    """
+    array: NDArray[Any] = np.asarray(image)
+    if array.dtype != np.uint8 or array.ndim != 2:
+        raise ConfigurationError(
+            f"an image is a table of uint8, got {array.ndim} axes of {array.dtype}"
+        )
+    if not 0 < array.size <= MAX_PIXELS:
+        raise ConfigurationError(f"an image has 1 to {MAX_PIXELS} pixels, got {array.size}")
+    return array.copy()
+
+
+def bitmap(image: NDArray[np.uint8]) -> bytes:
+    """Return an image as a BMP file: 8 bits a pixel, a palette of greys, the last row first.
+
+    That the camera sends a standard BMP is published; which of its forms is not.
+    """
+    height, width = image.shape
+    rows = np.pad(image[::-1], ((0, 0), (0, -width % 4))).tobytes()
+    offset = _FILE_HEADER.size + _INFO_HEADER.size + len(_PALETTE)
+    return (
+        _FILE_HEADER.pack(b"BM", offset + len(rows), 0, 0, offset)
+        + _INFO_HEADER.pack(
+            _INFO_HEADER.size, width, height, 1, 8, 0, len(rows), 2835, 2835, 256, 256
+        )
+        + _PALETTE
+        + rows
+    )

@@ -1,0 +1,266 @@
+"""Jobs of the emulated In-Sight camera: files on it, each with the cells of its spreadsheet."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from numbers import Real
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from smartcam.emulator._data import EmulatorData, Seconds
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols._insight import words
+from smartcam.settings import validated
+
+_log = logging.getLogger("smartcam.emulator")
+
+EXTENSIONS = (".job", ".jobx")
+"""Of job files: of older and of newer cameras (manual, published)."""
+
+MAX_CELL_TEXT = 1024
+"""Characters of a cell's text; a bound of the emulator."""
+
+CellValue: TypeAlias = bool | int | float | str
+"""What a cell may hold. The spreadsheet knows numbers and texts; a bool is the number 0 or 1."""
+
+_Name = Annotated[str, Field(min_length=1, max_length=255)]
+
+
+class Control(EmulatorData):
+    """An edit control in a cell: what ``SI``, ``SF`` and ``SS`` may set.
+
+    Its value is set back when the job is loaded.
+    """
+
+    kind: Literal["int", "float", "string"] = Field(
+        description="which command sets it: SI an int, SF a float, SS a string"
+    )
+    value: int | float | str = Field(description="what it holds when the job is loaded")
+    low: float | None = Field(default=None, description="least number that is taken")
+    high: float | None = Field(default=None, description="greatest number that is taken")
+    max_length: int = Field(
+        default=255, ge=1, le=MAX_CELL_TEXT, description="characters of a string"
+    )
+
+    def admits(self, value: CellValue) -> bool:
+        """Return whether the value lies within its bounds and fits a line, with the kind's type."""
+        if isinstance(value, str):
+            fits = len(value) <= self.max_length and (value == "" or _printable(value))
+            return self.kind == "string" and fits
+        if self.kind == "string" or not math.isfinite(value):
+            return False
+        low = -math.inf if self.low is None else self.low
+        high = math.inf if self.high is None else self.high
+        return low <= value <= high
+
+    @model_validator(mode="after")
+    def _check(self) -> Control:
+        kinds: Mapping[str, tuple[type, ...]] = {
+            "int": (int,),
+            "float": (int, float),
+            "string": (str,),
+        }
+        if isinstance(self.value, bool) or not isinstance(self.value, kinds[self.kind]):
+            raise ValueError(f"a control for {self.kind} cannot hold {self.value!r}")  # noqa: TRY004
+        if not self.admits(self.value):
+            raise ValueError(f"{self.value!r} is outside the control's own bounds")
+        return self
+
+
+CellSource: TypeAlias = Control | CellValue | list[CellValue] | Callable[[int], CellValue]
+"""Where a cell's value comes from: a control, a constant, a list (a value an acquisition, over and
+over), or a function of the run's number, which is 1 for the first since the job was loaded."""
+
+
+class Job(EmulatorData):
+    """A program on the camera: a file, and the spreadsheet in it.
+
+    Raises:
+        pydantic.ValidationError: a field is wrong.
+    """
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        frozen=True, extra="forbid", arbitrary_types_allowed=True
+    )
+
+    file: _Name = Field(
+        description="name of its file; a number of up to three digits at its beginning is its id"
+    )
+    cells: dict[str, Any] = Field(
+        default_factory=dict[str, Any],
+        description=(
+            "cell (A1) or name of a cell to a control, a constant, a list or a function of the "
+            "run's number"
+        ),
+    )
+    rate: float | None = Field(
+        default=None,
+        ge=0.0001,
+        le=1000,
+        allow_inf_nan=False,
+        description="acquisitions per second while online; None: it waits for triggers",
+    )
+    load_time: Seconds = Field(default=0.5, description="seconds until it is loaded")
+    acquisition_time: Seconds = Field(
+        default=0.02, description="seconds from a trigger until the image is there"
+    )
+    processing_time: Seconds = Field(
+        default=0.03, description="seconds from the image until the cells are there"
+    )
+
+    @cached_property
+    def id(self) -> int | None:
+        """The number its file name begins with (manual, published); None without."""
+        return words.job_id(self.file)
+
+    @property
+    def triggered(self) -> bool:
+        """Whether it waits for triggers: only then do ``SE8`` and ``SW8`` work (published)."""
+        return self.rate is None
+
+    def is_called(self, name: str) -> bool:
+        """Return whether ``name`` is its file's, with the extension or without."""
+        return name == self.file or any(name + end == self.file for end in EXTENSIONS)
+
+    @cached_property
+    def sources(self) -> Mapping[str, Any]:
+        """Its cells by :func:`cell_key`."""
+        return {cell_key(name): source for name, source in self.cells.items()}
+
+    def fresh_cells(self) -> dict[str, str]:
+        """Return the cells' texts right after loading: what needs a run is in error."""
+        return {key: self._show(key, source, 0) for key, source in self.sources.items()}
+
+    def update_cells(self, cells: dict[str, str], run: int) -> None:
+        """Bring the cells up to date after a run, from 1; controls keep what they hold."""
+        for key, source in self.sources.items():
+            if not isinstance(source, Control):
+                cells[key] = self._show(key, source, run)
+
+    def _show(self, key: str, source: Any, run: int) -> str:
+        if isinstance(source, Control):
+            return shown(source.value)
+        if isinstance(source, list):
+            return shown(source[(run - 1) % len(source)]) if run else words.ERROR_VALUE
+        if callable(source):
+            return self._call(key, source, run) if run else words.ERROR_VALUE
+        return shown(source)
+
+    def _call(self, key: str, function: Callable[[int], Any], run: int) -> str:
+        try:
+            return shown(function(run))
+        except Exception as exc:  # noqa: BLE001 - a cell that fails shows it, as on the camera
+            _log.warning("! job %s: cell %s failed in run %d: %r", self.file, key, run, exc)
+            return words.ERROR_VALUE
+
+    @field_validator("file")
+    @classmethod
+    def _check_file(cls, file: str) -> str:
+        if not _printable(file) or file != file.strip():
+            raise ValueError("a file name has printable Latin-1 characters, none blank at its ends")
+        return file
+
+    @field_validator("cells", mode="before")
+    @classmethod
+    def _read_controls(cls, cells: Any) -> Any:
+        if not isinstance(cells, Mapping):
+            return cells
+        return {
+            name: Control.model_validate(source) if isinstance(source, Mapping) else source
+            for name, source in cells.items()
+        }
+
+    @model_validator(mode="after")
+    def _check_cells(self) -> Job:
+        seen: dict[str, str] = {}
+        for name, source in self.cells.items():
+            key = cell_key(name)
+            if key in seen:
+                raise ValueError(f"cells {seen[key]!r} and {name!r} are the same")
+            seen[key] = name
+            if isinstance(source, Control) or callable(source):
+                continue
+            values = source if isinstance(source, list) else [source]
+            if not values:
+                raise ValueError(f"cell {name}: the list is empty")
+            for value in values:
+                try:
+                    shown(value)
+                except (TypeError, ValueError) as exc:
+                    raise ValueError(f"cell {name}: {exc}") from exc
+        return self
+
+
+def cell_key(name: str) -> str:
+    """Return under what a cell or a cell's name is kept: ``A012``, or the name in lower case.
+
+    Raises:
+        ConfigurationError: it is neither; a ValueError, so it counts for pydantic.
+    """
+    try:
+        return words.parse_cell(name).wire
+    except ConfigurationError as not_a_cell:
+        try:
+            return words.parse_tag(name)
+        except ConfigurationError as exc:
+            raise exc from not_a_cell
+
+
+def shown(value: Any) -> str:
+    """Return a value as the answer to ``GV`` has it: numbers with three decimals (derived).
+
+    A number that is not finite is a cell in error.
+
+    Raises:
+        TypeError: it is no number and no text.
+        ValueError: a text that does not fit a line.
+    """
+    if isinstance(value, str):
+        if len(value) > MAX_CELL_TEXT or not (value == "" or _printable(value)):
+            raise ValueError(
+                f"a text has at most {MAX_CELL_TEXT} printable Latin-1 characters, got {value!r}"
+            )
+        return value
+    if not isinstance(value, Real):
+        raise TypeError(f"a cell holds a number or a text, got {value!r}")
+    try:
+        number = float(value)
+    except OverflowError:
+        return words.ERROR_VALUE
+    return f"{number:.3f}" if math.isfinite(number) else words.ERROR_VALUE
+
+
+def make_job(given: Job | Mapping[str, Any]) -> Job:
+    """Return ``given`` as a job.
+
+    Raises:
+        ConfigurationError: a field is wrong; the text names the job and the field.
+    """
+    if isinstance(given, Job):
+        return given
+    return validated(Job, given, f"job {given.get('file', '?')}")
+
+
+def _printable(text: str) -> bool:
+    return text.isprintable() and all(ord(character) < 256 for character in text)
+
+
+BUILTIN_JOBS = (
+    Job(
+        file="1PartCheck.job",
+        cells={
+            "Passed": True,
+            "A1": 101.5,
+            "B1": -3.25,
+            "C1": "ABC",
+            "Threshold": Control(kind="float", value=0.5, low=0, high=1),
+        },
+    ),
+    Job(file="7Counter.job", cells={"A1": lambda run: run}, load_time=0.3),
+    Job(file="9Free.job", cells={"A1": lambda run: run}, rate=20),
+)
+"""Jobs for whoever has none at hand: constants with a control, a count of triggers, a free run."""

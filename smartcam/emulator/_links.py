@@ -1,0 +1,353 @@
+"""Sockets of the emulated camera: they move bytes, what they mean is decided elsewhere.
+
+A client's link is a TCP connection, or all datagrams of one address.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import struct
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+from smartcam._accepting import Acceptor
+from smartcam.emulator._client_link import WRITE_LIMIT, ClientLink
+from smartcam.protocols._base import Transport
+from smartcam.protocols._framed.machine import State
+
+if TYPE_CHECKING:
+    from smartcam.emulator._client_link import LinkOwner
+
+_log = logging.getLogger("smartcam.emulator")
+
+MAX_LINKS = 32
+"""Clients that are looked at. The camera serves one; a few more may wait to take over. A newcomer
+always gets in: the one without a session for longest makes room."""
+
+FAREWELL = 1.0
+"""Seconds of real time that a client has to close its side after a fault closed the camera's."""
+
+_NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
+
+REFUSED = "refuse"
+"""Kind of the fault that closes the port for a time."""
+
+
+def _peer_text(address: Any) -> str:
+    return f"{address[0]}:{address[1]}" if address else "?"
+
+
+# ---------------------------------------------------------------------- TCP
+
+
+class _TcpLink(ClientLink, asyncio.Protocol):
+    """A connection. All that one step causes goes out in one write (SC manual p. 40)."""
+
+    _transport: asyncio.Transport
+
+    def __init__(self, listener: TcpListener, owner: LinkOwner) -> None:
+        super().__init__(owner, Transport.TCP, "?")
+        self._listener = listener
+        self._farewell: asyncio.TimerHandle | None = None
+        self._end_waits = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        self.peer: str = _peer_text(transport.get_extra_info("peername"))
+        if self._listener.down:
+            self.close("the camera is down")
+            return
+        self._listener.enter(self)
+        if self.closed:
+            return
+        # the camera does so too (newest SC manual p. 40: published)
+        with contextlib.suppress(OSError):  # the client may be gone already
+            transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def data_received(self, data: bytes) -> None:
+        if self.closed:  # it says farewell
+            return
+        with self._owner.step():
+            self._take(data)
+            self.heard()
+
+    def eof_received(self) -> bool:
+        """The client has closed its side: that waits behind what faults hold back."""
+        self._end_waits = self._faulty is not None and self._faulty.unheard
+        return self._end_waits
+
+    def heard(self) -> None:
+        self.flush()  # also what was said before a Disconnect in the same bytes
+        if self._machine.state is State.FAILED:
+            self.close("a broken frame came")
+        elif self._end_waits and (self._faulty is None or not self._faulty.unheard):
+            self._transport.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._farewell is not None:
+            self._farewell.cancel()
+        by_client = not self.closed
+        self._leave()
+        self._listener.links.pop(self, None)
+        with self._owner.step():
+            self._owner.lost(self)
+        self._owner.parted(self, by_client=by_client, reset=exc is not None)
+
+    def write(self, data: bytes) -> bool:
+        if self.closed:
+            return False
+        if self._transport.get_write_buffer_size() + len(data) > WRITE_LIMIT:
+            self.close(f"it does not read: more than {WRITE_LIMIT} bytes wait for it")
+            return False
+        self._transport.write(data)
+        return True
+
+    def unseated(self) -> None:
+        if self in self._listener.links:
+            del self._listener.links[self]
+            self._listener.links[self] = None
+
+    def close(self, reason: str) -> None:
+        self._listener.links.pop(self, None)
+        if not self.closed:
+            self._leave()
+            _log.info("= %s: connection closed: %s", self.peer, reason)
+            self._owner.lost(self)
+        self._transport.abort()
+
+    def part(self, how: Literal["close", "reset"]) -> None:
+        if how == "reset":
+            with contextlib.suppress(OSError):  # the client may be gone already
+                sock = self._transport.get_extra_info("socket")
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+            self.close("a fault resets it")
+            return
+        self._leave()
+        _log.info("= %s: connection closed: a fault ends it", self.peer)
+        self._owner.lost(self)
+        # a socket that is closed with unread bytes sends a reset, so it stays until the client
+        # has closed its side, too
+        with contextlib.suppress(OSError):
+            self._transport.write_eof()
+        loop = asyncio.get_running_loop()
+        self._farewell = loop.call_later(FAREWELL, self._transport.abort)
+
+    def stop_listening(self) -> None:
+        self._transport.pause_reading()
+
+    def heal(self) -> None:
+        if self._faulty is not None and self._faulty.muted is not None:
+            self.part("reset")
+
+    def _write_frames(self, frames: list[bytes]) -> None:
+        if frames:
+            self.write(b"".join(frames))
+
+
+class Listener(ABC):
+    """The camera's port; it can be shut and opened again."""
+
+    kind: socket.SocketKind
+
+    def __init__(self) -> None:
+        self.crowded_out: int = 0  # links that made room for newcomers
+
+    def crowd_out(self, link: ClientLink, why: str) -> None:
+        """Close a link to make room for a newcomer."""
+        self.crowded_out += 1
+        link.close(why)
+
+    @property
+    @abstractmethod
+    def all_links(self) -> list[ClientLink]:
+        """The links that are open."""
+
+    @abstractmethod
+    async def serve(self, sock: socket.socket) -> None:
+        """Serve a bound socket."""
+
+    @abstractmethod
+    def close_port(self) -> None:
+        """Close the port, at once; links stay."""
+
+    @abstractmethod
+    def shut(self) -> None:
+        """Close the port and every link, at once."""
+
+    async def wait_closed(self) -> None:
+        """Wait until the event loop has let go of all sockets."""
+        # transports that were aborted call connection_lost in the loop's next round
+        for _ in range(2):
+            await asyncio.sleep(0)
+
+
+class TcpListener(Listener):
+    """Accepts connections."""
+
+    kind = socket.SOCK_STREAM
+
+    def __init__(self, owner: LinkOwner) -> None:
+        super().__init__()
+        self.links: dict[_TcpLink, None] = {}  # the one without a session for longest stands first
+        self.down: bool = True
+        """Whether connections that were accepted before are too late."""
+        self._owner = owner
+        self._acceptor = Acceptor(
+            lambda: _TcpLink(self, self._owner), _log, name="smartcam.emulator"
+        )
+
+    @property
+    def all_links(self) -> list[ClientLink]:
+        """The links that are open."""
+        return list(self.links)
+
+    async def serve(self, sock: socket.socket) -> None:
+        """Serve a bound socket that listens."""
+        self.down = False
+        self._acceptor.open(sock)
+
+    def shut(self) -> None:
+        """Close the port and every link, at once; the socket is its owner's to close."""
+        self.down = True
+        self.close_port()
+        for link in self.all_links:
+            link.close("the camera is down")
+
+    def close_port(self) -> None:
+        """Close the port, at once; the socket is its owner's to close."""
+        self._acceptor.close()
+
+    async def wait_closed(self) -> None:
+        """Wait until the event loop has let go of all sockets."""
+        await self._acceptor.wait_closed()
+        await super().wait_closed()
+
+    def enter(self, link: _TcpLink) -> None:
+        """Take a new connection; where there are too many, another one makes room."""
+        self.links[link] = None
+        if len(self.links) > MAX_LINKS:
+            one = next(one for one in self.links if not self._owner.serves(one))
+            why = f"{MAX_LINKS} others are open, it was without a session for longest"
+            self.crowd_out(one, why)
+
+
+# ---------------------------------------------------------------------- UDP
+
+
+class _UdpLink(ClientLink):
+    """The datagrams of one address; one message is one datagram (SC manual p. 40)."""
+
+    def __init__(self, listener: UdpListener, owner: LinkOwner, address: Any) -> None:
+        super().__init__(owner, Transport.UDP, _peer_text(address))
+        self._listener = listener
+        self._address = address
+
+    def datagram_received(self, data: bytes) -> None:
+        with self._owner.step():
+            self._take(data)
+            self.flush()
+
+    def write(self, data: bytes) -> bool:
+        return not data or self._listener.send(data, self._address)
+
+    def part(self, how: Literal["close", "reset"]) -> None:
+        self.close(f"a fault ends it ({how})")
+
+    def stop_listening(self) -> None:
+        pass  # the faulty link takes nothing any more
+
+    def heal(self) -> None:
+        if self._faulty is not None and self._faulty.muted != REFUSED:
+            self._faulty.heal()
+
+    def shut_off(self) -> None:
+        """The port is closed for a time: what is said is lost."""
+        faulty = self._enter_faulty()
+        faulty.muted = faulty.muted or REFUSED
+
+    def let_in(self) -> None:
+        """The port is open again."""
+        if self._faulty is not None and self._faulty.muted == REFUSED:
+            self._faulty.muted = None
+
+    def _write_frames(self, frames: list[bytes]) -> None:
+        for frame in frames:
+            self._listener.send(frame, self._address)
+
+    def close(self, reason: str) -> None:
+        if not self.closed:
+            self._leave()
+            _log.debug("= %s: forgotten: %s", self.peer, reason)
+            self._listener.links.pop(self._address, None)
+            self._owner.lost(self)
+
+
+class UdpListener(Listener, asyncio.DatagramProtocol):
+    """Sorts datagrams by address."""
+
+    kind = socket.SOCK_DGRAM
+
+    def __init__(self, owner: LinkOwner) -> None:
+        super().__init__()
+        self.links: dict[Any, _UdpLink] = {}  # the one that was heard last stands last
+        self._owner = owner
+        self._transport: asyncio.DatagramTransport | None = None
+
+    @property
+    def all_links(self) -> list[ClientLink]:
+        """The links that are open."""
+        return list(self.links.values())
+
+    async def serve(self, sock: socket.socket) -> None:
+        """Serve a bound socket."""
+        loop = asyncio.get_running_loop()
+        self._transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=sock)
+        for link in self.links.values():
+            link.let_in()
+
+    def close_port(self) -> None:
+        """Close the port, at once; what is said meanwhile is lost."""
+        for link in self.links.values():
+            link.shut_off()
+        self._close_socket()
+
+    def shut(self) -> None:
+        """Close the port and every link, at once."""
+        self._close_socket()
+        for link in self.all_links:
+            link.close("the camera is down")
+
+    def _close_socket(self) -> None:
+        transport, self._transport = self._transport, None
+        if transport is not None:
+            transport.abort()
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        """Pass it to the link of its address; too many links drop the one silent for longest."""
+        if self._transport is None:
+            return  # the port is shut, the loop had this one already
+        link = self.links.pop(addr, None) or _UdpLink(self, self._owner, addr)
+        self.links[addr] = link
+        if len(self.links) > MAX_LINKS:
+            old = next(old for old in self.all_links if not self._owner.serves(old))
+            self.crowd_out(old, "idle")
+        link.datagram_received(data)
+
+    def error_received(self, exc: Exception) -> None:
+        """Nobody reads the answers at a peer any more; the camera does not notice."""
+        _log.debug("! datagram not delivered: %s", exc)
+
+    def send(self, frame: bytes, address: Any) -> bool:
+        """Send one datagram; False if it is lost here."""
+        if self._transport is None:
+            return False
+        # the abstract class lacks it, every transport of asyncio has it
+        if cast("asyncio.Transport", self._transport).get_write_buffer_size() > WRITE_LIMIT:
+            _log.warning("! %s: datagram dropped: the network is too slow", _peer_text(address))
+            return False
+        self._transport.sendto(frame, address)
+        return True

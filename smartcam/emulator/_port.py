@@ -1,0 +1,135 @@
+"""The camera's port: opened, closed, and opened again on the same number."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from smartcam.emulator._links import MAX_LINKS
+
+if TYPE_CHECKING:
+    from smartcam.emulator._links import Listener
+
+_log = logging.getLogger("smartcam.emulator")
+
+_RETRY = 0.2  # seconds between tries to get the port back
+
+
+@dataclass(eq=False)
+class Port:
+    """A port with a listener behind it."""
+
+    _listener: Listener
+    _host: str
+    number: int  # 0 for a free one until it is open
+    _name: str  # for logs
+
+    def __post_init__(self) -> None:
+        self._address: tuple[int, Any] = (socket.AF_INET, (self._host, self.number))
+        self._socket: socket.socket | None = None
+        self._opening: asyncio.Task[None] | None = None
+        self._handing_over = False  # the loop may be about to watch the socket
+
+    async def open(self) -> None:
+        """Open it for the first time.
+
+        Raises:
+            OSError, ValueError, OverflowError: it cannot be had.
+
+        Cancellation: leaves it closed.
+        """
+        try:
+            self._address = await self._resolve()
+            self._socket = self._bind()
+            self.number = self._socket.getsockname()[1]
+            await self._hand_over(self._socket)
+        except BaseException:
+            self.shut()
+            raise
+
+    def reopen(self) -> None:
+        """Open it again: now if possible, else as soon as it can be had."""
+        try:
+            self._socket = self._bind()
+        except OSError:
+            self._socket = None  # another program took it, or the loop has not let go of it yet
+        self._opening = asyncio.get_running_loop().create_task(
+            self._reopen(self._opening), name=f"smartcam.emulator[{self._name}].reopen"
+        )
+
+    def close(self) -> None:
+        """Close it; links stay."""
+        self._stop_opening()
+        self._listener.close_port()
+        self._close_socket()
+
+    def shut(self) -> None:
+        """Close it and every link."""
+        self._stop_opening()
+        self._listener.shut()
+        self._close_socket()
+
+    async def wait_closed(self) -> None:
+        """Wait until nothing of it is left; it must be shut."""
+        opening, self._opening = self._opening, None
+        if opening is not None:
+            await asyncio.wait({opening})
+        await self._listener.wait_closed()
+
+    async def _resolve(self) -> tuple[int, Any]:
+        loop = asyncio.get_running_loop()
+        found = await loop.getaddrinfo(self._host, self.number, type=self._listener.kind)
+        return found[0][0], found[0][4]
+
+    def _bind(self) -> socket.socket:
+        family, address = self._address
+        sock = socket.socket(family, self._listener.kind)
+        try:
+            sock.setblocking(False)
+            if self._listener.kind is socket.SOCK_STREAM and os.name == "posix":
+                # the camera comes up on its old port while old connections linger
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind((address[0], self.number, *address[2:]))
+            if self._listener.kind is socket.SOCK_STREAM:
+                sock.listen(MAX_LINKS)
+        except BaseException:
+            sock.close()
+            raise
+        return sock
+
+    async def _reopen(self, before: asyncio.Task[None] | None) -> None:
+        if before is not None:  # it was cancelled and has to let go of its socket first
+            await asyncio.wait({before})
+        while True:
+            try:
+                self._socket = self._socket or self._bind()
+                await self._hand_over(self._socket)
+            except OSError as exc:
+                _log.warning("! %s: port %d is not to be had: %s", self._name, self.number, exc)
+                await asyncio.sleep(_RETRY)
+            else:
+                return
+
+    async def _hand_over(self, sock: socket.socket) -> None:
+        self._handing_over = True
+        try:
+            await self._listener.serve(sock)
+        finally:
+            self._handing_over = False
+
+    def _stop_opening(self) -> None:
+        if self._opening is not None:
+            self._opening.cancel()
+
+    def _close_socket(self) -> None:
+        sock, self._socket = self._socket, None
+        if sock is None:
+            return
+        if self._handing_over and self._opening is not None:
+            self._opening.add_done_callback(lambda _: sock.close())
+        else:
+            sock.close()  # serves nothing yet, or is closed already

@@ -1,0 +1,62 @@
+"""What an emulated camera is made of: a scenario, and what was given beside it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.emulator._application import Application, make_application
+from smartcam.emulator._bvs.quirks import Quirks
+from smartcam.emulator._scenario.file import load_scenario
+from smartcam.emulator._scenario.scenario import Scenario
+from smartcam.emulator._scenario.timeline import Cue
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols._base import Transport
+from smartcam.protocols._bvs import BVS
+from smartcam.settings import validated
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+_KNOWN: Mapping[str, tuple[str, ...]] = {
+    "dialect": tuple(BVS.dialects),
+    "transport": tuple(one.value for one in Transport),
+}
+
+
+def make_plan(
+    scenario: Scenario | str | Path | None,
+    applications: Iterable[Application | dict[str, Any]],
+    timeline: Iterable[Cue | Mapping[str, Any]],
+    **given: Any,
+) -> Scenario:
+    """Return the scenario with what was given beside it; None is not given.
+
+    Raises:
+        ConfigurationError: something is wrong, or more than the camera can do.
+    """
+    changes = {key: value for key, value in given.items() if value is not None}
+    for what, names in _KNOWN.items():
+        if what in changes and changes[what] not in names:
+            raise ConfigurationError(
+                f"emulator: {what} {changes[what]!r} is unknown; known are {', '.join(names)}"
+            )
+    if scenario is None:
+        base = Scenario()
+    elif isinstance(scenario, Scenario):
+        base = scenario
+    else:
+        base = load_scenario(scenario, dialect=changes.get("dialect"))
+    if isinstance(changes.get("quirks"), dict):
+        changes["quirks"] = validated(Quirks, changes["quirks"], "quirks")
+    added = [make_application(application) for application in applications]
+    ids = {application.id for application in added}
+    changes["applications"] = (*added, *(a for a in base.applications if a.id not in ids))
+    cues = (validated(Cue, one, f"cue {number}") for number, one in enumerate(timeline, start=1))
+    changes["timeline"] = (*base.timeline, *cues)
+    plan = base.model_copy(update=changes)
+    mistake = plan.mistake()
+    if mistake is not None:
+        place, text = mistake
+        raise ConfigurationError(f"emulator: {'.'.join(str(part) for part in place)}: {text}")
+    return plan

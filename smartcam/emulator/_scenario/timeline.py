@@ -1,0 +1,305 @@
+"""Timelines: what happens to an emulated camera by itself, and when.
+
+A timeline is a list of *cues*. A cue says when (at a time, on entering a state, on command, or from
+the beginning) and which faults are injected then::
+
+    timeline:
+      - {at: 2.0, do: {kind: condition, condition: overheat}}
+      - {entering: running, nth: 2, after: 0.5, do: {kind: stop}}
+      - {command: jam, do: [{kind: no_result}, {kind: busy_for_ever, seconds: 3}]}
+      - {do: {kind: drop, on: QueryAnswer, nth: 3}}
+
+A fault that waits for a message (``on``, ``nth``) waits for it from that moment on. The same
+timeline, the same seed and the same messages give the same bytes.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import logging
+from dataclasses import dataclass
+from random import Random
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
+
+from smartcam.emulator._clock import OneTimer, nanoseconds
+from smartcam.emulator._data import EmulatorData
+from smartcam.emulator._scenario.states import DeviceState
+from smartcam.emulator.faults import Fault
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from pydantic import GetJsonSchemaHandler
+    from pydantic.json_schema import JsonSchemaValue
+    from pydantic_core import CoreSchema
+
+    from smartcam.emulator._clock import Clock
+
+_log = logging.getLogger("smartcam.emulator")
+
+MAX_PENDING = 10_000
+"""Cues that wait for their time; one that comes when so many wait is dropped, with a warning."""
+
+MAX_AT_ONCE = 1000
+"""Cues at one instant: cues that bring each other about would go on for ever. One more is dropped,
+with a warning."""
+
+MAX_FAULTS_OF_CUE = 100
+"""Faults of one cue: as many as anybody writes."""
+
+_MOMENTS = ("at", "entering", "command")
+
+_Seconds = Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)]
+
+
+class _OneOrMore:
+    """In a schema: one fault stands for a list of one."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        array = handler(core_schema)
+        return {"anyOf": [array["items"], array]}
+
+
+def _as_list(value: object) -> object:
+    return [value] if isinstance(value, (dict, BaseModel)) else value
+
+
+class Cue(EmulatorData):
+    """When something happens, and what.
+
+    At most one of ``at``, ``entering`` and ``command`` says when; with none of them it is when the
+    emulator starts.
+    """
+
+    at: _Seconds | None = Field(default=None, description="seconds after the emulator's start")
+    every: float | None = Field(
+        default=None,
+        ge=0.001,
+        le=86_400,
+        allow_inf_nan=False,
+        description="again and again, so many seconds after the last time; with `at`",
+    )
+    entering: DeviceState | None = Field(
+        default=None, description="when the camera enters this state"
+    )
+    command: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=100,
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$",
+        description="when this command is given; several cues may have the same",
+    )
+    nth: int = Field(
+        default=1,
+        ge=1,
+        le=1_000_000,
+        description="the first time it applies to; with `entering` and `command`",
+    )
+    times: int | None = Field(
+        default=None,
+        ge=1,
+        description=(
+            "how often it applies, one time after the other; default once, with `every` and "
+            "`command` as often as it comes"
+        ),
+    )
+    after: _Seconds = Field(default=0.0, description="seconds later")
+    spread: _Seconds = Field(
+        default=0.0, description="by chance up to so many seconds later still, all as likely"
+    )
+    chance: float = Field(
+        default=1.0, gt=0, le=1, description="how likely it is that it happens, each time"
+    )
+    do: Annotated[tuple[Fault, ...], _OneOrMore, BeforeValidator(_as_list)] = Field(
+        description="what is injected then: one fault, or several"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Cue:
+        moments = [name for name in _MOMENTS if getattr(self, name) is not None]
+        if not 1 <= len(self.do) <= MAX_FAULTS_OF_CUE:
+            raise ValueError(f"do: 1 to {MAX_FAULTS_OF_CUE} faults, got {len(self.do)}")
+        if len(moments) > 1:
+            raise ValueError(f"it happens at one moment, not by {' and '.join(moments)}")
+        if self.every is not None and self.at is None:
+            raise ValueError("every needs at: when it happens for the first time")
+        if self.nth > 1 and self.entering is None and self.command is None:
+            raise ValueError("nth needs entering or command; a fault has an nth of its own")
+        if (self.times or 1) > 1 and self.every is None and moments in ([], ["at"]):
+            raise ValueError("times needs every, entering or command")
+        return self
+
+    @property
+    def is_random(self) -> bool:
+        """Whether chance has a part in it."""
+        return self.chance < 1 or self.spread > 0
+
+    @property
+    def limit(self) -> int | None:
+        """How often it applies, None for as often as it comes."""
+        if self.times is None and (self.every is not None or self.command is not None):
+            return None
+        return self.times or 1
+
+
+@dataclass(slots=True, eq=False)
+class _CueState:
+    """A cue and what became of it."""
+
+    cue: Cue
+    random: Random  # one for each cue, so that none changes the chance of another
+    seen: int = 0  # how often its moment came
+    done: int = 0  # how often its faults were injected
+
+    @property
+    def over(self) -> bool:
+        """Whether no later moment matters."""
+        limit = self.cue.limit
+        return limit is not None and self.seen >= self.cue.nth - 1 + limit
+
+    def comes(self) -> float | None:
+        """Count a moment; return after how many seconds it happens, None for never."""
+        if self.over:
+            return None
+        self.seen += 1
+        if self.seen < self.cue.nth:
+            return None
+        happens = self.random.random() < self.cue.chance
+        later = self.cue.after + self.random.random() * self.cue.spread
+        return later if happens else None
+
+
+class Timeline:
+    """Runs cues; made anew for each start of the emulator.
+
+    Those that happen at one instant do so in their order; ``seed`` is of all left to chance.
+    """
+
+    def __init__(
+        self,
+        cues: Sequence[Cue],
+        *,
+        clock: Clock,
+        seed: int,
+        inject: Callable[[Sequence[Fault]], None],
+    ) -> None:
+        self._rows = [
+            _CueState(cue, Random(f"{seed}/{number}"))  # noqa: S311  chance in a test, no secret
+            for number, cue in enumerate(cues)
+        ]
+        self._entering = [row for row in self._rows if row.cue.entering is not None]
+        self._clock = clock
+        self._inject = inject
+        self._pending: list[tuple[int, int, _CueState, bool]] = []
+        self._order = itertools.count()
+        self._timer = OneTimer(clock, self._run)
+        self._waiting: list[_CueState] = []
+        self._acting = False
+        self._instant: tuple[float, int] = (0.0, 0)
+
+    @property
+    def watches(self) -> bool:
+        """Whether it wants to know of states."""
+        return bool(self._entering)
+
+    @property
+    def done(self) -> list[int]:
+        """How often each cue has happened."""
+        return [row.done for row in self._rows]
+
+    def start(self) -> None:
+        """Begin: now is second 0."""
+        begin = nanoseconds(self._clock.now)
+        for row in self._rows:
+            cue = row.cue
+            if cue.at is not None:
+                self._put(begin + nanoseconds(cue.at), row, comes=True)
+            elif cue.entering is None and cue.command is None:
+                self._come(row)
+        self._run()
+
+    def stop(self) -> None:
+        """Forget what is to come. Harmless when done twice."""
+        self._pending.clear()
+        self._waiting.clear()
+        self._timer.set(None)
+
+    def entered(self, state: DeviceState) -> None:
+        """The camera has entered a state."""
+        for row in self._entering:
+            if row.cue.entering is state:
+                self._come(row)
+        self._run()
+
+    def command(self, name: str) -> None:
+        """Somebody gives a command.
+
+        Raises:
+            ConfigurationError: no cue has it.
+        """
+        rows = [row for row in self._rows if row.cue.command == name]
+        if not rows:
+            known = sorted({row.cue.command for row in self._rows if row.cue.command})
+            raise ConfigurationError(
+                f"no cue of the timeline has the command {name!r}; there are "
+                f"{', '.join(known) or 'none'}"
+            )
+        for row in rows:
+            self._come(row)
+        self._run()
+
+    def _come(self, row: _CueState) -> None:
+        """Count a moment of a cue, and let it happen or wait."""
+        later = row.comes()
+        if later:
+            self._put(nanoseconds(self._clock.now) + nanoseconds(later), row, comes=False)
+        elif later is not None:
+            self._waiting.append(row)
+
+    def _put(self, when: int, row: _CueState, *, comes: bool) -> None:
+        if len(self._pending) >= MAX_PENDING:
+            _log.warning("! timeline: more than %d cues wait, one is dropped", MAX_PENDING)
+            return
+        heapq.heappush(self._pending, (when, next(self._order), row, comes))
+
+    def _run(self) -> None:
+        """Let all happen for which it is time, one after the other, never inside each other."""
+        if self._acting:
+            return
+        self._acting = True
+        try:
+            self._happen()
+            now = nanoseconds(self._clock.now)
+            while self._pending and self._pending[0][0] <= now:
+                when, _, row, comes = heapq.heappop(self._pending)
+                if comes:
+                    self._come(row)
+                    if row.cue.every is not None and not row.over:
+                        self._put(when + nanoseconds(row.cue.every), row, comes=True)
+                else:
+                    self._waiting.append(row)
+                self._happen()
+        finally:
+            self._acting = False
+        self._timer.set(self._pending[0][0] if self._pending else None)
+
+    def _happen(self) -> None:
+        while self._waiting:
+            row = self._waiting.pop(0)
+            now, count = self._instant
+            self._instant = (now, count + 1) if now == self._clock.now else (self._clock.now, 1)
+            if self._instant[1] > MAX_AT_ONCE:
+                _log.warning("! timeline: more than %d cues at once, one is dropped", MAX_AT_ONCE)
+                continue
+            row.done += 1
+            try:
+                self._inject(row.cue.do)
+            except ConfigurationError as exc:  # too many faults wait
+                _log.warning("! timeline: not injected: %s", exc)

@@ -1,0 +1,132 @@
+"""A table with seven tangram pieces, and a camera that sees it.
+
+The pieces have ground-truth poses in metres. The camera turns them into pixels by a similarity
+transformation (scale, rotation, offset) and adds noise; its own calibration is the exact inverse of
+that transformation, so what it reports in metres differs from the truth by the noise only.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+TABLE_SIZE = (0.30, 0.25)
+"""Width and depth of the table, metres."""
+
+
+class TablePose(NamedTuple):
+    """Where a piece lies: x right, y away, metres; theta counter-clockwise, radians."""
+
+    x: float
+    y: float
+    theta: float
+
+
+class Observation(NamedTuple):
+    """What the camera saw of one piece."""
+
+    name: str  # of the piece
+    u: float  # pixels to the right
+    v: float  # pixels upwards, or downwards for a scene with ``y_down``
+    theta: float  # radians, counter-clockwise (clockwise with ``y_down``), in (-pi, pi]
+    quality: float  # 0 to 1
+
+
+PIECES: Mapping[str, TablePose] = {
+    "big_triangle_1": TablePose(0.060, 0.060, 0.30),
+    "big_triangle_2": TablePose(0.060, 0.185, -0.80),
+    "medium_triangle": TablePose(0.150, 0.055, 1.20),
+    "small_triangle_1": TablePose(0.145, 0.130, 2.40),
+    "small_triangle_2": TablePose(0.155, 0.205, -2.10),
+    "square": TablePose(0.240, 0.065, 0.55),
+    "parallelogram": TablePose(0.235, 0.185, -1.35),
+}
+"""The pieces and where they lie at first; no two touch, none reaches over the table's edge."""
+
+_ARM = 0.02
+"""Metres: half the length of a piece. Pixel noise at this distance turns it."""
+
+
+class TableScene:
+    """Seven pieces on a table and the camera above it.
+
+    Args:
+        scale: pixels per metre. 4000 puts the table onto a sensor of 1280 x 1024 pixels.
+        offset: pixel where the table's origin is seen.
+        rotation: radians, of the image against the table.
+        pixel_noise: standard deviation of u and v, pixels.
+        seed: of the noise; the same seed gives the same observations.
+        y_down: v counts downwards, as in image files.
+
+    Raises:
+        ConfigurationError: a scale that is not positive, or negative noise.
+    """
+
+    def __init__(
+        self,
+        *,
+        scale: float = 4000.0,
+        offset: tuple[float, float] = (45.0, 10.0),
+        rotation: float = 0.01,
+        pixel_noise: float = 0.2,
+        seed: int = 0,
+        y_down: bool = False,
+    ) -> None:
+        if not (scale > 0 and math.isfinite(scale)):
+            raise ConfigurationError(f"scene: scale must be positive, got {scale}")
+        if not (pixel_noise >= 0 and math.isfinite(pixel_noise)):
+            raise ConfigurationError(f"scene: pixel_noise must not be negative, got {pixel_noise}")
+        self.scale = scale
+        self.offset = offset
+        self.rotation = rotation
+        self.pixel_noise = pixel_noise
+        self.seed = seed
+        self.y_down = y_down
+        self.pieces: dict[str, TablePose] = dict(PIECES)
+        """Name to ground truth; change it and the next measurement sees the change."""
+        self._random = random.Random(seed)  # noqa: S311  noise, not a secret
+        self._flip = -1.0 if y_down else 1.0
+
+    def to_pixels(self, pose: TablePose) -> tuple[float, float, float]:
+        """Return u, v (pixels) and theta (radians) of a pose on the table, without noise."""
+        cos, sin = self.scale * math.cos(self.rotation), self.scale * math.sin(self.rotation)
+        u = self.offset[0] + cos * pose.x - sin * pose.y
+        v = self.offset[1] + self._flip * (sin * pose.x + cos * pose.y)
+        return u, v, self._flip * (pose.theta + self.rotation)
+
+    def to_table(self, observation: Observation) -> TablePose:
+        """Return the place on the table that the camera's calibration gives an observation."""
+        u = observation.u - self.offset[0]
+        v = self._flip * (observation.v - self.offset[1])
+        cos, sin = math.cos(self.rotation) / self.scale, math.sin(self.rotation) / self.scale
+        theta = self._flip * observation.theta - self.rotation
+        return TablePose(cos * u + sin * v, cos * v - sin * u, _normal(theta))
+
+    def measure(self) -> list[Observation]:
+        """Return one observation of each piece, in the order of :attr:`pieces`, with new noise."""
+        gauss = self._random.gauss
+        found: list[Observation] = []
+        for name, pose in list(self.pieces.items()):  # a test may change them in its own thread
+            u, v, theta = self.to_pixels(pose)
+            turn = gauss(0.0, self.pixel_noise / (_ARM * self.scale))
+            found.append(
+                Observation(
+                    name=name,
+                    u=u + gauss(0.0, self.pixel_noise),
+                    v=v + gauss(0.0, self.pixel_noise),
+                    theta=_normal(theta + turn),
+                    quality=self._random.uniform(0.95, 1.0),
+                )
+            )
+        return found
+
+
+def _normal(angle: float) -> float:
+    """Return the same angle in (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2 * math.pi)

@@ -1,0 +1,40 @@
+"""Counting what happens, and waiting until it has happened so often."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from typing import TypeVar
+
+K = TypeVar("K")
+
+
+class Tally(Counter[K]):
+    """A counter that coroutines can wait for."""
+
+    _changed: asyncio.Event | None = None  # there while somebody waits
+
+    def add(self, key: K, amount: int = 1) -> None:
+        """Count something, and wake those that wait."""
+        self[key] += amount
+        if self._changed is not None:
+            self._changed.set()
+            self._changed = None
+
+    async def wait(self, key: K, count: int, timeout: float) -> None:
+        """Wait until ``key`` was counted ``count`` times since the beginning.
+
+        Raises:
+            TimeoutError: it was not in ``timeout`` seconds of real time; the text says how often.
+
+        Cancellation: safe.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                while self[key] < count:
+                    changed = self._changed = self._changed or asyncio.Event()
+                    await changed.wait()
+        except TimeoutError as exc:
+            raise TimeoutError(
+                f"{key!r} came to {self[key]} in {timeout} s, not to {count}"
+            ) from exc

@@ -1,0 +1,309 @@
+"""What went over the wire: the emulator's log, and waiting for something to appear in it."""
+
+from __future__ import annotations
+
+import functools
+from collections import deque
+from collections.abc import Sequence
+from itertools import islice
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, overload
+
+from smartcam.emulator._tally import Tally
+from smartcam.exceptions import RemoteProtocolError, ResponseTimeoutError
+from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols.messages import Message, Sender, UnknownMessage
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.protocols._framed.dialect import FramedDialect
+
+MAX_ENTRIES = 10_000
+"""Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
+
+MAX_BYTES = 1 << 25
+"""Bytes that the entries hold, read or not; the oldest go first. 10,000 results of seven parts
+fit; of the largest containers, 64 kB, it keeps 120."""
+
+MAX_IDS = 1000
+"""Message ids of which it is counted how often they came. Those of the dialect always are: more
+than these only a client makes that sends anything."""
+
+_ENTRY = 400  # bytes of an entry with its message, without what is as long as the payload
+_PER_BYTE = 4  # of each byte of a payload: one in the message, three in hex
+
+MAX_VISITS = 1000
+"""Connections that have ended of which a record is kept; the oldest go first."""
+
+
+Direction = Literal["in", "out"]
+
+
+class LogEntry(NamedTuple):
+    """One frame, or bytes that make none.
+
+    Attributes:
+        time: of the emulator's clock, seconds.
+        direction: ``in`` from a client, ``out`` to it.
+        peer: address and port of the client.
+        message_id: id of the frame, None for bytes that make none.
+        message: what the frame says; None for an unknown id, a body that does not fit, and bytes
+            that make no frame.
+        hex: the frame's payload, or the first bytes that make no frame.
+        error: why it was ignored, None for a frame. A whole frame that is ignored has two
+            entries: the frame, then the reason.
+        fault: kinds of the faults that acted on it, in order; ``connection ended`` or ``not sent``
+            behind them where it was lost for that reason. None where none did. The entry of a
+            message is made when it has passed, or is lost. What the camera sends is told as it
+            meant it, what it hears as it heard it.
+        wire: the bytes that really passed, header included, as hex; empty for nothing. None: those
+            of the frame.
+    """
+
+    time: float
+    direction: Direction
+    peer: str
+    message_id: int | None
+    message: Message | None
+    hex: str
+    error: str | None = None
+    fault: str | None = None
+    wire: str | None = None
+
+
+class Visit(NamedTuple):
+    """A TCP connection that has ended.
+
+    Attributes:
+        time: of the emulator's clock when it ended, seconds.
+        peer: address and port of the client.
+        ended_by: which side closed it first.
+        reset: whether it ended by a reset, and not in order.
+    """
+
+    time: float
+    peer: str
+    ended_by: Literal["client", "camera"]
+    reset: bool
+
+
+_Traced: TypeAlias = tuple[float, str, Sender, Frame | bytes, str | None, bytes | None]
+"""Time, peer, sender, frame or bytes, faults, what passed: all that an entry is made of."""
+
+_DIRECTIONS: dict[Sender, Direction] = {Sender.CLIENT: "in", Sender.CAMERA: "out"}
+
+
+class Log(Sequence[LogEntry]):
+    """The last frames in both directions, oldest first; the oldest go where it is full.
+
+    Entries are made when somebody reads: until then a frame is kept as it went over the wire. What
+    counts as full does not depend on it.
+
+    Args:
+        dialect: in which frames are decoded.
+        maxlen: entries kept.
+        max_bytes: what they hold at most; the last one is kept however large it is.
+
+    Attributes:
+        maxlen: entries kept.
+        max_bytes: what they hold at most.
+        pushed_out: entries that are gone because it was full, since the beginning or the last
+            :meth:`clear`.
+    """
+
+    def __init__(
+        self, dialect: FramedDialect, maxlen: int = MAX_ENTRIES, max_bytes: int = MAX_BYTES
+    ) -> None:
+        self.maxlen: int = maxlen
+        self.max_bytes: int = max_bytes
+        self.pushed_out: int = 0
+        self._dialect = dialect
+        self._entries: deque[LogEntry] = deque()
+        self._unread: deque[LogEntry | _Traced] = deque()  # behind those
+        self._weights: deque[int] = deque()  # of both, in the same order
+        self._size = 0  # their sum, bytes
+        self._gone = 0  # entries that there have been before them
+
+    def __repr__(self) -> str:
+        return f"Log({list(self)!r})"
+
+    def __len__(self) -> int:
+        return len(self._weights)
+
+    def __iter__(self) -> Iterator[LogEntry]:
+        return iter(self._read())
+
+    @overload
+    def __getitem__(self, index: int, /) -> LogEntry: ...
+    @overload
+    def __getitem__(self, index: slice, /) -> list[LogEntry]: ...
+    def __getitem__(self, index: int | slice, /) -> LogEntry | list[LogEntry]:
+        """Return an entry, or some as a list.
+
+        Raises:
+            IndexError: there is none.
+        """
+        entries = self._read()
+        return entries[index] if isinstance(index, int) else list(entries)[index]
+
+    @property
+    def size(self) -> int:
+        """Bytes that the entries hold, counted as if all had been read."""
+        return self._size
+
+    def append(self, entry: LogEntry | _Traced) -> None:
+        """Put an entry, or what one is made of, behind the others."""
+        if isinstance(entry, LogEntry):
+            size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
+            weight = sum(len(text) for text in texts if text)
+        else:  # as it will be when it is read
+            _, _, _, what, fault, wire = entry
+            size = len(what.payload if isinstance(what, Frame) else what)
+            weight = len(fault or "") + max(0, 3 * len(wire or b"") - 1)
+        weight += _ENTRY + _PER_BYTE * size
+        weights = self._weights
+        self._unread.append(entry)
+        weights.append(weight)
+        self._size += weight
+        while len(weights) > self.maxlen or (self._size > self.max_bytes and len(weights) > 1):
+            (self._entries or self._unread).popleft()
+            self._forget_oldest()
+            self.pushed_out += 1
+
+    def since(self, serial: int, limit: int | None = None) -> tuple[list[LogEntry], int]:
+        """Return the entries behind the first ``serial`` ones, and how many there have been.
+
+        ::
+
+            new, count = emulator.log.since(serial)
+            missed = count - serial - len(new)
+
+        Entries that are gone by then are missing in the list.
+
+        Args:
+            serial: how many are known already.
+            limit: entries that are returned at most, the oldest; default all.
+        """
+        entries = self._read()
+        first = min(max(0, serial - self._gone), len(entries))
+        last = len(entries) if limit is None else first + limit
+        return list(islice(entries, first, last)), self._gone + len(entries)
+
+    def popleft(self) -> LogEntry:
+        """Take the oldest entry away.
+
+        Raises:
+            IndexError: there is none.
+        """
+        entry = self._read().popleft()
+        self._forget_oldest()
+        return entry
+
+    def clear(self) -> None:
+        """Take all away."""
+        self._gone += len(self)
+        self._entries.clear()
+        self._unread.clear()
+        self._weights.clear()
+        self._size = self.pushed_out = 0
+
+    def _forget_oldest(self) -> None:
+        """Leave the entry out of the account that was taken away in front."""
+        self._gone += 1
+        self._size -= self._weights.popleft()
+
+    def _read(self) -> deque[LogEntry]:
+        unread, entries = self._unread, self._entries
+        while unread:
+            one = unread.popleft()
+            entries.append(one if isinstance(one, LogEntry) else self._entry(*one))
+        return entries
+
+    def _entry(
+        self,
+        time: float,
+        peer: str,
+        sender: Sender,
+        what: Frame | bytes,
+        fault: str | None,
+        wire: bytes | None,
+    ) -> LogEntry:
+        passed = None if wire is None else wire.hex(" ")
+        if isinstance(what, bytes):
+            message_id, message, payload = None, None, what
+        else:
+            message_id, payload = what
+            message = _decode(self._dialect, sender, what)
+        direction, data = _DIRECTIONS[sender], payload.hex(" ")
+        return LogEntry(time, direction, peer, message_id, message, data, None, fault, passed)
+
+
+class TrafficLog:
+    """Keeps the last entries and counts what clients sent."""
+
+    def __init__(self, dialect: FramedDialect) -> None:
+        self.visits: deque[Visit] = deque(maxlen=MAX_VISITS)  # the last connections that have ended
+        self.entries: Log = Log(dialect)  # the last ones
+        self._dialect = dialect
+        self._received: Tally[int | type[Message] | None] = Tally(
+            {row.message_id: 0 for row in dialect.table}
+        )
+
+    def add(
+        self,
+        time: float,
+        peer: str,
+        sender: Sender,
+        what: Frame | bytes | RemoteProtocolError,
+        fault: str | None = None,
+        wire: bytes | None = None,
+    ) -> None:
+        """Keep a frame, bytes that make none, or why they are ignored; see :class:`LogEntry`."""
+        if isinstance(what, RemoteProtocolError):
+            # not kept itself: it holds on to the place where it was raised
+            data, error = what.data.hex(" "), str(what)
+            self.entries.append(
+                LogEntry(time, _DIRECTIONS[sender], peer, None, None, data, error, fault)
+            )
+        else:
+            self.entries.append((time, peer, sender, what, fault, wire))
+
+    async def wait_received(
+        self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
+    ) -> None:
+        """Wait as :meth:`~smartcam.emulator.EmulatedCamera.wait_received` does."""
+        try:
+            await self._received.wait(what, count, timeout)
+        except TimeoutError as exc:
+            name = f"message {what:#04x}" if isinstance(what, int) else what.__name__
+            raise ResponseTimeoutError(
+                f"the emulator received {self._received[what]} of {count} {name} in {timeout} s",
+                message_id=what if isinstance(what, int) else None,
+                waited=timeout,
+            ) from exc
+
+    def count(self, frame: Frame) -> None:
+        """Count a frame that the camera has heard."""
+        message_id, payload = frame
+        received = self._received
+        if message_id in received or len(received) < MAX_IDS:
+            received[message_id] += 1
+        received.add(_kind(self._dialect, message_id, len(payload)))
+
+
+@functools.lru_cache(maxsize=256)
+def _kind(dialect: FramedDialect, message_id: int, size: int) -> type[Message] | None:
+    """Return the type of a client's frame; id and size of its payload decide that."""
+    message = _decode(dialect, Sender.CLIENT, Frame(message_id, bytes(size)))
+    return None if message is None else type(message)
+
+
+def _decode(dialect: FramedDialect, sender: Sender, frame: Frame) -> Message | None:
+    """Return a frame decoded; None for an unknown id and for a body that does not fit."""
+    if dialect.surplus(sender, frame) > 0:
+        return None
+    try:
+        message = dialect.decode(sender, frame)
+    except RemoteProtocolError:
+        return None
+    return None if isinstance(message, UnknownMessage) else message

@@ -1,0 +1,66 @@
+"""What device faults do to the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from smartcam.emulator import faults as f
+from smartcam.emulator._scene import TablePose
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from smartcam.emulator._bvs.device import Device
+    from smartcam.emulator.faults._base import DeviceFault
+
+_CONDITIONS = {"system_error": Status.SYSTEM_ERROR, "overheat": Status.OVERHEAT}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stage:
+    """What faults act on."""
+
+    device: Device
+    refuse: Callable[[float], None]  # closes the port for so many seconds
+    let_second_client_in: Callable[[], None]  # lets another client connect
+    clear: Callable[[], None]  # forgets the faults that wait, and ends those that last
+
+
+def _condition(stage: Stage, fault: f.Condition) -> None:
+    stage.device.set_condition(_CONDITIONS[fault.condition], fault.active)
+
+
+def _switch(stage: Stage, fault: f.OperatorSwitch) -> None:
+    stage.device.switch_application(fault.application, running=fault.running)
+
+
+def _move(stage: Stage, fault: f.MovePart) -> None:
+    stage.device.scene.pieces[fault.part] = TablePose(fault.x, fault.y, fault.theta)
+
+
+_ACTIONS: Mapping[type[DeviceFault], Callable[[Stage, Any], object]] = {
+    f.Refuse: lambda stage, fault: stage.refuse(fault.seconds),
+    f.BusyForEver: lambda stage, fault: stage.device.hold_busy(fault.seconds),
+    f.Overtrigger: lambda stage, fault: stage.device.drop_triggers(fault.count),
+    f.SecondClient: lambda stage, _: stage.let_second_client_in(),
+    f.PowerCycle: lambda stage, fault: stage.device.reboot(fault.seconds),
+    f.OperatorSwitch: _switch,
+    f.OperatorStop: lambda stage, _: stage.device.stop(),
+    f.OperatorStart: lambda stage, _: stage.device.start(),
+    f.Condition: _condition,
+    f.LateResult: lambda stage, fault: stage.device.change_run(late=fault.seconds),
+    f.NoResult: lambda stage, _: stage.device.change_run(silent=True),
+    f.ExtraResult: lambda stage, fault: stage.device.change_run(extra=fault.count),
+    f.DigitalInput: lambda stage, _: stage.device.trigger(),
+    f.ChangeByteOrder: lambda stage, fault: stage.device.set_endian(fault.endian),
+    f.MovePart: _move,
+    f.RemovePart: lambda stage, fault: stage.device.scene.pieces.pop(fault.part, None),
+    f.ClearFaults: lambda stage, _: stage.clear(),
+}
+
+
+def act(stage: Stage, fault: DeviceFault) -> None:
+    """Let a device fault happen."""
+    _ACTIONS[type(fault)](stage, fault)

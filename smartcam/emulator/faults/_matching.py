@@ -1,0 +1,171 @@
+"""Which faults wait for what, which of them a message brings about, and which have happened."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from smartcam.emulator.faults import (
+    MAX_FAULTS,
+    MAX_FIRED,
+    FiredFault,
+    Insert,
+    OperatorSwitch,
+    make_faults,
+)
+from smartcam.emulator.faults._base import MESSAGE_NAMES, WireFault
+from smartcam.exceptions import (
+    ConfigurationError,
+    LocalProtocolError,
+    MessageError,
+    UnsupportedError,
+)
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Iterable, Mapping
+
+    from smartcam.emulator._clock import Clock
+    from smartcam.emulator.faults import Fault
+    from smartcam.emulator.faults._base import BaseFault
+    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols._framed.framing import Frame
+
+_log = logging.getLogger("smartcam.emulator")
+
+
+@dataclass(slots=True, eq=False)
+class Row:
+    """A fault that waits."""
+
+    fault: Fault
+    left: int | None  # how often it will still apply; None: always
+    seen: int = 0  # messages that fitted so far
+
+    def count(self) -> bool:
+        """Count a message that fits; True if the fault applies to it."""
+        self.seen += 1
+        if self.seen < self.fault.nth:
+            return False
+        if self.left is not None:
+            self.left -= 1
+        return True
+
+
+@dataclass(eq=False)
+class FaultQueue:
+    """The faults that wait, in the order in which they were given.
+
+    The lists of rows are always the same objects, so that it costs little to see that one is empty.
+    """
+
+    _dialect: FramedDialect
+    _clock: Clock  # whose time the record tells
+    _applications: Container[int] = ()  # ids of those that the camera has
+
+    def __post_init__(self) -> None:
+        self.said: list[Row] = []  # wire faults on messages of the camera
+        self.heard: list[Row] = []  # wire faults on messages of a client
+        self.device_said: list[Row] = []  # device faults on messages of the camera
+        self.device_heard: list[Row] = []  # device faults on messages of a client
+        # the last faults that have happened, oldest first
+        self.fired: deque[FiredFault] = deque(maxlen=MAX_FIRED)
+        self._at_once: list[Row] = []
+        self._all: list[Row] = []
+
+    @property
+    def waiting(self) -> list[Fault]:
+        """The faults."""
+        return [row.fault for row in self._all]
+
+    def add(self, given: Iterable[BaseFault | Mapping[str, Any]]) -> None:
+        """Put faults behind those that wait.
+
+        Raises:
+            ConfigurationError: one is wrong, or too many would wait; none was added.
+        """
+        faults = make_faults(given)
+        for number, fault in enumerate(faults, start=1):
+            self._check(number, fault)
+        if len(self._all) + len(faults) > MAX_FAULTS:
+            raise ConfigurationError(f"at most {MAX_FAULTS} faults can wait at one time")
+        for fault in faults:
+            row = Row(fault, fault.times)
+            self._all.append(row)
+            self._list_of(fault).append(row)
+
+    def by_frame(self, rows: list[Row], frame: Frame) -> list[Fault]:
+        """Return the faults among ``rows`` that a client's frame brings about, in order."""
+        if not rows:
+            return []
+        try:
+            message = self._dialect.decode(m.Sender.CLIENT, frame)
+        except MessageError:
+            message = m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
+        name = self._dialect.message_type(m.Sender.CLIENT, frame.message_id).__name__
+        return self._take(rows, name, frame.message_id, message)
+
+    def by_message(self, rows: list[Row], message: m.Message) -> list[Fault]:
+        """Return the faults among ``rows`` that a message brings about, as :meth:`by_frame`."""
+        return self._take(rows, type(message).__name__, self._dialect.message_id(message), message)
+
+    def at_once(self) -> list[Fault]:
+        """Return the faults that wait for no message, in order."""
+        rows = list(self._at_once)
+        self._forget(rows)
+        return self._record([row.fault for row in rows], None)
+
+    def clear(self) -> None:
+        """Forget all that wait."""
+        self._forget(list(self._all))
+
+    def _take(self, rows: list[Row], name: str, message_id: int, message: m.Message) -> list[Fault]:
+        hits = [row for row in rows if row.fault.fits(name, message_id) and row.count()]
+        self._forget([row for row in hits if row.left == 0])
+        return self._record([row.fault for row in hits], message)
+
+    def _record(self, faults: list[Fault], message: m.Message | None) -> list[Fault]:
+        for fault in faults:
+            _log.info("= fault: %r, on %s", fault, message)
+            self.fired.append(FiredFault(self._clock.now, fault, message))
+        return faults
+
+    def _forget(self, rows: list[Row]) -> None:
+        for row in rows:
+            self._list_of(row.fault).remove(row)
+            self._all.remove(row)
+
+    def _list_of(self, fault: Fault) -> list[Row]:
+        speaker = fault.speaker
+        if speaker is None:
+            return self._at_once
+        if isinstance(fault, WireFault):
+            return self.said if speaker is m.Sender.CAMERA else self.heard
+        return self.device_said if speaker is m.Sender.CAMERA else self.device_heard
+
+    def _check(self, number: int, fault: Fault) -> None:
+        """Refuse what this camera cannot do."""
+        wrong = misfit(fault, self._dialect, self._applications)
+        if wrong is not None:
+            field, text = wrong
+            raise ConfigurationError(f"fault {number}: {fault.kind}.{field}: {text}")
+
+
+def misfit(
+    fault: Fault, dialect: FramedDialect, applications: Container[int]
+) -> tuple[str, str] | None:
+    """Return the field of a fault that a camera cannot do and why, None where it can do all."""
+    if isinstance(fault.on, str) and not dialect.has(MESSAGE_NAMES[fault.on]):
+        return "on", f"dialect {dialect.label} has no {fault.on}"
+    if isinstance(fault, Insert) and fault.word is not None:
+        try:
+            dialect.encode(fault.word)
+        except LocalProtocolError as exc:
+            return "fields", str(exc)
+        except UnsupportedError:
+            return "message", f"dialect {dialect.label} has no {fault.message}"
+    if isinstance(fault, OperatorSwitch) and fault.application not in applications:
+        return "application", f"the camera has no application {fault.application}"
+    return None

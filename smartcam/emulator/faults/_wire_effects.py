@@ -1,0 +1,209 @@
+"""What faults make of one message: transmissions, to be passed on as they say. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from smartcam.emulator import faults as f
+from smartcam.emulator.faults._delay_line import Ending, Transmission
+from smartcam.exceptions import FrameError
+from smartcam.protocols._framed.framing import Frame, Framer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from smartcam.protocols._framed.dialect import FramedDialect
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class WireMessage(Transmission):
+    """A message on its way, or something inserted."""
+
+    what: Frame | bytes  # the frame that its sender meant; bytes for what makes none
+    original: bytes  # its bytes
+    changeable: bool = True  # whether later faults act on it
+    passed: bytearray = field(default_factory=bytearray)  # what has passed
+
+    @classmethod
+    def of(cls, what: Frame | bytes, data: bytes) -> WireMessage:
+        """Return one that passes as it is."""
+        return cls([data], what=what, original=data)
+
+    @property
+    def wire(self) -> bytes | None:
+        """The bytes that passed, None where they are those that were meant."""
+        return None if self.passed == self.original else bytes(self.passed)
+
+    def place(self, offset: int) -> tuple[int, int]:
+        """Return the part in which the byte at ``offset`` is, and where in it."""
+        ends = list(accumulate(map(len, self.parts)))
+        index = next(number for number, end in enumerate(ends) if offset < end)
+        return index, offset - (ends[index] - len(self.parts[index]))
+
+    def drop(self) -> None:
+        """Let nothing of it pass; no later fault acts on it."""
+        self.parts.clear()
+        self.pauses.clear()
+        self.changeable = False
+
+    def copy(self) -> WireMessage:
+        """Return another one like it."""
+        return replace(
+            self,
+            parts=list(self.parts),
+            pauses=list(self.pauses),
+            faults=list(self.faults),
+            passed=bytearray(),
+        )
+
+
+# ---------------------------------------------------------------------- one for itself
+
+
+def _delay(fault: f.Delay, message: WireMessage) -> None:
+    message.delay += fault.seconds
+    message.overtaken |= fault.overtaken
+
+
+def _split(fault: f.Split, message: WireMessage) -> None:
+    if fault.after >= message.size:
+        return
+    index, inner = message.place(fault.after)
+    if inner:  # else it is cut there already
+        part = message.parts[index]
+        message.parts[index : index + 1] = [part[:inner], part[inner:]]
+        message.pauses.insert(index, fault.pause)
+
+
+def _coalesce(fault: f.Coalesce, message: WireMessage) -> None:
+    message.gather = (fault.count, fault.seconds)
+
+
+def _truncate(fault: f.Truncate, message: WireMessage) -> None:
+    if fault.keep == 0:
+        message.drop()
+    elif fault.keep < message.size:
+        index, inner = message.place(fault.keep - 1)
+        message.parts[index:] = [message.parts[index][: inner + 1]]
+        del message.pauses[index:]
+    if fault.then != "continue":
+        message.end = Ending(fault.then, fault.kind)
+
+
+def _corrupt(fault: f.Corrupt, message: WireMessage) -> None:
+    size = message.size
+    offset = fault.offset if fault.offset >= 0 else size + fault.offset
+    if not 0 <= offset < size:
+        return
+    index, inner = message.place(offset)
+    part = bytearray(message.parts[index])
+    part[inner] = part[inner] ^ (fault.xor or 0) if fault.value is None else fault.value
+    message.parts[index] = bytes(part)
+
+
+_CHANGES: Mapping[type[object], Callable[[Any, WireMessage], None]] = {
+    f.Delay: _delay,
+    f.Split: _split,
+    f.Coalesce: _coalesce,
+    f.Truncate: _truncate,
+    f.Corrupt: _corrupt,
+    f.Drop: lambda _, message: message.drop(),
+}
+"""Faults that act on each transmission of a message for itself."""
+
+
+# ---------------------------------------------------------------------- all together
+
+_Sent: TypeAlias = "list[WireMessage]"
+
+
+def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: FramedDialect) -> _Sent:
+    result: _Sent = []
+    for one in sent:
+        result.append(one)
+        if one.changeable:
+            one.faults.append(fault.kind)
+            result += [one.copy() for _ in range(fault.copies)]
+    return result
+
+
+def _insert(fault: f.Insert, sent: _Sent, dialect: FramedDialect) -> _Sent:
+    places = [number for number, one in enumerate(sent) if one.changeable]
+    if not places:
+        return sent
+    word = fault.word
+    data = dialect.encode(word) if word is not None else fault.data or b""
+    new = cut_datagram(data, dialect)
+    new.faults.append(fault.kind)
+    new.changeable = fault.where == "instead"
+    if new.changeable:
+        for number in places:
+            sent[number].drop()
+            sent[number].faults.append(fault.kind)
+    place = places[0] if fault.where == "before" else places[-1] + 1
+    return [*sent[:place], new, *sent[place:]]
+
+
+def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: FramedDialect) -> _Sent:
+    seconds = fault.seconds if isinstance(fault, f.HalfOpen) else None
+    if fault.when == "before":
+        for one in sent:
+            if one.changeable:
+                one.drop()
+                one.faults.append(fault.kind)
+    sent[-1].end = sent[-1].end or Ending(fault.kind, fault.kind, seconds)
+    return sent
+
+
+_REBUILDS: Mapping[type[object], Callable[[Any, _Sent, FramedDialect], _Sent]] = {
+    f.Duplicate: _duplicate,
+    f.Insert: _insert,
+    f.HalfOpen: _end,
+    f.Reset: _end,
+    f.Close: _end,
+}
+"""Faults that act on all transmissions of a message together."""
+
+
+def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: FramedDialect) -> _Sent:
+    """Apply wire faults one after the other; return the messages that pass, in order."""
+    sent = [message]
+    for fault in faults:
+        rebuild = _REBUILDS.get(type(fault))
+        if rebuild is not None:
+            sent = rebuild(fault, sent, dialect)
+            continue
+        for one in sent:
+            if one.changeable:
+                one.faults.append(fault.kind)
+                _CHANGES[type(fault)](fault, one)
+    return sent
+
+
+def cut(data: bytes, framer: Framer, dialect: FramedDialect) -> list[WireMessage]:
+    """Return the messages that are whole with these bytes: frames, and bytes between them.
+
+    The framer keeps what is unfinished.
+    """
+    framer.feed(data)
+    messages: list[WireMessage] = []
+    while True:
+        try:
+            frame = framer.next_frame()
+        except FrameError:
+            before = framer.pending
+            skipped = before[: framer.resync()]
+            messages.append(WireMessage.of(skipped, skipped))
+            continue
+        if frame is None:
+            return messages
+        messages.append(WireMessage.of(frame, dialect.encode_frame(frame)))
+
+
+def cut_datagram(data: bytes, dialect: FramedDialect) -> WireMessage:
+    """Return a datagram as a message, with its frame if it is exactly one."""
+    messages = cut(data, Framer(dialect.header, len(data)), dialect)
+    whole = [one.original for one in messages] == [data]
+    return messages[0] if whole else WireMessage.of(data, data)

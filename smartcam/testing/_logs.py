@@ -1,0 +1,297 @@
+"""Expectations on what went over the wire, for tests of anybody's client.
+
+::
+
+    emulated_camera.log.expect(Connect, Query, Trigger, ResultContainer, Disconnect)
+    emulated_camera.log.expect_nothing_while_busy()
+    emulated_camera.log.expect_disconnect_before_close()
+
+What is expected may still be on its way, so each of them looks again and again until its time is
+over. A failure is an ``AssertionError`` that shows the log.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeAlias, overload
+
+from smartcam.emulator.faults._base import MESSAGE_NAMES, known_name
+from smartcam.exceptions import ConfigurationError
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.emulator._traffic import LogEntry, Visit
+
+Expected: TypeAlias = "type[m.Message] | m.Message | str | int"
+"""A message type or its name, a message with all its fields, or a message id."""
+
+ALLOWED_WHILE_BUSY: tuple[type[m.Message], ...] = (
+    m.Connect,
+    m.Query,
+    m.GetStatus,
+    m.Disconnect,
+)
+"""What a client may say while the camera is BUSY: it asks for nothing that takes the camera's time
+(inferred)."""
+
+SHOWN = 40
+"""Entries of the log that a failure shows: the last ones."""
+
+PAUSE = 0.005
+"""Seconds between two looks."""
+
+
+class CameraLog(Sequence["LogEntry"]):
+    """What went over the wire of an emulated camera, oldest first; looked at anew each time.
+
+    Args:
+        read: returns the entries.
+        visits: returns the connections that have ended.
+        links: returns who is connected; nobody where there are no connections.
+        pushed_out: returns how many entries are gone because the log was full.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[], list[LogEntry]],
+        visits: Callable[[], list[Visit]],
+        links: Callable[[], list[str]],
+        pushed_out: Callable[[], int] = lambda: 0,
+    ) -> None:
+        self._read = read
+        self._pushed_out = pushed_out
+        self._visits = visits
+        self._links = links
+
+    def __len__(self) -> int:
+        return len(self._read())
+
+    def __iter__(self) -> Iterator[LogEntry]:
+        return iter(self._read())
+
+    @overload
+    def __getitem__(self, index: int, /) -> LogEntry: ...
+    @overload
+    def __getitem__(self, index: slice, /) -> list[LogEntry]: ...
+    def __getitem__(self, index: int | slice, /) -> LogEntry | list[LogEntry]:
+        """Return an entry, or some as a list.
+
+        Raises:
+            IndexError: there is none.
+        """
+        return self._read()[index]
+
+    @property
+    def pushed_out(self) -> int:
+        """Entries that are gone because the log was full; what is expected of all then fails."""
+        return self._pushed_out()
+
+    @property
+    def received(self) -> list[m.Message]:
+        """What clients have sent, as far as it makes messages."""
+        return _messages(self._read(), "in")
+
+    @property
+    def said(self) -> list[m.Message]:
+        """What the camera has said."""
+        return _messages(self._read(), "out")
+
+    # ------------------------------------------------------------------ expectations
+
+    def expect(self, *expected: Expected, only: bool = False, timeout: float = 1.0) -> None:
+        """See that these messages went over the wire, in this order.
+
+        Args:
+            expected: of the client and of the camera; others may stand between them.
+            only: the client sent nothing else. What the camera said is not looked at unless it is
+                expected.
+            timeout: seconds that they may still take.
+
+        Raises:
+            AssertionError: they did not.
+            ConfigurationError: no message is called so.
+        """
+        __tracebackhide__ = True
+        wanted = [_known(one) for one in expected]
+        self._until(lambda entries: _in_order(entries, wanted, only=only), timeout, whole=only)
+
+    def expect_nothing_while_busy(
+        self, *also: type[m.Message], grace: float = 0.0, timeout: float = 0.0
+    ) -> None:
+        """See that clients sent nothing between the camera's BUSY and the status without it.
+
+        Queries, Get status, Connect and Disconnect are allowed. What comes in one piece with the
+        message that made the camera BUSY was sent before.
+
+        Args:
+            also: what else is allowed.
+            grace: seconds after BUSY in which a message may have been on its way already.
+            timeout: seconds to wait for it to become true; it hardly ever does.
+
+        Raises:
+            AssertionError: something else was sent.
+        """
+        __tracebackhide__ = True
+        allowed = (*ALLOWED_WHILE_BUSY, *also)
+        self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
+
+    def expect_disconnect_before_close(self, *, timeout: float = 1.0) -> None:
+        """See that every client that had a session ended it by Disconnect, and then its connection.
+
+        Over UDP there is no connection: Disconnect has to be the last message of each.
+
+        Args:
+            timeout: seconds that it may still take.
+
+        Raises:
+            AssertionError: one did not, or is still connected.
+        """
+        __tracebackhide__ = True
+        self._until(self._unfinished, timeout, whole=True)
+
+    def expect_no_errors(self) -> None:
+        """See that all that clients sent was frames that the camera accepts.
+
+        Raises:
+            AssertionError: something was ignored.
+        """
+        __tracebackhide__ = True
+        self._until(_refused, 0.0, whole=True)
+
+    def _unfinished(self, entries: list[LogEntry]) -> str | None:
+        last: dict[str, LogEntry] = {}
+        sessions: set[str] = set()
+        for entry in entries:
+            if entry.direction == "in":
+                last[entry.peer] = entry
+                if isinstance(entry.message, m.Connect):
+                    sessions.add(entry.peer)
+        for peer in sorted(sessions):
+            if not isinstance(last[peer].message, m.Disconnect):
+                ended = next((v for v in self._visits() if v.peer == peer), None)
+                how = "" if ended is None else f", and {_end_text(ended)}"
+                return f"the last message of {peer} was {_text(last[peer])}, not Disconnect{how}"
+        still = sorted(sessions.intersection(self._links()))
+        return f"still connected: {', '.join(still)}" if still else None
+
+    def _until(
+        self, finding: Callable[[list[LogEntry]], str | None], timeout: float, *, whole: bool
+    ) -> None:
+        """Look until nothing is found; with ``whole`` nothing may be missing in the log."""
+        __tracebackhide__ = True
+        end = time.monotonic() + timeout
+        while True:
+            entries = self._read()
+            found = finding(entries)
+            gone = self._pushed_out()
+            missing = f"{gone} older entries were pushed out of the full log" if gone else None
+            if found is None and not (missing and whole):
+                return
+            if time.monotonic() >= end or found is None:
+                reasons = [one for one in (found, missing) if one]
+                raise AssertionError("\n".join([*reasons, _shown(entries)]))
+            time.sleep(PAUSE)
+
+
+def _messages(entries: list[LogEntry], direction: str) -> list[m.Message]:
+    return [
+        entry.message
+        for entry in entries
+        if entry.direction == direction and entry.message is not None and entry.error is None
+    ]
+
+
+def _known(expected: Expected) -> Expected:
+    if not isinstance(expected, str):
+        return expected
+    try:
+        return MESSAGE_NAMES[known_name(expected)]
+    except ValueError as exc:
+        raise ConfigurationError(str(exc)) from exc
+
+
+def _fits(entry: LogEntry, expected: Expected) -> bool:
+    if isinstance(expected, int):
+        return entry.message_id == expected
+    if isinstance(expected, type):
+        return isinstance(entry.message, expected)
+    return entry.message == expected
+
+
+def _in_order(entries: list[LogEntry], wanted: list[Expected], *, only: bool) -> str | None:
+    """Return the mistake in words, None where all is there."""
+    frames = [entry for entry in entries if entry.error is None]
+    place = 0
+    for entry in frames:
+        if place < len(wanted) and _fits(entry, wanted[place]):
+            place += 1
+        elif only and entry.direction == "in":
+            return f"the client also sent {_text(entry)}, {_place_text(wanted, place)}"
+    if place == len(wanted):
+        return None
+    return f"expected {_name(wanted[place])}, {_place_text(wanted, place)}; it did not come"
+
+
+def _place_text(wanted: list[Expected], place: int) -> str:
+    done = ", ".join(_name(one) for one in wanted[:place])
+    return f"after {done}" if done else "at first"
+
+
+def _busy_talk(
+    entries: list[LogEntry], allowed: tuple[type[m.Message], ...], grace: float
+) -> str | None:
+    busy: dict[str, float] = {}
+    for entry in entries:
+        message = entry.message
+        if isinstance(message, m.StatusReport) and entry.direction == "out":
+            if Status.BUSY not in message.status:
+                busy.pop(entry.peer, None)
+            else:
+                busy.setdefault(entry.peer, entry.time)
+        elif isinstance(message, m.Connect):
+            busy.pop(entry.peer, None)
+        elif entry.direction == "in" and entry.error is None and entry.peer in busy:
+            since = entry.time - busy[entry.peer]
+            if not isinstance(message, allowed) and since >= grace:
+                return f"the client sent {_text(entry)} while the camera was BUSY, for {since:g} s"
+    return None
+
+
+def _refused(entries: list[LogEntry]) -> str | None:
+    wrong = next((entry for entry in entries if entry.direction == "in" and entry.error), None)
+    return None if wrong is None else f"the client sent what the camera refuses: {wrong.error}"
+
+
+def _end_text(visit: Visit) -> str:
+    how = "reset" if visit.reset else "closed"
+    return f"the {visit.ended_by} {how} the connection"
+
+
+def _name(expected: Expected) -> str:
+    if isinstance(expected, type):
+        return expected.__name__
+    return f"message {expected:#04x}" if isinstance(expected, int) else str(expected)
+
+
+def _text(entry: LogEntry) -> str:
+    if entry.message is not None:
+        return str(entry.message)
+    return f"message {entry.message_id:#04x}" if entry.message_id is not None else "no frame"
+
+
+def _shown(entries: list[LogEntry]) -> str:
+    """Return the log as it stands in a failure."""
+    lines = [f"  ... {len(entries) - SHOWN} before"] if len(entries) > SHOWN else []
+    begin = entries[0].time if entries else 0.0
+    for entry in entries[-SHOWN:]:
+        mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
+        what = entry.error or _text(entry)
+        fault = f"  ({entry.fault})" if entry.fault else ""
+        lines.append(f"  {entry.time - begin:9.4f} s {mark} {entry.peer}  {what}{fault}")
+    return "\n".join(
+        ["what went over the wire (< from a client, > to it):", *(lines or ["  nothing"])]
+    )

@@ -1,0 +1,450 @@
+"""The suite for authors of interpreters: subclass, give containers and values, inherit the tests.
+
+::
+
+    class TestWeights(InterpreterSuite):
+        spec = weights
+        name = "weights"
+        samples = (
+            ContainerSample(struct.pack("<10sf", b"bolt", 0.25), {"bolt": 0.25}),
+            ContainerSample(b"", {}),
+        )
+
+An interpreter is called as the client calls it, except that the client makes an InterpretationError
+of whatever an interpreter raises; here another error is a mistake.
+"""
+# ruff: noqa: S101 - they are tests, in a package so that others can run them
+
+from __future__ import annotations
+
+import gc
+import json
+import math
+import pickle
+import re
+import struct
+import sys
+from dataclasses import dataclass, fields, is_dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import pytest
+
+from smartcam.exceptions import ConfigurationError, InterpretationError, PluginError
+from smartcam.interpreters._base import Context, Interpreter, PlainInterpreter, Reader, resolve
+from smartcam.layout import Layout
+from smartcam.models import Pose, jsonable
+from smartcam.registry import INTERPRETERS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from hypothesis.strategies import DataObject
+
+    from smartcam.interpreters._base import Spec
+
+MAX_ERROR_TEXT = 500
+"""Characters of an error's text: a container's bytes are in it, 64 of them at most."""
+
+MAX_PLACES = 256
+"""Places of a container at which one thing is tried, at most."""
+
+TRAILING = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
+"""What may stand behind a container."""
+
+NOT_FINITE = tuple(
+    struct.pack(order + code, number)
+    for order in "<>"
+    for code in "fd"
+    for number in (math.nan, math.inf, -math.inf)
+)
+"""Bytes of numbers that are none, in each size and order."""
+
+LAYOUTS = ("x: int8", "x: real32 mm, y: real32 mm, theta: real32 deg", "(name: string[3])*")
+"""Layouts that a user may write behind an interpreter's name."""
+
+_AT = datetime(2024, 2, 29, 23, 59, 30, tzinfo=UTC)
+_ADDRESS = re.compile(r"<.* at 0x[0-9A-Fa-f]+>")
+
+
+@dataclass(frozen=True)
+class ContainerSample:
+    """A container and what it means.
+
+    Attributes:
+        data: its bytes behind the application id, numbers little endian.
+        value: what the interpreter makes of it; for an array its ``tolist()`` will do.
+        layout: what the user writes behind the interpreter's name, None for nothing.
+        big: the same container with big-endian numbers, the same bytes where it has none. It may be
+            left out where the interpreter has a layout, which says where numbers stand.
+        sequence: its sequence number.
+        name: for people.
+    """
+
+    data: bytes
+    value: object
+    layout: str | None = None
+    big: bytes | None = None
+    sequence: int | None = None
+    name: str = ""
+
+
+class InterpreterSuite:
+    """What holds for every interpreter.
+
+    Attributes:
+        spec: the interpreter as ``interpret_as`` takes it: a function, a class, an object, a name.
+        samples: containers and what they mean; each layout of interest has one.
+        name: name of its entry point, "" without one.
+    """
+
+    spec: ClassVar[Spec]
+    samples: ClassVar[Sequence[ContainerSample]] = ()
+    name: ClassVar[str] = ""
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """Run a check with each sample; pytest calls it.
+
+        Raises:
+            pytest.UsageError: ``spec`` or ``samples`` is missing.
+        """
+        if "sample" not in metafunc.fixturenames:
+            return
+        own = type(self)
+        for name in ("spec", "samples"):
+            if not getattr(own, name, None):
+                raise pytest.UsageError(f"{own.__name__}.{name}: expected one, got none")
+        labels = [one.name or one.layout or f"sample {i}" for i, one in enumerate(self.samples)]
+        metafunc.parametrize("sample", self.samples, ids=labels)
+
+    def make(self, layout: str | None = None) -> Interpreter:
+        """Return a new interpreter, with what a user would write behind its name.
+
+        Raises:
+            ConfigurationError: it takes no layout, needs one, or not this one.
+        """
+        spec = type(self).spec  # of an object a function would be a method
+        if layout is None:
+            return resolve(spec)
+        if isinstance(spec, str):
+            return resolve(f"{spec}: {layout}")
+        if isinstance(spec, type) and issubclass(spec, Interpreter):
+            return spec(Layout(layout))
+        interpreter = resolve(spec)
+        if interpreter is spec:
+            raise ConfigurationError("an interpreter that is made already takes no layout")
+        interpreter.layout = Layout(layout)
+        return interpreter
+
+    # ------------------------------------------------------------------ values
+
+    def test_value_is_as_expected(self, sample: ContainerSample) -> None:
+        """And so is the value of the same bytes that come a second time."""
+        interpreter = self.make(sample.layout)
+        for _ in range(2):
+            value = interpret(interpreter, sample.data)
+            assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
+
+    def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
+        """It is that of the layout's field, or None; of any bytes it is one or an error."""
+        interpreter = self.make(sample.layout)
+        reader = _reader(interpreter, sample.data)
+        found = interpreter.sequence(reader)
+        assert found == sample.sequence, f"expected number {sample.sequence}, got {found}"
+        for data in (*_cuts(sample.data), *(sample.data + more for more in TRAILING)):
+            try:
+                number = interpreter.sequence(_reader(interpreter, data))
+            except InterpretationError as error:
+                see_error(error, data)
+            else:
+                assert number is None or isinstance(number, int), f"{data!r}: number {number!r}"
+
+    def test_value_is_the_same_each_time(self, sample: ContainerSample) -> None:
+        """Whatever came in between, and of a new interpreter too; values share nothing."""
+        interpreter = self.make(sample.layout)
+        first = interpret(interpreter, sample.data)
+        between = [one for one in self.samples if one.layout == sample.layout]
+        for data in (*(one.data for one in between), sample.data[:-1], sample.data + b"\0", b""):
+            outcome(interpreter, data)
+            again = interpret(interpreter, sample.data)
+            assert _same(again, first), f"first {first!r}, after {data!r} {again!r}"
+            shared = [one for one in _mutable(first) if id(one) in set(map(id, _mutable(again)))]
+            assert not shared, f"two values share {shared[0]!r}"
+        other = interpret(self.make(sample.layout), sample.data)
+        assert _same(other, first), f"first {first!r}, of another interpreter {other!r}"
+
+    def test_nothing_is_kept(self, sample: ContainerSample) -> None:
+        """Neither bytes nor anything else; the bytes stay what they are."""
+        interpreter = self.make(sample.layout)
+        outcome(interpreter, sample.data)  # what it finds out at first it may keep
+        data = bytes(bytearray(sample.data))
+        kept, before = repr(vars(interpreter)), sys.getrefcount(data)
+        for _ in range(3):
+            outcome(interpreter, data)
+        assert data == sample.data, f"the container was changed to {data!r}"
+        now = repr(vars(interpreter))
+        assert now == kept, f"the interpreter was changed from {kept} to {now}"
+        if sys.getrefcount(data) != before:
+            gc.collect()
+        assert sys.getrefcount(data) <= before or len(data) < 2, "the container's bytes are kept"
+
+    def test_value_can_be_written_as_json(self, sample: ContainerSample) -> None:
+        """``--json`` and monitoring tools write it."""
+        value = interpret(self.make(sample.layout), sample.data)
+        text = json.dumps(jsonable(value), allow_nan=False)
+        nameless = _ADDRESS.search(text)
+        assert nameless is None, f"JSON has no word for {nameless and nameless[0]!r} in {value!r}"
+
+    def test_big_endian_gives_the_same_value(self, sample: ContainerSample) -> None:
+        """The camera's status says which order it is: it stands in ``reader.context``."""
+        interpreter = self.make(sample.layout)
+        big = sample.big
+        if big is None:
+            if interpreter.layout is None:
+                pytest.skip(
+                    "ContainerSample(big=...) is missing: the container with big-endian numbers"
+                )
+            big = _turned(interpreter.layout, sample.data)
+        value = interpret(interpreter, big, byte_order="big")
+        assert _like(value, sample.value), f"{big!r}: expected {sample.value!r}, got {value!r}"
+
+    # ------------------------------------------------------------------ what does not fit
+
+    def test_cut_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
+        """At each length: a value, or an InterpretationError that says what was expected."""
+        interpreter = self.make(sample.layout)
+        for data in (b"", *_cuts(sample.data)):
+            see(interpreter, data)
+
+    def test_longer_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
+        """What stands behind a container is no other kind of error either."""
+        interpreter = self.make(sample.layout)
+        for more in TRAILING:
+            see(interpreter, sample.data + more)
+            see(interpreter, sample.data + sample.data + more)
+
+    def test_any_bytes_are_a_value_or_told(self, sample: ContainerSample) -> None:
+        """The user may have named the wrong interpreter."""
+        from smartcam.testing._suites import strategies
+
+        interpreter = self.make(sample.layout)
+        contents = strategies.noise([one.data for one in self.samples])
+        orders = strategies.st.sampled_from(["little", "big"])
+
+        def check(data: DataObject) -> None:
+            see(interpreter, data.draw(contents), byte_order=data.draw(orders))
+
+        strategies.each_drawn(check)
+
+    def test_numbers_that_are_none_are_in_no_pose(self, sample: ContainerSample) -> None:
+        """NaN or infinity, wherever they come, are an error where a robot would move to them."""
+        interpreter = self.make(sample.layout)
+        size = len(sample.data)
+        for number in NOT_FINITE:
+            last = size - len(number)
+            for place in range(0, last + 1, 1 + size // MAX_PLACES):
+                data = sample.data[:place] + number + sample.data[place + len(number) :]
+                for order in ("little", "big"):
+                    see(interpreter, data, byte_order=order)
+
+    def test_any_context_is_borne(self, sample: ContainerSample) -> None:
+        """Names, numbers and options of the client's."""
+        interpreter = self.make(sample.layout)
+        for options in (
+            {"camera": "é " * 100, "application": -1, "number": 1 << 40, "received_at": _AT},
+            {"application": (1 << 32) - 1, "y_down": True},
+            {"lenient": True},
+        ):
+            for data in (sample.data, sample.data[:-1], b"\x01" * len(sample.data)):
+                see(interpreter, data, **options)
+
+    # ------------------------------------------------------------------ what it says of itself
+
+    def test_containers_of_a_burst_are_read_as_one_by_one(self, sample: ContainerSample) -> None:
+        """A PlainInterpreter's ``read_all`` and ``interpret`` are no other than its ``read``."""
+        interpreter = self.make(sample.layout)
+        if not isinstance(interpreter, PlainInterpreter):
+            return  # the client reads them one by one
+        burst = [one.data for one in self.samples if one.layout == sample.layout] * 2
+        context = Context(camera="burst", number=5, received_at=_AT)
+        values = interpreter.read_all(burst, context)
+        assert len(values) == len(burst), f"{len(burst)} containers gave {len(values)} values"
+        empty = 0
+        for number, (data, value) in enumerate(zip(burst, values, strict=True), 5):
+            single = Context(camera="burst", number=number, received_at=_AT)
+            read = interpreter.read(data, single)
+            assert _same(value, read), f"read() gives {read!r}, read_all() {value!r}"
+            by_reader = interpreter.interpret(Reader(data, Context("burst", 0, number, _AT)))
+            assert _same(by_reader, read), f"read() gives {read!r}, interpret() {by_reader!r}"
+            empty += single.empty_slots
+        assert context.empty_slots == empty, f"empty_slots: {context.empty_slots}, not {empty}"
+
+    def test_layout_is_taken_or_refused(self, sample: ContainerSample) -> None:
+        """Whatever the user writes behind the name, or if nothing: a ConfigurationError at most."""
+        for layout in (None, *LAYOUTS):
+            try:
+                interpreter = self.make(layout)
+            except ConfigurationError:
+                continue
+            assert isinstance(interpreter, Interpreter), f"{layout}: {interpreter!r}"
+            see(interpreter, sample.data)
+
+    def test_entry_point_gives_the_interpreter(self, sample: ContainerSample) -> None:
+        """``interpret_as="name"`` finds it: the package is installed."""
+        if not self.name:
+            pytest.skip(f"{type(self).__name__}.name is empty: it has no entry point")
+        try:
+            loaded = INTERPRETERS.load(self.name)
+        except PluginError as error:
+            message = f"{error}. Is the package installed (pip install -e .), and is {self.name!r}"
+            raise AssertionError(f"{message} the name under smartcam.interpreters?") from error
+        spec = type(self).spec
+        assert isinstance(spec, str) or loaded is spec, f"{self.name!r} gives {loaded!r:.200}"
+        text = self.name if sample.layout is None else f"{self.name}: {sample.layout}"
+        value = interpret(resolve(text), sample.data)
+        assert _like(value, sample.value), f"{text!r}: expected {sample.value!r}, got {value!r}"
+
+
+def _reader(interpreter: Interpreter, data: bytes, **context: Any) -> Reader:
+    return Reader(data, Context(**context), interpreter.layout)
+
+
+def interpret(interpreter: Interpreter, data: bytes, **context: Any) -> object:
+    """Return an interpreter's value; whatever it raises comes out as it is."""
+    return interpreter.interpret(_reader(interpreter, data, **context))
+
+
+def outcome(interpreter: Interpreter, data: bytes) -> object:
+    """Return an interpreter's value, None where it raises an InterpretationError."""
+    try:
+        return interpret(interpreter, data)
+    except InterpretationError:
+        return None
+
+
+def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
+    """See that bytes give a value without nonsense, or the right kind of error.
+
+    Raises:
+        AssertionError: they do not.
+    """
+    where = f"{len(data)} bytes {data[:64]!r}, {context}"
+    try:
+        value = interpret(interpreter, data, **context)
+    except InterpretationError as error:
+        see_error(error, data)
+        return
+    except Exception as error:
+        message = f"{where}: expected a value or an InterpretationError, got {error!r}"
+        raise AssertionError(message) from error
+    for pose in _poses(value):
+        numbers = (*pose.position, *pose.orientation)
+        assert all(map(math.isfinite, numbers)), f"{where}: a pose that is none: {pose}"
+
+
+def see_error(error: InterpretationError, data: bytes) -> None:
+    """See that an error says what was expected where, in a few words, and survives pickle.
+
+    Raises:
+        AssertionError: it does not.
+    """
+    where = f"{len(data)} bytes {data[:64]!r}: {error!r:.300}"
+    assert str(error), f"{where}: it says nothing"
+    assert len(str(error)) <= MAX_ERROR_TEXT, f"{where}: a text of {len(str(error))} characters"
+    assert error.field or error.expected is not None, f"{where}: neither field nor expected"
+    assert error.offset >= 0, f"{where}: offset {error.offset}"
+    try:
+        copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
+    except Exception as exc:
+        raise AssertionError(f"{where}: it does not survive pickle: {exc!r}") from exc
+    said = (type(error), str(error), error.field, error.offset)
+    assert (type(copy), str(copy), copy.field, copy.offset) == said, f"{where}: a copy is {copy!r}"
+
+
+def _cuts(data: bytes) -> Iterator[bytes]:
+    for end in range(0, len(data), 1 + len(data) // MAX_PLACES):
+        yield data[:end]
+    yield data[:-1]
+
+
+def _turned(layout: Layout, data: bytes) -> bytes:
+    """Return a container with its numbers in the other byte order."""
+    turned, place = bytearray(), 0
+    todo = [*layout.head, *layout.fields]
+    while place < len(data) and todo:
+        for field in todo:
+            piece = data[place : place + field.size]
+            turned += piece[::-1] if field.wire.is_number else piece
+            place += field.size
+        todo = list(layout.fields)
+    return bytes(turned)
+
+
+def _parts(value: object) -> Iterator[object]:
+    """Yield a value and everything in it."""
+    yield value
+    inside: Sequence[object] = ()
+    if isinstance(value, dict):
+        found = cast("dict[object, object]", value)
+        inside = [*found.keys(), *found.values()]
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        inside = [*cast("Sequence[object]", value)]
+    elif is_dataclass(value) and not isinstance(value, type):
+        inside = [getattr(value, field.name) for field in fields(value)]
+    for one in inside:
+        yield from _parts(one)
+
+
+def _poses(value: object) -> Iterator[Pose]:
+    return (one for one in _parts(value) if isinstance(one, Pose))
+
+
+def _mutable(value: object) -> list[object]:
+    """Return the mutable objects in a value."""
+    kinds = (list, dict, set, bytearray)
+    return [
+        one
+        for one in _parts(value)
+        if isinstance(one, kinds)
+        or bool(getattr(getattr(one, "flags", None), "writeable", False))
+        or _is_open(one)
+    ]
+
+
+def _is_open(value: object) -> bool:
+    """Whether a value is a dataclass's object that can be changed."""
+    if not is_dataclass(value) or isinstance(value, type):
+        return False
+    return not cast("Any", value).__dataclass_params__.frozen
+
+
+def _is_array(value: object) -> bool:
+    numpy = sys.modules.get("numpy")  # only who has arrays has it
+    return numpy is not None and isinstance(value, numpy.ndarray)
+
+
+def _like(value: Any, expected: Any) -> bool:
+    """Whether a value is what an author wrote down."""
+    if _is_array(value):
+        return _same(value, expected) if _is_array(expected) else value.tolist() == expected
+    if isinstance(value, float) and isinstance(expected, float):
+        return value == expected or (math.isnan(value) and math.isnan(expected))
+    return bool(value == expected)
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values are alike, types and numbers that are none included."""
+    if type(one) is not type(other):
+        return False
+    if _is_array(one):
+        fits = one.dtype == other.dtype and one.shape == other.shape
+        return bool(fits) and one.tobytes() == other.tobytes()
+    if isinstance(one, float):
+        return one == other or (math.isnan(one) and math.isnan(other))
+    if isinstance(one, dict):
+        return [*one] == [*other] and all(_same(one[key], other[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if is_dataclass(one):
+        return all(_same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    return bool(one == other) or repr(one) == repr(other)

@@ -1,0 +1,129 @@
+"""What the checks of a client in front of a camera share."""
+# ruff: noqa: S101 - they are tests, in a package so that others can run them
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import re
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import smartcam
+from smartcam.exceptions import UnsupportedError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Coroutine
+    from typing import Concatenate, ParamSpec, TypeVar
+
+    from smartcam.client import SmartCamera
+    from smartcam.models import Statistics
+    from smartcam.testing._suites.protocols.cameras_under_test import CameraKind, LiveCamera
+
+    Suite = TypeVar("Suite")
+    Given = ParamSpec("Given")
+
+SHORT = 0.05
+"""Seconds of a timeout that is meant to fire."""
+
+SOON = 5.0
+"""Seconds after which what should happen at once fails the check."""
+
+LONGEST = 60.0
+"""Seconds of a whole check."""
+
+GRACE_STEPS = 100
+"""Steps of the loop that what was cancelled gets to end itself."""
+
+
+def in_a_loop(
+    check: Callable[Concatenate[Suite, Given], Coroutine[Any, Any, None]],
+) -> Callable[Concatenate[Suite, Given], None]:
+    """Make a check an ordinary test, with a loop of its own.
+
+    So it needs no plugin for asynchronous tests, and bears with any. Tasks that a check leaves
+    behind fail it.
+    """
+
+    @functools.wraps(check)
+    def run(suite: Suite, /, *args: Given.args, **kwargs: Given.kwargs) -> None:
+        # with a factory the thread's current loop stays what it is
+        with asyncio.Runner(loop_factory=asyncio.new_event_loop) as runner:
+            runner.run(_watched(check(suite, *args, **kwargs)))
+
+    return run
+
+
+async def _watched(check: Coroutine[Any, Any, None]) -> None:
+    async with asyncio.timeout(LONGEST):
+        await check
+    steps = 0
+    while left := asyncio.all_tasks() - {asyncio.current_task()}:
+        steps += 1
+        if steps > GRACE_STEPS:
+            pytest.fail(f"left behind: {'; '.join(sorted(map(repr, left)))}")
+        await asyncio.sleep(0)
+
+
+def needs(camera_kind: CameraKind, *applications: int) -> None:
+    """Skip the check where a camera has not all of these applications."""
+    missing = [one for one in applications if one not in camera_kind.applications]
+    if missing:
+        pytest.skip(f"{camera_kind} has no application {', '.join(map(str, missing))}")
+
+
+def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> SmartCamera:
+    """Return a client that reads numbers, and does not reconnect."""
+    options = {"reconnect": None, "interpret_as": camera_kind.numbers, **options}
+    return smartcam.connect(live.url, **options)
+
+
+@contextlib.asynccontextmanager
+async def visiting(
+    camera_kind: CameraKind, **options: Any
+) -> AsyncIterator[tuple[LiveCamera, SmartCamera]]:
+    """A camera that is up, and a client in a session with it."""
+    if "application" in options:
+        needs(camera_kind, options["application"])
+    async with camera_kind.open() as live, client(camera_kind, live, **options) as camera:
+        yield live, camera
+
+
+async def number(camera: SmartCamera, application: int | None = None, **options: Any) -> int:
+    """Trigger and return the number that came."""
+    options.setdefault("timeout", SOON)
+    result = await camera.trigger(application, **options)
+    return int(result.value.n)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Let the loop run until something is true."""
+    async with asyncio.timeout(SOON):
+        while not condition():  # noqa: ASYNC110 - whatever the condition is
+            await asyncio.sleep(0)
+
+
+async def refused(camera: SmartCamera, call: Coroutine[Any, Any, object]) -> None:
+    """See that the dialect cannot do it, that the error says so, and that the session goes on."""
+    dialect = re.escape(camera.capabilities.dialect)
+    abilities = re.escape(", ".join(camera.capabilities.names))
+    with pytest.raises(UnsupportedError, match=rf"dialect {dialect} .*{abilities}"):
+        await call
+    assert camera.connected
+    await number(camera)
+
+
+def balance(statistics: Statistics) -> None:
+    """See that both accounts balance."""
+    assert statistics.received == (
+        statistics.triggered
+        + statistics.streamed
+        + statistics.late
+        + statistics.wrong_application
+        + statistics.uninterpretable
+        + statistics.unclaimed
+    )
+    for one in statistics.subscribers:
+        assert one.offered == one.taken + one.dropped + one.queued

@@ -1,0 +1,178 @@
+"""What client and camera say to each other, written down, and a machine that is led through it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+from smartcam.exceptions import RemoteProtocolError
+from smartcam.protocols._base import Role, Transport
+from smartcam.protocols._framed.machine import LinkFailed, ResultBurst
+from smartcam.protocols.messages import Message
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from smartcam.protocols._base import Dialect, Protocol
+    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols._framed.machine import Event, LinkMachine
+    from smartcam.protocols.messages import Sender
+
+    Trace = Callable[[Sender, Frame | RemoteProtocolError], None]
+
+MAX_LENGTH = 1 << 12
+"""Largest payload that the machines of a suite accept, bytes."""
+
+Told: TypeAlias = Message | type[RemoteProtocolError]
+"""What a machine tells: a message, or the kind of error that ends the link."""
+
+
+class Sent(NamedTuple):
+    """The client says something.
+
+    Attributes:
+        message: what it says.
+        wire: the bytes that it writes for that, those of all datagrams one after the other.
+    """
+
+    message: Message
+    wire: bytes
+
+
+class Came(NamedTuple):
+    """Bytes come from the camera: any piece of a stream, or one datagram.
+
+    Attributes:
+        data: the bytes.
+        events: what the machine makes of them: messages, and in the end possibly the type of the
+            error that ends the link.
+        wire: what it writes to that by itself.
+    """
+
+    data: bytes
+    events: tuple[Told, ...] = ()
+    wire: bytes = b""
+
+
+Step: TypeAlias = Sent | Came
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conversation:
+    """Bytes from the protocol's documents: what is said on one link, in order, from its beginning.
+
+    Attributes:
+        name: for people.
+        steps: who says what.
+        dialect: name of the dialect.
+        transport: what carries it.
+        quirks: pinned deviations from the dialect.
+        parameters: what else a URL would say.
+    """
+
+    name: str
+    steps: Sequence[Step]
+    dialect: str
+    transport: Transport = Transport.TCP
+    quirks: tuple[str, ...] = ()
+    parameters: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    def __str__(self) -> str:
+        return self.name
+
+    def group(self, protocol: Protocol) -> tuple[Dialect, ...]:
+        """Return the dialects that a client tries on the link: one, or several of its name.
+
+        Raises:
+            ConfigurationError: the dialect has no such quirk, or cannot use a parameter.
+        """
+        tries = protocol.tries(self.transport, self.dialect, self.quirks, self.parameters)
+        return tries[0]
+
+
+def told(events: Iterable[Event]) -> list[Any]:
+    """Return events with each burst as its containers, and errors by their kind."""
+    found: list[Any] = []
+    for event in events:
+        if isinstance(event, ResultBurst):
+            found += event
+        else:
+            found.append(type(event.error) if isinstance(event, LinkFailed) else event)
+    return found
+
+
+class Player:
+    """Leads a machine through a conversation, and sees that it keeps to it."""
+
+    def __init__(
+        self, protocol: Protocol, conversation: Conversation, trace: Trace | None = None
+    ) -> None:
+        self.conversation = conversation
+        self.group: tuple[Dialect, ...] = conversation.group(protocol)
+        self.machine: LinkMachine = protocol.machine(
+            self.group[0],
+            Role.CLIENT,
+            conversation.transport,
+            max_length=MAX_LENGTH,
+            trace=trace,
+            kin=self.group,
+        )
+        self.place: int = 0
+
+    def play(self, until: int | None = None) -> Player:
+        """Go on to a place, by default to the end; return the player.
+
+        Raises:
+            AssertionError: the machine said or told something else.
+        """
+        for step in self.conversation.steps[self.place : until]:
+            self.step(step)
+        return self
+
+    def step(self, step: Step, chunks: Sequence[bytes] | None = None, *, room: bool = True) -> None:
+        """Do one step; ``chunks`` are what came, cut in another way.
+
+        With ``room`` a stream's bytes are written where the machine wants them.
+
+        Raises:
+            AssertionError: the machine said or told something else.
+        """
+        where = f"{self.conversation}, step {self.place}, {step!r:.300}"
+        events: list[Any] = []
+        if isinstance(step, Sent):
+            self.machine.send(step.message)
+            wanted: list[Any] = []
+            events = told(self.machine.events())
+        else:
+            wanted = list(step.events)
+            for chunk in [step.data] if chunks is None else chunks:
+                events += self.deliver(chunk, room=room)
+        wire = self.written()
+        if events != wanted:
+            raise AssertionError(f"{where}: expected events {wanted}, got {events}")
+        if wire != step.wire:
+            raise AssertionError(f"{where}: expected {step.wire!r} on the wire, got {wire!r}")
+        if wire and not isinstance(step, Sent) and not self.machine.replies:
+            raise AssertionError(f"{where}: the machine replies by itself: replies must be True")
+        self.place += 1
+
+    def deliver(self, chunk: bytes, *, room: bool = True) -> list[Any]:
+        """Give bytes to the machine as a link does, and return what it tells."""
+        if not room or self.machine.transport is Transport.UDP:
+            self.machine.receive_data(chunk)
+            return told(self.machine.events())
+        events: list[Any] = []
+        while chunk:
+            place = self.machine.room()
+            if not len(place):
+                raise AssertionError("room() gave no room for a single byte")
+            count = min(len(place), len(chunk))
+            place[:count] = chunk[:count]
+            chunk = chunk[count:]
+            if self.machine.filled(count, 0.0):
+                events += told(self.machine.events())
+        return events + told(self.machine.events())
+
+    def written(self) -> bytes:
+        """Return the bytes that the machine has to write."""
+        return b"".join(self.machine.data_to_send())

@@ -1,0 +1,341 @@
+"""Checks of a protocol and its dialects: what they say of themselves fits together."""
+# ruff: noqa: S101 - they are tests, in a package so that others can run them
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from smartcam.exceptions import (
+    CommandRejectedError,
+    ConfigurationError,
+    LocalProtocolError,
+    PluginError,
+    SmartCamError,
+    UnsupportedError,
+)
+from smartcam.models import jsonable
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import CodeMeaning, RawRequest, Spelled, Transport, Verdict
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import Frame, Framer
+from smartcam.registry import PROTOCOLS
+from smartcam.settings import Address, parse_address
+from smartcam.testing._suites.protocols.parameters import Parameters
+from smartcam.testing._suites.protocols.words import ABILITIES, MESSAGES, NEEDED, REQUESTS, example
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from hypothesis.strategies import DataObject
+
+    from smartcam.protocols._base import Dialect
+
+SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
+"""What a URL may begin with (RFC 3986, 3.1), in small letters."""
+
+CODES = (*range(-300, 301), -(1 << 31), (1 << 16) - 1, (1 << 32) - 1)
+"""Result codes that a dialect is asked the meaning of."""
+
+
+def _is_line(text: object) -> bool:
+    return isinstance(text, str) and bool(text.strip()) and text.isprintable()
+
+
+class DialectChecks(Parameters):
+    """What holds for every protocol and dialect, without a camera."""
+
+    # ------------------------------------------------------------------ the protocol
+
+    def test_protocol_describes_itself(self) -> None:
+        """Scheme, port, models and dialects are such that a URL can name them."""
+        protocol = self.protocol
+        assert _is_line(protocol.name), f"name: expected a line, got {protocol.name!r}"
+        assert protocol.schemes, "schemes: expected at least one"
+        for scheme, transport in protocol.schemes.items():
+            assert SCHEME.fullmatch(scheme), f"scheme {scheme!r}: expected small letters"
+            assert isinstance(transport, Transport), f"scheme {scheme!r}: {transport!r}"
+        port = protocol.default_port
+        assert 0 < port < 1 << 16, f"default_port: expected 1 to 65535, got {port}"
+        for model in protocol.models:
+            assert model == model.upper(), f"model {model!r}: expected capitals"
+        assert protocol.dialects, "dialects: expected at least one"
+        for name, dialect in protocol.dialects.items():
+            assert dialect.name == name, f"dialects[{name!r}] calls itself {dialect.name!r}"
+        for name, about in protocol.parameters.items():
+            assert name not in {"dialect", "quirks"}, f"parameter {name!r} means something else"
+            assert _is_line(about), f"parameter {name!r}: expected a line that says what it is"
+
+    def test_entry_point_gives_the_protocol(self) -> None:
+        """``connect()`` finds it: the package is installed and the names agree."""
+        name = self.protocol.name
+        try:
+            loaded = PROTOCOLS.load(name)
+        except PluginError as error:
+            message = f"{error}. Is the package installed (pip install -e .), and is {name!r} the"
+            raise AssertionError(f"{message} name under smartcam.protocols?") from error
+        assert loaded is self.protocol, f"the entry point {name!r} gives {loaded!r:.300}"
+
+    def test_every_dialect_is_tried(self) -> None:
+        """A client that was told no dialect tries each, and a pinned one is what it gets."""
+        protocol = self.protocol
+        used = set(protocol.schemes.values())
+        surplus = set(protocol.detection) - used
+        assert not surplus, f"detection: no scheme has {surplus}"
+        for transport in used:
+            tries = protocol.tries(transport)
+            tried = {dialect.name for group in tries for dialect in group}
+            assert all(tries), f"detection over {transport.value}: a group is empty"
+            missing = set(protocol.dialects) - tried
+            assert not missing, f"detection over {transport.value} leaves out {missing}"
+            unknown = tried - set(protocol.dialects)
+            assert not unknown, f"detection over {transport.value}: {unknown} is no dialect"
+            for name in protocol.dialects:
+                (group,) = protocol.tries(transport, name)
+                others = {dialect.name for dialect in group} - {name}
+                assert not others, f"pinned {name!r} over {transport.value} tries {others}, too"
+
+    def test_model_picks_the_protocol(self) -> None:
+        """A bare host with a model, in any letters, is a camera of this protocol."""
+        for model in self.protocol.models:
+            for written in (model, model.lower()):
+                address = parse_address("192.0.2.7", model=written)
+                assert address.protocol == self.protocol.name, f"model {written!r} is {address}"
+                assert address.port == self.protocol.default_port
+
+    # ------------------------------------------------------------------ a dialect
+
+    def test_dialect_describes_itself(self, dialect: Dialect) -> None:
+        """What it is, where it is described, and which ids an application may have."""
+        assert _is_line(dialect.about), f"about: expected a line, got {dialect.about!r}"
+        assert _is_line(dialect.source), f"source: expected a line, got {dialect.source!r}"
+        assert dialect.label.startswith(dialect.name), f"label: {dialect.label!r}"
+        abilities = dialect.capabilities
+        assert abilities.dialect == dialect.name, f"capabilities.dialect: {abilities.dialect!r}"
+        ids = dialect.application_ids
+        assert isinstance(ids, range), f"application_ids: expected a range, got {ids!r}"
+        assert ids, "application_ids: expected at least one"
+        assert ids.step == 1, f"application_ids: expected a step of 1, got {ids!r}"
+        assert ids.start >= 0, f"application_ids: expected no negative one, got {ids!r}"
+        for name in ("in_order", "exclusive", "has_login"):
+            assert isinstance(getattr(dialect, name), bool), f"{name}: expected a bool"
+        if dialect.has_login:
+            assert "user" in self.protocol.parameters, "has_login, but no parameter 'user'"
+
+    def test_dialect_has_what_a_client_needs(self, dialect: Dialect) -> None:
+        """A session, a sign of life, results, and the status: by itself or on request."""
+        missing = [one.__name__ for one in NEEDED if not dialect.has(one)]
+        assert not missing, f"has() is False for {', '.join(missing)}"
+        assert dialect.answers(m.Connect), "Connect must be answered"
+        assert dialect.answers(m.Query), "Query must be answered: it is the sign of life"
+        abilities = dialect.capabilities
+        assert abilities.status_by_itself or abilities.get_status, (
+            "capabilities: the status neither comes by itself nor can be asked for"
+        )
+
+    def test_capabilities_are_those_of_its_messages(self, dialect: Dialect) -> None:
+        """Each ability has its messages, and the other way round."""
+        for name, needed in ABILITIES.items():
+            can = getattr(dialect.capabilities, name)
+            has = [dialect.has(one) for one in needed]
+            names = " and ".join(one.__name__ for one in needed)
+            if can:
+                assert all(has), f"capabilities.{name} is True, but it has not {names}"
+            else:
+                assert not has[0], f"capabilities.{name} is False, but it has {names}"
+
+    def test_messages_have_ids_names_and_fields(self, dialect: Dialect) -> None:
+        """What it has can be called by a name; its fields are the message's."""
+        for kind in MESSAGES:
+            if not dialect.has(kind):
+                continue
+            message = example(kind, dialect)
+            assert isinstance(dialect.message_id(kind), int), f"message_id({kind.__name__})"
+            assert dialect.message_id(message) == dialect.message_id(kind), kind.__name__
+            called = dialect.called(message)
+            assert kind.__name__ in called, f"called({kind.__name__}) is {called!r}"
+            unknown = set(dialect.fields(kind)) - {name for name, _ in m.wire_fields(kind)}
+            assert not unknown, f"fields({kind.__name__}) has {unknown}"
+
+    def test_message_that_it_has_not_is_unsupported(self, dialect: Dialect) -> None:
+        """Who asks for it is told what the dialect is called."""
+        for kind in MESSAGES:
+            if dialect.has(kind):
+                continue
+            for asked in (kind, example(kind, dialect)):
+                said = _refusal(UnsupportedError, dialect.message_id, asked)
+                assert said is not None, f"has() is False for {kind.__name__}, but it has an id"
+                assert dialect.name in said, f"{said}: which dialect?"
+
+    def test_codes_mean_something(self, dialect: Dialect) -> None:
+        """Any code has a text and a verdict; where there are codes one is good and one is not."""
+        verdicts: set[Verdict] = set()
+        for request in (None, *filter(dialect.has, REQUESTS)):
+            for code in CODES:
+                meaning = dialect.code(code, request)
+                where = f"code({code}, {getattr(request, '__name__', None)})"
+                assert isinstance(meaning, CodeMeaning), (
+                    f"{where}: expected a CodeMeaning, got {meaning!r}"
+                )
+                assert _is_line(meaning.text), f"{where}: expected a text, got {meaning.text!r}"
+                assert isinstance(meaning.verdict, Verdict), f"{where}: {meaning.verdict!r}"
+                verdicts.add(meaning.verdict)
+        assert Verdict.DONE in verdicts, "no code says that a request was done"
+        if dialect.capabilities.result_codes:
+            assert verdicts - {Verdict.DONE}, "result_codes, but every code says done"
+
+    def test_any_frame_can_be_spelled(self, dialect: Dialect) -> None:
+        """A trace shows whatever comes, and never fails."""
+        from smartcam.testing._suites import strategies
+
+        def check(data: DataObject) -> None:
+            payload = data.draw(strategies.noise(()))
+            for sender in m.Sender:
+                for message_id in (0, 1, 2, 0x12, 0x20, 0x40, 0xFFFF):
+                    see_spelled(dialect, sender, Frame(message_id, payload))
+
+        strategies.each_drawn(check)
+
+    def test_any_raw_request_is_taken_or_refused(self, dialect: Dialect) -> None:
+        """Ids of either kind, known or not, are a request or one of smartcam's errors."""
+        refusals = (
+            UnsupportedError,
+            LocalProtocolError,
+            ConfigurationError,
+            CommandRejectedError,
+        )
+        for message_id in (0, 1, 0x12, 0x7777, -1, "", "nobody's", "é\n\0"):
+            with contextlib.suppress(*refusals):
+                raw = dialect.raw_request(message_id, b"1")
+                assert isinstance(raw, RawRequest), f"raw_request({message_id!r}): {raw!r}"
+        other = m.QueryAnswer(application=1)
+        with contextlib.suppress(*refusals):
+            body = dialect.body(other)
+            assert isinstance(body, bytes), f"body({other}): expected bytes, got {body!r}"
+
+    def test_unknown_quirk_is_a_mistake(self, dialect: Dialect) -> None:
+        """None is no change; one that nobody knows is a ConfigurationError."""
+        same = dialect.with_quirks(dialect.quirks)
+        assert same.label == dialect.label, f"with its own quirks it is {same.label!r}"
+        assert dialect.with_parameters({}).name == dialect.name
+        said = _refusal(ConfigurationError, dialect.with_quirks, ["no such quirk"])
+        assert said is not None, "with_quirks(['no such quirk']) was taken"
+        assert "no such quirk" in said, f"{said}: which quirk?"
+
+    def test_address_is_read_back(self, dialect: Dialect) -> None:
+        """A URL with everything pinned is the same when it is read again, and has no password."""
+        parameters: list[tuple[tuple[str, str], ...]] = [()]
+        parameters += [
+            tuple(one.parameters.items())
+            for one in self.conversations
+            if one.dialect == dialect.name and one.parameters
+        ]
+        for scheme in self.protocol.schemes:
+            for host in ("192.0.2.7", "2001:db8::7"):
+                for said in parameters:
+                    see_address(
+                        Address(
+                            self.protocol.name,
+                            scheme,
+                            host,
+                            self.protocol.default_port,
+                            dialect.name,
+                            tuple(sorted(dialect.quirks)),
+                            said,
+                        )
+                    )
+
+    # ------------------------------------------------------------------ binary frames
+
+    def test_framed_messages_are_read_back(self, dialect: Dialect) -> None:
+        """A dialect of binary frames reads what it writes, whatever the values are."""
+        if not isinstance(dialect, FramedDialect):
+            pytest.skip("the dialect is no FramedDialect: its machine's conversations say it all")
+        from smartcam.testing._suites import strategies
+
+        def check(data: DataObject) -> None:
+            row = data.draw(strategies.st.sampled_from(dialect.table))
+            values: dict[str, Any] = {}
+            for name, wire in row.fields:
+                top = _TOPS.get((wire, dialect.word))
+                drawn = strategies.st.integers(0, top) if top else strategies.st.binary(max_size=64)
+                values[name] = data.draw(drawn, label=name)
+            see_read_back(dialect, row.type, values)
+
+        for row in dialect.table:
+            for place in (0, 1, -1):
+                tops = [(name, _TOPS.get((wire, dialect.word))) for name, wire in row.fields]
+                edges = {name: (0, 1, top)[place] if top else b"\0\xff" for name, top in tops}
+                see_read_back(dialect, row.type, edges)
+        strategies.each_drawn(check)
+
+
+_TOPS: Mapping[tuple[m.Wire, str], int] = {
+    (m.Wire.WORD, "I"): (1 << 32) - 1,
+    (m.Wire.WORD, "H"): (1 << 16) - 1,
+    (m.Wire.UINT32, "I"): (1 << 32) - 1,
+    (m.Wire.UINT32, "H"): (1 << 32) - 1,
+}
+"""Largest value of each kind of number, by the dialect's word."""
+
+
+def _refusal(
+    error: type[SmartCamError], call: Callable[[Any], object], given: object
+) -> str | None:
+    """Return the text of the error that a call raises, None where it raises none."""
+    try:
+        call(given)
+    except error as exc:
+        return str(exc)
+    return None
+
+
+def see_spelled(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
+    """See that a frame can be shown, in JSON as well.
+
+    Raises:
+        AssertionError: it cannot.
+    """
+    spelled = dialect.spell(sender, frame)
+    assert isinstance(spelled, Spelled), f"spell({frame}): expected a Spelled, got {spelled!r}"
+    assert _is_line(spelled.message), f"spell({frame}): message {spelled.message!r}"
+    assert isinstance(spelled.data, bytes), f"spell({frame}): data {spelled.data!r}"
+    json.dumps(jsonable(spelled.fields), allow_nan=False)
+    return spelled
+
+
+def see_address(address: Address) -> None:
+    """See that an address is what its own URL says.
+
+    Raises:
+        AssertionError: it is not.
+    """
+    url = address.url
+    read = parse_address(url)
+    assert read.url == url, f"{url} is read as {read.url}"
+    assert read[:6] == address[:6], f"{url} is read as {read!r}, not as {address!r}"
+    secret = dict(address.parameters).get("password")
+    assert not secret or secret not in f"{url} {address!r} {read!r}", f"{url} has the password"
+
+
+def see_read_back(dialect: FramedDialect, kind: type[m.Message], values: Mapping[str, Any]) -> None:
+    """See that a message with these values on the wire goes through bytes unchanged.
+
+    Raises:
+        AssertionError: it does not.
+    """
+    if kind is m.StatusReport:
+        values = {**values, "status": dialect.status_bits.read(values["status"])}
+    message = kind(**values)
+    encoded = dialect.encode(message)
+    framer = Framer(dialect.header)
+    framer.feed(encoded)
+    frame = framer.next_frame()
+    assert frame is not None, f"{encoded.hex(' ')} of {message} makes no frame"
+    assert framer.buffered == 0, f"{encoded.hex(' ')} of {message}: bytes are left over"
+    read = dialect.decode(kind.sender, frame)
+    assert read == message, f"{encoded.hex(' ')} of {message} is read as {read}"

@@ -1,0 +1,473 @@
+"""Checks of a machine: what a link relies on, shown with the bytes of conversations."""
+# ruff: noqa: S101 - they are tests, in a package so that others can run them
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import tracemalloc
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import pytest
+
+from smartcam.exceptions import (
+    ConfigurationError,
+    LocalProtocolError,
+    RemoteProtocolError,
+    UnsupportedError,
+)
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import Transport, Verdict
+from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._framed.machine import Counters, LinkEnded, LinkFailed, ResultBurst, State
+from smartcam.testing._suites.protocols.conversations import Came, Player, Sent
+from smartcam.testing._suites.protocols.dialects import see_spelled
+from smartcam.testing._suites.protocols.parameters import Parameters
+from smartcam.testing._suites.protocols.words import REQUESTS, example
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from hypothesis.strategies import DataObject
+
+    from smartcam.protocols._framed.machine import Event, LinkMachine
+    from smartcam.testing._suites.protocols.conversations import Conversation, Step
+
+MAX_CUTS = 64
+"""Places at which one delivery is cut in two, at most."""
+
+MAX_ERROR_TEXT = 500
+"""Characters of an error's text: a peer's bytes are in it, 64 of them at most."""
+
+FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
+"""What a camera that has lost its mind says, without an end."""
+
+REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
+
+ENOUGH = 1000
+"""Messages after which bytes without an end are messages."""
+
+HIDDEN = 2
+"""How many times the bound a machine may take in memory for bytes that wait, events apart."""
+
+
+class MachineChecks(Parameters):
+    """What holds for the machine of every protocol, without a socket.
+
+    Attributes:
+        max_waiting: bytes that a machine may keep of what is not whole yet, where 4 KiB of payload
+            are accepted.
+    """
+
+    max_waiting: ClassVar[int] = 1 << 16
+
+    # ------------------------------------------------------------------ conversations
+
+    def test_conversation_goes_as_written(self, conversation: Conversation) -> None:
+        """Each request is these bytes, and what comes is these messages."""
+        Player(self.protocol, conversation).play()
+        kinds = [type(one.message) for one in conversation.steps if isinstance(one, Sent)]
+        assert m.Connect in kinds, f"{conversation}: nobody sends Connect"
+
+    def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
+        """A stream has no boundaries: any piece may come by itself, or with what follows."""
+        for room in (True, False):
+            for cuts in (_bytewise, _whole):
+                player = Player(self.protocol, stream)
+                for step in stream.steps:
+                    player.step(step, cuts(step), room=room)
+        for place, step in enumerate(stream.steps):
+            if isinstance(step, Came):
+                size = len(step.data)
+                for cut in range(1, size, 1 + size // MAX_CUTS):
+                    player = Player(self.protocol, stream).play(place)
+                    player.step(step, [step.data[:cut], step.data[cut:]])
+        joined = dataclasses.replace(stream, steps=_joined(stream.steps))
+        Player(self.protocol, joined).play()
+
+    def test_any_cutting_of_any_bytes_tells_the_same(self, stream: Conversation) -> None:
+        """Also of bytes that no camera sends."""
+        from smartcam.testing._suites import strategies
+
+        places = range(len(stream.steps) + 1)
+        samples = _samples(stream)
+        pieces = strategies.st.lists(strategies.noise(samples), max_size=3)
+
+        def told(place: int, cut: Iterable[bytes]) -> tuple[list[Any], State]:
+            player = Player(self.protocol, stream).play(place)
+            events = [event for chunk in cut for event in player.deliver(chunk)]
+            return events, player.machine.state
+
+        def compare(place: int, whole: bytes, chunks: list[bytes]) -> None:
+            first = told(place, [whole])
+            for cut in (chunks, [bytes([one]) for one in whole]):
+                other = told(place, cut)
+                assert other == first, f"whole: {first}, in pieces: {other}"
+
+        def check(data: DataObject) -> None:
+            place = data.draw(strategies.st.sampled_from(places), label="at step")
+            whole = b"".join(data.draw(pieces, label="comes"))
+            compare(place, whole, strategies.cut(data, whole))
+
+        for place in places:
+            compare(place, b"".join(samples), samples)
+        strategies.each_drawn(check)
+
+    # ------------------------------------------------------------------ anything
+
+    def test_any_bytes_tell_messages_or_one_failure(self, conversation: Conversation) -> None:
+        """Whatever comes, whenever requests are sent: events, and a failure is the last."""
+        from smartcam.testing._suites import strategies
+
+        places = range(len(conversation.steps) + 1)
+        comes = strategies.noise(_samples(conversation))
+        dialect = conversation.group(self.protocol)[0]
+        says = strategies.st.sampled_from([example(one, dialect) for one in REQUESTS])
+        actions = strategies.st.lists(strategies.st.one_of(comes, says), max_size=8)
+
+        def check(data: DataObject) -> None:
+            place = data.draw(strategies.st.sampled_from(places), label="at step")
+            player = Player(self.protocol, conversation).play(place)
+            judge = _Judge(player.machine)
+            for action in data.draw(actions, label="then"):
+                judge.let(action)
+            judge.end()
+
+        strategies.each_drawn(check)
+
+    def test_end_of_the_link_is_told_once(self, stream: Conversation) -> None:
+        """Wherever it ends, in the middle of an answer as well; then nothing is read any more."""
+        for place, halves in _places(stream):
+            player = Player(self.protocol, stream).play(place)
+            judge = _Judge(player.machine)
+            for half in halves:
+                judge.let(half)
+            failed = judge.over
+            judge.end()
+            assert failed or isinstance(judge.last, LinkEnded), f"at step {place}: {judge.last}"
+
+    def test_what_waits_for_more_has_a_bound(self, conversation: Conversation) -> None:
+        """Bytes without an end fail, are dropped, or are messages; they are not collected."""
+        tracing = tracemalloc.is_tracing()
+        for place, halves in _places(conversation):
+            for filler in FILLERS:
+                player = Player(self.protocol, conversation).play(place)
+                for half in halves:
+                    player.deliver(half)
+                if not tracing:
+                    tracemalloc.start()
+                try:
+                    self._fill(player, filler, f"at step {place}, {filler!r} without an end")
+                finally:
+                    if not tracing:
+                        tracemalloc.stop()
+
+    def _fill(self, player: Player, filler: bytes, where: str) -> None:
+        machine, messages = player.machine, 0
+        datagrams = machine.transport is Transport.UDP
+        chunk = filler * (60_000 if datagrams else 4096)
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(4 * self.max_waiting // len(chunk)):
+            machine.receive_data(chunk)
+            events = machine.events()
+            failed = any(isinstance(one, LinkFailed) for one in events)
+            messages += len(events)
+            waiting = len(machine.pending)
+            assert waiting <= self.max_waiting, f"{where}: {waiting} bytes are kept"
+            if failed:
+                assert waiting == 0, f"{where}: {waiting} bytes are kept of a link that failed"
+                break
+            if datagrams:
+                assert waiting == 0, f"{where}: {waiting} bytes of a datagram are kept"
+            if messages > ENOUGH:
+                break  # they are messages
+        kept = tracemalloc.get_traced_memory()[0] - before
+        assert kept <= HIDDEN * self.max_waiting, f"{where}: the machine has grown by {kept} bytes"
+
+    # ------------------------------------------------------------------ requests
+
+    def test_request_before_the_session_is_refused(self, conversation: Conversation) -> None:
+        """It is a LocalProtocolError, and then everything goes as written."""
+        player = Player(self.protocol, conversation)
+        dialect = player.machine.dialect
+        for kind in REQUESTS:
+            if kind not in {m.Connect, m.Disconnect}:
+                see_refused(player, example(kind, dialect), "before the session")
+        player.play()
+
+    def test_disconnect_before_the_session_is_harmless(self, conversation: Conversation) -> None:
+        """A client says it first, to end a session that a dead one left behind."""
+        player = Player(self.protocol, conversation)
+        player.machine.send(m.Disconnect())
+        player.written()
+        player.play()
+
+    def test_message_that_it_has_not_is_refused(self, conversation: Conversation) -> None:
+        """At any time, and then everything goes as written."""
+        for place in range(len(conversation.steps) + 1):
+            player = Player(self.protocol, conversation).play(place)
+            dialect = player.machine.dialect
+            for kind in REQUESTS:
+                if not dialect.has(kind):
+                    see_refused(player, example(kind, dialect), f"at step {place}")
+            player.play()
+
+    def test_second_request_while_the_answer_is_owed_is_refused(
+        self, conversation: Conversation
+    ) -> None:
+        """Answers do not say what they answer; only a status is as good for two."""
+        for place, step in enumerate(conversation.steps):
+            if isinstance(step, Sent) and isinstance(step.message, m.Request):
+                player = Player(self.protocol, conversation).play(place + 1)
+                kind = type(step.message)
+                answer = kind.answer
+                if kind is m.Connect or answer is m.StatusReport:
+                    continue
+                if player.machine.dialect.answers(kind):
+                    see_refused(player, step.message, f"at step {place + 1}, an answer is owed")
+                    player.play()
+
+    def test_answer_that_nobody_asked_for_is_not_told(self, conversation: Conversation) -> None:
+        """It would pass for the next one's."""
+        for place, answer, data in _answers(conversation):
+            player = Player(self.protocol, conversation).play(place)
+            events = [event for one in data for event in player.deliver(one)]
+            found = [one for one in events if isinstance(one, answer)]
+            assert not found, f"at step {place}, nobody had asked, but it told {found}"
+
+    def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
+        """It can be said in any session, and then nothing is: the way out is closed."""
+        for place in range(len(conversation.steps) + 1):
+            player = Player(self.protocol, conversation).play(place)
+            machine = player.machine
+            if machine.state not in {State.CONNECTING, State.CONNECTED}:
+                continue
+            machine.send(m.Disconnect())
+            player.written()
+            later = [one.data for one in conversation.steps[place:] if isinstance(one, Came)]
+            for data in (b"", *later):
+                machine.receive_data(data)
+                machine.events()
+                wire = player.written()
+                assert not wire, f"at step {place}, after Disconnect it said {wire!r}"
+                for kind in REQUESTS:
+                    if kind not in {m.Connect, m.Disconnect}:
+                        message = example(kind, machine.dialect)
+                        see_refused(player, message, f"at step {place}, after Disconnect")
+
+    # ------------------------------------------------------------------ what it says of itself
+
+    def test_machine_says_what_it_is(self, conversation: Conversation) -> None:
+        """Dialect, transport and state are what the client looks at; lists are the caller's."""
+        player = Player(self.protocol, conversation)
+        machine, group = player.machine, player.group
+        assert machine.state is State.IDLE, f"at first it is {machine.state}"
+        assert machine.dialect in group, f"dialect: {machine.dialect} was not asked for"
+        assert machine.kin[0] in group, f"kin: {machine.kin} was not asked for"
+        assert machine.transport is conversation.transport, f"transport: {machine.transport}"
+        assert isinstance(machine.replies, bool), f"replies: expected a bool, {machine.replies!r}"
+        assert isinstance(machine.counters, Counters), f"counters: {machine.counters!r}"
+        assert bytes(machine.pending) == b"", f"pending: {machine.pending!r} before anything came"
+        for take in (machine.events, machine.data_to_send):
+            name = getattr(take, "__name__", "it")
+            taken: list[Any] = take()
+            assert taken == [], f"{name}() gave {taken} before anything was said"
+            taken.append(None)
+            assert take() == [], f"{name}() gives what its caller did to an earlier list"
+        player.play()
+        machine.adopt(machine.kin[0])
+        assert list(machine.kin) == [machine.dialect], f"adopt() left {machine.kin}"
+
+    def test_state_follows_the_session(self, conversation: Conversation) -> None:
+        """Connecting with Connect, connected with its answer, failed with the failure."""
+        player = Player(self.protocol, conversation)
+        machine = player.machine
+        for place, step in enumerate(conversation.steps):
+            player.play(place + 1)
+            state, where = machine.state, f"after step {place}, {step!r:.200}"
+            if isinstance(step, Sent):
+                if isinstance(step.message, m.Connect):
+                    wanted = {State.CONNECTING, State.CONNECTED}
+                    assert state in wanted, f"{where}: it is {state}"
+                continue
+            for event in step.events:
+                if isinstance(event, m.ConnectAnswer) and step.events[-1] is event:
+                    code = machine.dialect.code(event.code, m.Connect)
+                    if code.verdict is Verdict.DONE or not machine.dialect.fields(type(event)):
+                        assert state is State.CONNECTED, f"{where}: it is {state}"
+                if isinstance(event, type):
+                    assert state is State.FAILED, f"{where}: it is {state}"
+
+    def test_bytes_are_counted(self, conversation: Conversation) -> None:
+        """What came is in the counters: an attempt's error says how much it was."""
+        player = Player(self.protocol, conversation).play()
+        came = sum(len(one.data) for one in conversation.steps if isinstance(one, Came))
+        counted = player.machine.counters.bytes_received
+        assert counted == came, f"counters.bytes_received is {counted}, {came} came"
+
+    def test_trace_shows_what_is_said(self, conversation: Conversation) -> None:
+        """Both sides' frames, in words, without the password; nothing else changes."""
+        seen: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
+        player = Player(
+            self.protocol, conversation, lambda sender, frame: seen.append((sender, frame))
+        ).play()
+        dialect = player.machine.dialect
+        secret = conversation.parameters.get("password", "")
+        for sender, frame in seen:
+            if isinstance(frame, RemoteProtocolError):
+                continue
+            assert isinstance(frame, Frame), f"traced: expected a Frame, got {frame!r}"
+            spelled = see_spelled(dialect, sender, frame)
+            shown = f"{frame!r} {spelled!r}"
+            assert not secret or secret not in shown, f"the trace has the password: {shown}"
+        spoken = {
+            sender
+            for sender, said in (
+                (m.Sender.CLIENT, [one.wire for one in conversation.steps]),
+                (m.Sender.CAMERA, [*_samples(conversation)]),
+            )
+            if any(said)
+        }
+        missing = spoken - {sender for sender, _ in seen}
+        assert not missing, f"nothing of the {missing} was traced"
+
+
+class _Judge:
+    """Feeds a machine and sees that its events are what a link can bear."""
+
+    def __init__(self, machine: LinkMachine) -> None:
+        self.machine = machine
+        self.last: Event | State | None = None
+        if machine.state in {State.FAILED, State.CLOSED}:
+            self.last = machine.state
+
+    @property
+    def over(self) -> bool:
+        """Whether the link's end was told."""
+        return isinstance(self.last, (LinkFailed, LinkEnded, State))
+
+    def let(self, action: bytes | m.Message) -> None:
+        """Let bytes come, or a request be sent."""
+        if isinstance(action, m.Message):
+            try:
+                self.machine.send(action)
+            except REFUSALS:
+                pass
+            else:
+                harmless = not self.over or isinstance(action, m.Disconnect)
+                assert harmless, f"it took {action} after {self.last}"
+        else:
+            self.machine.receive_data(action)
+        self._look()
+
+    def end(self) -> None:
+        """Let the camera close the link, twice, and something come after that."""
+        before = self.over
+        for _ in range(2):
+            self.machine.receive_eof()
+            self._look()
+            self.machine.receive_data(b"too late\r\n\0")
+            self._look()
+        assert self.over, "the link's end was not told"
+        wanted = {State.FAILED, State.CLOSED} if before else {State.CLOSED}
+        assert self.machine.state in wanted, f"at the end it is {self.machine.state}"
+
+    def _look(self) -> None:
+        for event in self.machine.events():
+            assert not self.over, f"{event} after {self.last}, which is the last"
+            self.last = event
+            if isinstance(event, LinkFailed):
+                self._see_error(event.error)
+            elif isinstance(event, LinkEnded):
+                assert event.pending >= 0, f"{event}: expected the number of bytes left"
+            else:
+                whole = isinstance(event, (m.Report, m.UnknownMessage, ResultBurst))
+                assert whole, f"{event!r} is none of a camera's messages"
+        for data in self.machine.data_to_send():
+            assert isinstance(data, bytes), f"data_to_send() has {data!r}"
+
+    def _see_error(self, error: RemoteProtocolError) -> None:
+        assert isinstance(error, RemoteProtocolError), f"LinkFailed with {error!r}"
+        assert str(error), f"{error!r} says nothing"
+        assert len(str(error)) <= MAX_ERROR_TEXT, f"a text of {len(str(error))}: {error!r:.200}"
+        copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
+        assert str(copy) == str(error), f"{error!r} is {copy!r} behind pickle"
+        assert self.machine.state is State.FAILED, f"after {error!r} it is {self.machine.state}"
+
+
+def see_refused(player: Player, message: m.Message, where: str) -> None:
+    """See that a machine refuses a message, and that nothing has changed.
+
+    Raises:
+        AssertionError: it takes it, or says or tells something.
+    """
+    machine = player.machine
+    state = machine.state
+    try:
+        machine.send(message)
+    except (LocalProtocolError, UnsupportedError):
+        pass
+    else:
+        pytest.fail(f"{where}: {message} was taken")
+    events, wire = machine.events(), player.written()
+    assert not events, f"{where}: {message} was refused, but it told {events}"
+    assert not wire, f"{where}: {message} was refused, but it said {wire!r}"
+    assert machine.state is state, f"{where}: {message} was refused, but it is {machine.state}"
+
+
+def _samples(conversation: Conversation) -> list[bytes]:
+    return [step.data for step in conversation.steps if isinstance(step, Came)]
+
+
+def _bytewise(step: Step) -> list[bytes] | None:
+    return [bytes([one]) for one in step.data] if isinstance(step, Came) else None
+
+
+def _whole(_: Step) -> None:
+    return None
+
+
+def _joined(steps: Sequence[Step]) -> list[Step]:
+    """Return the steps with what comes in a row, unanswered, in one delivery."""
+    found: list[Step] = []
+    for step in steps:
+        last = found[-1] if found else None
+        if isinstance(step, Came) and isinstance(last, Came) and not last.wire:
+            found[-1] = Came(last.data + step.data, last.events + step.events, step.wire)
+        else:
+            found.append(step)
+    return found
+
+
+def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
+    """Yield each place of a conversation that is not failed there, and the middle of each answer.
+
+    With it come the bytes of the half that has come.
+    """
+    failed = False
+    for place, step in enumerate(conversation.steps):
+        yield place, []
+        if isinstance(step, Came):
+            yield place, [step.data[: len(step.data) // 2]]
+            failed = any(isinstance(one, type) for one in step.events)
+    if not failed:
+        yield len(conversation.steps), []
+
+
+def _answers(conversation: Conversation) -> Iterator[tuple[int, type[m.Message], list[bytes]]]:
+    """Yield each answered request's place, its answer's type, and what came up to the answer."""
+    steps = conversation.steps
+    for place, step in enumerate(steps):
+        if not isinstance(step, Sent) or not isinstance(step.message, m.Request):
+            continue
+        answer = type(step.message).answer
+        if answer is None or issubclass(answer, (m.StatusReport, m.ResultContainer)):
+            continue
+        data: list[bytes] = []
+        for following in steps[place + 1 :]:
+            if isinstance(following, Sent):
+                break
+            data.append(following.data)
+            if any(isinstance(event, answer) for event in following.events):
+                yield place, answer, data
+                break

@@ -1,0 +1,186 @@
+"""Checks of what not every camera can do: it does, or an error says so and the session goes on."""
+# ruff: noqa: S101 - they are tests, in a package so that others can run them
+
+from __future__ import annotations
+
+import struct
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING
+
+import pytest
+
+from smartcam import (
+    CommandRejectedError,
+    ConnectionLostError,
+    ResponseTimeoutError,
+    Status,
+    UnsupportedError,
+)
+from smartcam.testing._suites.protocols.cameras_under_test import ECHO
+from smartcam.testing._suites.protocols.client_checks import (
+    SHORT,
+    SOON,
+    in_a_loop,
+    needs,
+    number,
+    refused,
+    until,
+    visiting,
+)
+from smartcam.testing._suites.protocols.parameters import Parameters
+
+if TYPE_CHECKING:
+    from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
+
+LEAP_DAY = datetime(2024, 2, 29, 23, 59, 30)  # noqa: DTZ001 - the camera's clock has no zone
+
+
+class OptionalFeatureChecks(Parameters):
+    """What not every camera can do: it does, or an error says so and the session goes on."""
+
+    @in_a_loop
+    async def test_start_and_stop(self, camera_kind: CameraKind) -> None:
+        """Twice is as good as once."""
+        async with visiting(camera_kind) as (_, camera):
+            if not camera.capabilities.start_stop:
+                await refused(camera, camera.stop())
+                await refused(camera, camera.start())
+                return
+            await camera.stop()
+            assert Status.RUNNING not in camera.status
+            await camera.stop()
+            await camera.start()
+            await camera.start()
+            assert Status.RUNNING in camera.status
+            assert await number(camera) == 0
+
+    @in_a_loop
+    async def test_clock(self, camera_kind: CameraKind) -> None:
+        """What was set is told."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.set_clock:
+                await camera.set_clock(LEAP_DAY)
+            else:
+                await refused(camera, camera.set_clock(LEAP_DAY))
+            if camera.capabilities.get_clock:
+                assert timedelta(0) <= await camera.get_clock() - LEAP_DAY < timedelta(seconds=30)
+            else:
+                await refused(camera, camera.get_clock())
+
+    @in_a_loop
+    async def test_input_belongs_to_its_trigger(self, camera_kind: CameraKind) -> None:
+        """What was given is used by the next inspection."""
+        async with visiting(camera_kind) as (_, camera):
+            data = struct.pack("<I", 4711)
+            if not camera.capabilities.input_data:
+                await refused(camera, camera.set_input(data))
+                with pytest.raises(UnsupportedError):
+                    await camera.trigger(input=data)
+                return
+            needs(camera_kind, ECHO)
+            await camera.switch_application(ECHO)
+            assert await number(camera, input=data) == 4711
+            await camera.set_input(struct.pack("<I", 5))
+            assert await number(camera) == 5
+
+    @in_a_loop
+    async def test_input_that_does_not_fit_is_refused_where_there_are_codes(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """And nothing of it is left over."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.input_data and camera.capabilities.result_codes:
+                needs(camera_kind, ECHO)
+                await camera.switch_application(ECHO)
+                with pytest.raises(CommandRejectedError):
+                    await camera.trigger(input=b"too long for it")
+                assert await number(camera, input=struct.pack("<I", 1)) == 1
+
+    @in_a_loop
+    async def test_sequence_number(self, camera_kind: CameraKind) -> None:
+        """What was set comes with the next result."""
+        async with visiting(camera_kind, interpret_as=camera_kind.numbers_with_sequence) as (
+            _,
+            camera,
+        ):
+            if not camera.capabilities.sequence_number:
+                await refused(camera, camera.set_sequence_number(5000))
+                return
+            await camera.set_sequence_number(5000)
+            result = await camera.trigger()
+            assert (result.sequence, result.value.n) == (5000, 5000)
+            assert (await camera.trigger()).sequence not in {None, 5000}
+
+    @in_a_loop
+    async def test_query_status(self, camera_kind: CameraKind) -> None:
+        """The answer is the status."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.get_status:
+                assert Status.RUNNING in await camera.query_status()
+            else:
+                await refused(camera, camera.query_status())
+
+    @in_a_loop
+    async def test_reset_errors(self, camera_kind: CameraKind) -> None:
+        """The answer is a status without them."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.reset_errors:
+                assert Status.OVERTRIGGERED not in await camera.reset_errors()
+            else:
+                await refused(camera, camera.reset_errors())
+
+    @in_a_loop
+    async def test_read_image(self, camera_kind: CameraKind) -> None:
+        """There is a picture."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.read_image:
+                assert len(await camera.read_image(timeout=SOON)) > 0
+            else:
+                await refused(camera, camera.read_image())
+
+    @in_a_loop
+    async def test_load_by_file(self, camera_kind: CameraKind) -> None:
+        """A file that is not there is refused."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.load_file:
+                with pytest.raises(CommandRejectedError):
+                    await camera.switch_application("no such file")
+                await number(camera)
+            else:
+                await refused(camera, camera.switch_application("counter"))
+
+    @in_a_loop
+    async def test_reboot(self, camera_kind: CameraKind) -> None:
+        """The session is over."""
+        async with visiting(camera_kind, close_timeout=0.2) as (_, camera):
+            if not camera.capabilities.reboot:
+                await refused(camera, camera.reboot())
+                return
+            await camera.reboot()
+            assert not camera.connected
+            with pytest.raises(ConnectionLostError):
+                await camera.trigger()
+
+    @in_a_loop
+    async def test_request_gives_the_answers_body(self, camera_kind: CameraKind) -> None:
+        """Any request by its id, answered or not."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera_kind.raw_request is not None:
+                assert await camera.request(camera_kind.raw_request)
+                assert await camera.request(camera_kind.raw_request, answered=False) is None
+                assert await camera.request(camera_kind.raw_request)
+            with pytest.raises(UnsupportedError):
+                await camera.request(camera_kind.foreign_request)
+            assert await number(camera) == 0
+
+    @in_a_loop
+    async def test_request_that_nobody_answers_costs_the_link(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """A later answer would pass for the next one."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.result_codes or camera_kind.silent_request is None:
+                return  # it answers everything
+            with pytest.raises(ResponseTimeoutError):
+                await camera.request(camera_kind.silent_request, timeout=SHORT)
+            await until(lambda: not camera.connected)

@@ -1,0 +1,78 @@
+"""What a suite's checks are run with: each dialect, conversation or kind of camera, by its name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import pytest
+
+from smartcam.protocols._base import Protocol, Transport
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.protocols._base import Dialect
+    from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
+    from smartcam.testing._suites.protocols.conversations import Conversation
+
+
+class Parameters:
+    """Base of the suites: what an author gives.
+
+    Attributes:
+        protocol: what the entry point gives.
+        conversations: bytes from the protocol's documents, at least one for each dialect.
+        camera_kinds: cameras that speak it.
+    """
+
+    protocol: ClassVar[Protocol]
+    conversations: ClassVar[Sequence[Conversation]] = ()
+    camera_kinds: ClassVar[Sequence[CameraKind]] = ()
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """Run a check with each of what it has an argument for; pytest calls it.
+
+        Raises:
+            pytest.UsageError: ``protocol`` is none.
+        """
+        for name in ("dialect", "conversation", "stream", "camera_kind"):
+            if name in metafunc.fixturenames:
+                found = self._found(name)
+                metafunc.parametrize(name, found, ids=_label)
+
+    def _found(self, name: str) -> list[Any]:
+        own = type(self)
+        if name == "camera_kind":
+            return list(self.camera_kinds) or _nothing(f"{own.__name__}.camera_kinds is empty")
+        if not isinstance(getattr(own, "protocol", None), Protocol):
+            raise pytest.UsageError(f"{own.__name__}.protocol: expected a Protocol")
+        if name == "dialect":
+            return dialects_of(self.protocol)
+        found = [
+            one
+            for one in self.conversations
+            if name == "conversation" or one.transport is Transport.TCP
+        ]
+        return found or _nothing(
+            f"{own.__name__}.conversations has none"
+            + (" over TCP" if name == "stream" and self.conversations else "")
+        )
+
+
+def _nothing(reason: str) -> list[Any]:
+    return [pytest.param(None, id="none", marks=pytest.mark.skip(reason=reason))]
+
+
+def _label(value: object) -> str | None:
+    label = getattr(value, "label", None)
+    return label if isinstance(label, str) else str(value)
+
+
+def dialects_of(protocol: Protocol) -> list[Dialect]:
+    """Return the dialects of a protocol, and those with quirks that a client tries."""
+    found: list[Dialect] = list(protocol.dialects.values())
+    tried = [one for groups in protocol.detection.values() for group in groups for one in group]
+    for dialect in tried:
+        if dialect not in found:
+            found.append(dialect)
+    return found

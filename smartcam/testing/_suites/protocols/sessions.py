@@ -1,0 +1,191 @@
+"""Checks of a session: made, left, lost, taken."""
+# ruff: noqa: S101 - they are tests, in a package so that others can run them
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+
+import smartcam
+from smartcam import (
+    Backoff,
+    Connected,
+    ConnectionClosedError,
+    ConnectionLostError,
+    ConnectionTakenError,
+    Disconnected,
+    Reconnected,
+    Status,
+    TriggerTimeoutError,
+)
+from smartcam.testing._suites.protocols.cameras_under_test import COUNTER, OTHER
+from smartcam.testing._suites.protocols.client_checks import (
+    SHORT,
+    SOON,
+    balance,
+    client,
+    in_a_loop,
+    number,
+    until,
+    visiting,
+)
+from smartcam.testing._suites.protocols.parameters import Parameters
+
+if TYPE_CHECKING:
+    from smartcam import SmartCamera
+    from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
+
+FAST = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
+
+
+class SessionChecks(Parameters):
+    """A session: made, left, lost, taken."""
+
+    @in_a_loop
+    async def test_connect_pinned_knows_the_camera(self, camera_kind: CameraKind) -> None:
+        """URL, application and status are known when ``connect()`` is through."""
+        async with visiting(camera_kind) as (live, camera):
+            assert camera.connected
+            assert camera.url == live.url
+            assert camera.active_application == COUNTER
+            assert Status.RUNNING in camera.status
+            assert f"dialect={camera.capabilities.dialect}" in live.url or "dialect" not in live.url
+            assert await camera.query_application() == COUNTER
+            await camera.wait_ready()
+
+    @in_a_loop
+    async def test_connect_unpinned_finds_out_and_pins_it(self, camera_kind: CameraKind) -> None:
+        """The dialect is found out, and then stands in the URL."""
+        async with camera_kind.open() as live:
+            camera = smartcam.connect(
+                live.unpinned, interpret_as=camera_kind.numbers, reconnect=None
+            )
+            events = camera.events()
+            async with camera:
+                assert camera.url == live.url
+                assert await number(camera) == 0
+                async with asyncio.timeout(SOON):
+                    event = await anext(events)
+                    while not isinstance(event, Connected):
+                        event = await anext(events)
+                assert event.url == live.url
+
+    @in_a_loop
+    async def test_connect_with_an_application_has_it_running(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """The one that was named is switched to."""
+        async with visiting(camera_kind, application=OTHER) as (_, camera):
+            assert camera.active_application == OTHER
+            result = await camera.trigger()
+            assert result.application == OTHER
+
+    @in_a_loop
+    async def test_close_ends_the_session_and_leaves_the_camera_as_it_is(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """The camera is told, and goes on running; closing twice is harmless."""
+        async with camera_kind.open() as live:
+            assert not live.has_session
+            camera = await client(camera_kind, live)
+            if camera.capabilities.switch:
+                await camera.switch_application(OTHER)
+            left_with = camera.active_application
+            assert live.has_session
+            await camera.close()
+            await until(lambda: not live.has_session)
+            await camera.close()
+            with pytest.raises(ConnectionClosedError):
+                await camera.trigger()
+            async with client(camera_kind, live) as following:
+                assert following.active_application == left_with
+                assert Status.RUNNING in following.status
+
+    @in_a_loop
+    async def test_lost_camera_is_told_and_comes_back(self, camera_kind: CameraKind) -> None:
+        """Disconnected, Reconnected, and triggers work again."""
+        async with visiting(camera_kind, reconnect=FAST, liveness_timeout=0.4) as (live, camera):
+            events = camera.events()
+            await number(camera)
+            await live.restart()
+            await until(lambda: not camera.connected)
+            async with asyncio.timeout(SOON):
+                kinds = [type(await anext(events))]
+                while kinds[-1] is not Reconnected:
+                    kinds.append(type(await anext(events)))
+            assert Disconnected in kinds
+            await camera.wait_connected(SOON)
+            assert (await camera.trigger()).application == COUNTER
+            assert camera.statistics().reconnects == 1
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_killed_camera_ends_what_waits_for_it(self, camera_kind: CameraKind) -> None:
+        """Every wait and stream ends with a ConnectionLostError."""
+        async with visiting(camera_kind, liveness_timeout=0.4) as (live, camera):
+            waiting = asyncio.create_task(camera.wait_status(lambda _: False, timeout=SOON))
+            results = camera.results()
+            await number(camera)
+            try:
+                await live.kill()
+            except pytest.skip.Exception:
+                waiting.cancel()
+                raise
+            with pytest.raises(ConnectionLostError):
+                await waiting
+            with pytest.raises(ConnectionLostError):
+                await camera.trigger(timeout=SOON)
+            assert not camera.connected
+            async with asyncio.timeout(SOON):
+                assert (await anext(results)).value.n == 0
+                with pytest.raises(ConnectionLostError):
+                    await anext(results)
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_newcomer_takes_the_camera_or_stands_beside(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """As its kind says."""
+        async with visiting(camera_kind) as (live, first), client(camera_kind, live) as second:
+            assert await number(second) == 0
+            if not camera_kind.exclusive:
+                assert await number(first) == 1
+            elif camera_kind.datagrams:
+                with pytest.raises(TriggerTimeoutError):
+                    await first.trigger(timeout=SHORT)
+            else:
+                with pytest.raises(ConnectionLostError):
+                    await first.trigger(timeout=SOON)
+            await number(second)
+
+    @in_a_loop
+    async def test_two_that_want_the_camera_do_not_fight_for_it(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """One gives up, the other keeps it."""
+        async with (
+            visiting(camera_kind, reconnect=FAST) as (live, first),
+            client(camera_kind, live, reconnect=FAST) as second,
+        ):
+            if camera_kind.exclusive and not camera_kind.datagrams:
+                await until(lambda: is_taken(first) or is_taken(second))
+                left = second if is_taken(first) else first
+                await left.wait_connected(SOON)
+                await number(left)
+                assert not is_taken(left)
+            balance(first.statistics())
+            balance(second.statistics())
+
+
+def is_taken(camera: SmartCamera) -> bool:
+    """Whether a client has given up because another one has the camera."""
+    try:
+        camera.next_result().close()
+    except ConnectionTakenError:
+        return True
+    except ConnectionLostError:
+        pass
+    return False

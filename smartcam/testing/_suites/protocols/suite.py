@@ -1,0 +1,29 @@
+"""The suites that authors of protocols subclass."""
+
+from __future__ import annotations
+
+from smartcam.testing._suites.protocols.dialects import DialectChecks
+from smartcam.testing._suites.protocols.machines import MachineChecks
+from smartcam.testing._suites.protocols.optional_features import OptionalFeatureChecks
+from smartcam.testing._suites.protocols.sessions import SessionChecks
+from smartcam.testing._suites.protocols.triggers import TriggerChecks
+
+
+class WireSuite(DialectChecks, MachineChecks):
+    """What holds for dialects and machine of every protocol, seen without a camera.
+
+    A subclass has ``protocol``, which must be installed, and ``conversations``: at least one for
+    each dialect, with the bytes of the protocol's documents.
+    """
+
+
+class CameraSuite(SessionChecks, TriggerChecks, OptionalFeatureChecks):
+    """What a user may expect of the client, whichever camera it is in front of.
+
+    A subclass has ``camera_kinds``, emulated or real cameras. What a camera cannot do in its
+    dialect must be an UnsupportedError, and the session must go on.
+    """
+
+
+class ProtocolSuite(WireSuite, CameraSuite):
+    """Both: a subclass has ``protocol``, ``conversations`` and ``camera_kinds``."""

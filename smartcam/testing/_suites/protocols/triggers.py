@@ -1,0 +1,302 @@
+"""Checks of triggers: one outcome each, and whose each result is."""
+# ruff: noqa: S101 - they are tests, in a package so that others can run them
+
+from __future__ import annotations
+
+import asyncio
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import pytest
+
+from smartcam import (
+    CommandRejectedError,
+    ConfigurationError,
+    InterpretationError,
+    NotRunningError,
+    OvertriggeredError,
+    Status,
+    TriggerTimeoutError,
+    WrongApplicationError,
+)
+from smartcam.testing._suites.protocols.cameras_under_test import (
+    COUNTER,
+    FREE,
+    NOBODYS,
+    OTHER,
+    SLOW,
+)
+from smartcam.testing._suites.protocols.client_checks import (
+    SHORT,
+    SOON,
+    balance,
+    in_a_loop,
+    needs,
+    number,
+    refused,
+    until,
+    visiting,
+)
+from smartcam.testing._suites.protocols.parameters import Parameters
+
+if TYPE_CHECKING:
+    from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
+
+
+class TriggerChecks(Parameters):
+    """Triggers: one outcome each, and whose each result is."""
+
+    @in_a_loop
+    async def test_trigger_gives_a_typed_result(self, camera_kind: CameraKind) -> None:
+        """With camera, application, number, times and latency."""
+        async with visiting(camera_kind, name="cell 1") as (_, camera):
+            before = datetime.now(UTC)
+            first, second = await camera.trigger(), await camera.trigger()
+            assert (first.value.n, second.value.n) == (0, 1)
+            assert (second.camera, second.application, second.number) == ("cell 1", COUNTER, 2)
+            assert first.triggered_at is not None
+            assert before <= first.triggered_at <= first.received_at
+            assert first.latency is not None
+            assert 0 <= first.latency < SOON
+            assert camera.statistics().triggered == 2
+
+    @in_a_loop
+    async def test_triggers_at_one_time_take_turns(self, camera_kind: CameraKind) -> None:
+        """Each has its own result."""
+        async with visiting(camera_kind) as (_, camera):
+            numbers = await asyncio.gather(*(number(camera) for _ in range(5)))
+            assert sorted(numbers) == [0, 1, 2, 3, 4]
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_trigger_in_another_application_goes_back(self, camera_kind: CameraKind) -> None:
+        """Afterwards the application from before is active."""
+        needs(camera_kind, OTHER)
+        async with visiting(camera_kind) as (_, camera):
+            result = await camera.trigger(OTHER)
+            assert result.application == OTHER
+            assert camera.active_application == COUNTER
+            async with camera.application(OTHER):
+                assert (await camera.trigger()).application == OTHER
+            assert await camera.query_application() == COUNTER
+            assert (await camera.trigger()).application == COUNTER
+
+    @in_a_loop
+    async def test_trigger_whose_result_does_not_fit_is_told_and_the_next_one_taken(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """An InterpretationError; the session goes on."""
+        async with visiting(camera_kind) as (_, camera):
+            with pytest.raises(InterpretationError):
+                await camera.trigger(interpret_as="a: uint32, b: uint32, c: string[40]")
+            assert await number(camera) == 1
+            statistics = camera.statistics()
+            assert (statistics.uninterpretable, statistics.triggered) == (1, 1)
+            balance(statistics)
+
+    @in_a_loop
+    async def test_trigger_that_timed_out_leaves_the_next_one_its_own_result(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """The late one does not pass for it."""
+        async with visiting(camera_kind, application=SLOW) as (_, camera):
+            for run in range(0, 6, 2):
+                with pytest.raises(TriggerTimeoutError):
+                    await camera.trigger(timeout=SHORT)
+                assert await number(camera) == run + 1
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_trigger_that_was_cancelled_leaves_the_next_one_its_own_result(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """The late one does not pass for it."""
+        async with visiting(camera_kind, application=SLOW) as (live, camera):
+            task = asyncio.create_task(camera.trigger())
+            await until(lambda: live.inspects)
+            task.cancel()
+            await asyncio.wait({task})
+            assert task.cancelled()
+            assert await number(camera) == 1
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_trigger_dropped_while_ours_is_under_way_is_an_overtrigger(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """Where somebody else's trigger comes in between."""
+        async with visiting(camera_kind, application=SLOW) as (live, camera):
+            if not camera.capabilities.unasked_results:
+                return  # it knows no triggers but the client's
+            task = asyncio.create_task(camera.trigger(timeout=SOON))
+            await until(lambda: live.inspects)
+            live.trigger()
+            with pytest.raises(OvertriggeredError):
+                await task
+            assert camera.statistics().overtriggers == 1
+            assert await number(camera) >= 1
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_trigger_while_somebody_elses_inspection_runs_waits_for_its_end(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """Its result is not ours."""
+        async with visiting(camera_kind, application=SLOW) as (live, camera):
+            if not camera.capabilities.unasked_results:
+                return
+            live.trigger()
+            await camera.wait_status(lambda status: Status.WAITING_FOR_TRIGGER not in status)
+            assert await number(camera) == 1
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_trigger_of_a_stopped_application_is_refused_at_once(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """It is a NotRunningError."""
+        async with visiting(camera_kind) as (_, camera):
+            if camera.capabilities.start_stop:
+                await camera.stop()
+                with pytest.raises(NotRunningError):
+                    await camera.trigger()
+                await camera.start()
+            assert await number(camera) == 0
+
+    @in_a_loop
+    async def test_trigger_of_another_application_than_the_one_named_is_told(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """An operator has switched: a WrongApplicationError."""
+        needs(camera_kind, OTHER)
+        async with visiting(camera_kind, application=COUNTER) as (live, camera):
+            live.switch(OTHER)
+            if camera.capabilities.status_by_itself:
+                await until(lambda: camera.active_application == OTHER)
+            with pytest.raises(WrongApplicationError):
+                await camera.trigger()
+            await camera.switch_application(COUNTER)
+            assert (await camera.trigger()).application == COUNTER
+            balance(camera.statistics())
+
+    # ---------------------------------------------------------------------- switching
+
+    @in_a_loop
+    async def test_switch_loads_the_application(self, camera_kind: CameraKind) -> None:
+        """The camera says so, and its results do."""
+        async with visiting(camera_kind) as (_, camera):
+            if not camera.capabilities.switch:
+                await refused(camera, camera.switch_application(OTHER))
+                return
+            await camera.switch_application(OTHER)
+            assert camera.active_application == OTHER
+            assert await camera.query_application() == OTHER
+            assert (await camera.trigger()).application == OTHER
+
+    @in_a_loop
+    async def test_switch_to_an_id_that_is_not_there_is_refused_and_the_old_one_runs(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """The error has the code, and what is active."""
+        async with visiting(camera_kind) as (_, camera):
+            if not camera.capabilities.switch:
+                return
+            with pytest.raises(CommandRejectedError) as caught:
+                await camera.switch_application(NOBODYS)
+            assert caught.value.active_application == COUNTER
+            assert caught.value.code != 0
+            assert await number(camera) == 0
+
+    @in_a_loop
+    async def test_switch_to_id_0_is_refused(self, camera_kind: CameraKind) -> None:
+        """By the client where no application may have it, else by the camera."""
+        async with visiting(camera_kind) as (_, camera):
+            if not camera.capabilities.switch:
+                return
+            with pytest.raises(CommandRejectedError) as caught:
+                await camera.switch_application(0)
+            assert ("id 0" in str(caught.value)) is not camera_kind.has_zero
+            assert caught.value.active_application == COUNTER
+            assert await number(camera) == 0
+
+    @in_a_loop
+    async def test_switch_to_an_id_that_does_not_fit_is_a_mistake(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """A ConfigurationError, before anything is sent."""
+        async with visiting(camera_kind) as (_, camera):
+            if not camera.capabilities.switch:
+                return
+            for application in (-1, 1 << 32):
+                with pytest.raises(ConfigurationError):
+                    await camera.switch_application(application)
+            assert await number(camera) == 0
+
+    # ---------------------------------------------------------------------- streams
+
+    @in_a_loop
+    async def test_next_result_is_the_next_one_whoever_triggers(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """And a wait for one that does not come ends in time."""
+        async with visiting(camera_kind) as (live, camera):
+            waiting = asyncio.create_task(camera.next_result(timeout=SOON))
+            await asyncio.sleep(0)
+            if camera.capabilities.unasked_results:
+                live.trigger()
+            else:
+                await number(camera)
+            assert (await waiting).value.n == 0
+            with pytest.raises(TriggerTimeoutError):
+                await camera.next_result(timeout=SHORT)
+
+    @in_a_loop
+    async def test_stream_has_every_result_of_a_free_running_application(
+        self, camera_kind: CameraKind
+    ) -> None:
+        """Without a gap; a trigger of it is answered by nothing."""
+        async with visiting(camera_kind) as (_, camera):
+            if not camera.capabilities.unasked_results:
+                return
+            needs(camera_kind, FREE)
+            await camera.switch_application(FREE)
+            async with camera.results() as results, asyncio.timeout(SOON):
+                numbers = [(await anext(results)).value.n for _ in range(10)]
+            assert numbers == list(range(numbers[0], numbers[0] + 10))
+            with pytest.raises(TriggerTimeoutError):
+                await camera.trigger(timeout=SHORT)
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_stream_has_triggered_results_too(self, camera_kind: CameraKind) -> None:
+        """In order, each once."""
+        async with visiting(camera_kind) as (_, camera), camera.results() as results:
+            for run in range(3):
+                assert await number(camera) == run
+                async with asyncio.timeout(SOON):
+                    assert (await anext(results)).value.n == run
+            balance(camera.statistics())
+
+    @in_a_loop
+    async def test_accounts_balance_whatever_happens(self, camera_kind: CameraKind) -> None:
+        """Each container has one fate, each item of a stream, too."""
+        async with visiting(camera_kind) as (live, camera), camera.results(max_queue=2) as results:
+            await number(camera)
+            async with asyncio.timeout(SOON):
+                await anext(results)
+            live.trigger()
+            await number(camera)
+            with pytest.raises(InterpretationError):
+                await camera.trigger(interpret_as="a: uint32, b: uint32, c: string[40]")
+            if camera.capabilities.switch:
+                await camera.switch_application(SLOW)
+                with pytest.raises(TriggerTimeoutError):
+                    await camera.trigger(timeout=SHORT)
+            await number(camera, COUNTER)
+            statistics = camera.statistics()
+            assert statistics.triggered == 3
+            balance(statistics)
+            if camera.capabilities.unasked_results:
+                await until(lambda: camera.statistics().received >= 5)
+            (account,) = statistics.subscribers
+            assert (account.taken, account.name) == (1, "results")

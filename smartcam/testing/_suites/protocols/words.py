@@ -1,0 +1,72 @@
+"""One message of each kind, and what a client of any protocol needs of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.protocols._base import Dialect
+
+MESSAGES: tuple[type[m.Message], ...] = tuple(
+    found
+    for name in m.__all__
+    for found in [getattr(m, name)]
+    if isinstance(found, type)
+    and issubclass(found, (m.Request, m.Report))
+    and found not in {m.Request, m.Report, m.Acknowledgement}
+)
+"""Every message that a dialect may have."""
+
+REQUESTS: tuple[type[m.Request], ...] = tuple(one for one in MESSAGES if issubclass(one, m.Request))
+"""Those that a client sends."""
+
+NEEDED: tuple[type[m.Message], ...] = (
+    m.Connect,
+    m.ConnectAnswer,
+    m.Disconnect,
+    m.Query,
+    m.QueryAnswer,
+    m.StatusReport,
+    m.ResultContainer,
+)
+"""What no client can do without: a session, a sign of life, the status, results."""
+
+ABILITIES: Mapping[str, tuple[type[m.Message], ...]] = {
+    "switch": (m.SwitchApplication, m.SwitchAnswer),
+    "load_file": (m.LoadFile, m.SwitchAnswer),
+    "start_stop": (m.Start, m.Stop),
+    "reboot": (m.Reboot,),
+    "get_clock": (m.GetClock, m.ClockAnswer),
+    "set_clock": (m.SetClock,),
+    "input_data": (m.SetInput,),
+    "sequence_number": (m.SetSequenceNumber,),
+    "get_status": (m.GetStatus,),
+    "reset_errors": (m.ResetErrors, m.ResetErrorsAnswer),
+    "read_image": (m.ReadImage, m.Image),
+}
+"""The messages that each of :class:`~smartcam.Capabilities` rests on."""
+
+_VALUES: Mapping[str, Any] = {
+    "status": Status.RUNNING,
+    "data": b"1.job",
+    "name": b"1.job",
+    "year": 2024,
+    "month": 2,
+    "day": 29,
+    "hour": 23,
+    "minute": 59,
+    "second": 30,
+}
+
+
+def example(kind: type[m.Message], dialect: Dialect) -> m.Message:
+    """Return a message of a kind, with values that fit any dialect."""
+    values = {name: _VALUES.get(name, 1) for name, _ in m.wire_fields(kind)}
+    if "application" in values:
+        values["application"] = dialect.application_ids[0]
+    return kind(**values)

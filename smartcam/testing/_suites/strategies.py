@@ -1,0 +1,75 @@
+"""What Hypothesis draws for the suites: bytes, and places to cut them.
+
+A check is called with each drawing by :func:`each_drawn`, which makes a test of its own of it: a
+method that several classes inherit cannot be one. The number of examples is the profile's.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import MissingExtraError
+
+try:
+    from hypothesis import HealthCheck, given, settings, strategies
+except ModuleNotFoundError as _exc:
+    raise MissingExtraError(
+        "smartcam's suites draw bytes with hypothesis, which is not installed: "
+        'pip install "smartcam[test]"',
+        extra="test",
+    ) from _exc
+
+st = strategies
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from hypothesis.strategies import DataObject, SearchStrategy
+
+MAX_NOISE = 200
+"""Bytes of one piece of noise."""
+
+
+def each_drawn(check: Callable[[DataObject], None]) -> None:
+    """Call a check with one drawing after the other; the smallest that fails is shown.
+
+    Raises:
+        AssertionError: what the check raises, with the drawing as a note.
+    """
+    quiet = [HealthCheck.too_slow, HealthCheck.data_too_large]
+
+    @settings(deadline=None, report_multiple_bugs=False, suppress_health_check=quiet)
+    @given(data=st.data())
+    def drawn(data: DataObject) -> None:
+        check(data)
+
+    drawn()
+
+
+def noise(samples: Sequence[bytes]) -> SearchStrategy[bytes]:
+    """Any bytes, and samples that are cut, repeated, or have a byte changed."""
+    some: SearchStrategy[bytes] = st.binary(max_size=MAX_NOISE)
+    if not any(samples):
+        return some
+    sample = st.sampled_from([one for one in samples if one])
+    return st.one_of(
+        some,
+        sample,
+        st.builds(lambda data, end: data[:end], sample, st.integers(0, MAX_NOISE)),
+        st.builds(lambda data, begin: data[begin:], sample, st.integers(0, MAX_NOISE)),
+        st.builds(_changed, sample, st.integers(0, MAX_NOISE), st.integers(0, 255)),
+        st.builds(lambda data, times: data * times, sample, st.integers(2, 3)),
+    )
+
+
+def _changed(data: bytes, place: int, byte: int) -> bytes:
+    place %= len(data)
+    return data[:place] + bytes([byte]) + data[place + 1 :]
+
+
+def cut(data: DataObject, whole: bytes) -> list[bytes]:
+    """Draw places to cut bytes at, and return the pieces; none is empty."""
+    places = data.draw(st.lists(st.integers(0, len(whole)), max_size=8), label="cut at")
+    edges = sorted({0, *places, len(whole)})
+    return [whole[begin:end] for begin, end in pairwise(edges)]

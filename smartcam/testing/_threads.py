@@ -1,0 +1,415 @@
+"""Emulated cameras in a thread with an event loop of its own.
+
+So they serve any test and any program: a synchronous one, one of asyncio, of trio, of another
+language. All methods are synchronous and may be called in any thread::
+
+    with ThreadedCamera(active=21, running=True) as emulator:
+        socket.create_connection((emulator.host, emulator.port))
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast
+
+from smartcam.emulator import EmulatedCamera, EmulatedFleet, ManualClock
+from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
+from smartcam.testing._logs import CameraLog
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+    from types import TracebackType
+    from typing import Self
+
+    from smartcam.emulator import Device, FiredFault, Scenario, TableScene, Visit
+    from smartcam.emulator.faults import Fault
+    from smartcam.emulator.faults._base import BaseFault
+    from smartcam.protocols.messages import Message
+
+CALL_TIMEOUT = 10.0
+"""Seconds that a call into the thread may take. It is answered in well under a millisecond; longer
+means that something in there, such as a generator of an application, does not return."""
+
+T = TypeVar("T")
+P = ParamSpec("P")
+
+
+class LoopThread:
+    """An event loop in a thread."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._end: asyncio.Event | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Start it; does nothing if it runs."""
+        if self._thread is not None:
+            return
+        ready: threading.Event = threading.Event()
+
+        async def live() -> None:
+            self._loop = asyncio.get_running_loop()
+            end = self._end = asyncio.Event()
+            ready.set()
+            await end.wait()
+
+        # a daemon, so that a test that is killed does not wait for it
+        self._thread = threading.Thread(
+            target=asyncio.run, args=(live(),), name=self._name, daemon=True
+        )
+        self._thread.start()
+        if not ready.wait(CALL_TIMEOUT):
+            raise ResponseTimeoutError(
+                f"the thread {self._name} did not start", message_id=None, waited=CALL_TIMEOUT
+            )
+
+    def stop(self) -> None:
+        """End it. Harmless when done twice."""
+        thread, self._thread = self._thread, None
+        if thread is not None and self._loop is not None and self._end is not None:
+            self._loop.call_soon_threadsafe(self._end.set)
+            thread.join(CALL_TIMEOUT)
+            self._loop = None
+
+    def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function in the thread and return what it returns.
+
+        Raises:
+            ConfigurationError: the thread does not run.
+            ResponseTimeoutError: it took longer than :data:`CALL_TIMEOUT`.
+            Exception: whatever the function raises.
+        """
+
+        async def call() -> T:
+            return function(*args, **kwargs)
+
+        return self.wait(call())
+
+    def wait(self, work: Coroutine[Any, Any, T], timeout: float = CALL_TIMEOUT) -> T:
+        """Run a coroutine in the thread to its end; errors as in :meth:`run`."""
+        future = self.submit(work)
+        try:
+            return future.result(timeout)
+        except TimeoutError as exc:
+            if future.done():  # it was the coroutine's own
+                raise
+            future.cancel()
+            raise ResponseTimeoutError(
+                f"the thread {self._name} did not answer within {timeout:g} s",
+                message_id=None,
+                waited=timeout,
+            ) from exc
+
+    def submit(self, work: Coroutine[Any, Any, T]) -> Future[T]:
+        """Run a coroutine in the thread.
+
+        Raises:
+            ConfigurationError: the thread does not run.
+        """
+        if self._loop is None:
+            work.close()
+            raise ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+
+@dataclass(eq=False)
+class _InThread:
+    """An object whose attributes are read, and whose methods are called, in a thread."""
+
+    _thread: LoopThread
+    _target: object
+
+    def __getattr__(self, name: str) -> Any:
+        value = self._thread.run(getattr, self._target, name)
+        if not callable(value):
+            return value
+        return lambda *args, **kwargs: self._thread.run(value, *args, **kwargs)
+
+
+@dataclass(eq=False, repr=False)
+class _InLoop:
+    """Something with ``start()`` and ``stop()`` that lives in a thread's loop."""
+
+    _thread: LoopThread
+    _hosted: EmulatedCamera | EmulatedFleet
+    _owns_thread: bool  # it is started and ended with it
+
+    def start(self) -> None:
+        """Start it; does nothing if it runs.
+
+        Raises:
+            ConfigurationError: it cannot listen; nothing is started.
+        """
+        if self._owns_thread:
+            self._thread.start()
+        try:
+            self._thread.wait(self._hosted.start())
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Stop it; the log can still be read. Harmless when done twice."""
+        try:
+            self._thread.wait(self._hosted.stop())
+        except ConfigurationError:
+            return  # it does not run
+        finally:
+            if self._owns_thread:
+                self._thread.stop()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+
+class ThreadedCamera(_InLoop):
+    """An :class:`~smartcam.emulator.EmulatedCamera` in a thread; a context manager.
+
+    Args:
+        manual_clock: its time stands still until :meth:`advance` moves it.
+        options: those of :class:`~smartcam.emulator.EmulatedCamera`.
+
+    Attributes:
+        log: what went over the wire, with expectations.
+
+    Raises:
+        ConfigurationError: something given is wrong.
+    """
+
+    def __init__(self, *, manual_clock: bool = False, **options: Any) -> None:
+        emulator = EmulatedCamera(clock=ManualClock() if manual_clock else None, **options)
+        self._host(LoopThread(f"smartcam.emulator[{emulator.name}]"), emulator, owns=True)
+
+    @classmethod
+    def in_thread(cls, thread: LoopThread, emulator: EmulatedCamera) -> Self:
+        """Return the synchronous face of an emulator that lives in a thread already."""
+        self = cls.__new__(cls)
+        self._host(thread, emulator, owns=False)
+        return self
+
+    def _host(self, thread: LoopThread, emulator: EmulatedCamera, *, owns: bool) -> None:
+        super().__init__(thread, emulator, owns)
+        self._emulator = emulator
+        self.log: CameraLog = CameraLog(
+            read=lambda: self._look(lambda: list(emulator.log)),
+            visits=lambda: self.visits,
+            links=lambda: self.links if self.transport == "tcp" else [],
+            pushed_out=lambda: self._look(lambda: emulator.log.pushed_out),
+        )
+
+    def __repr__(self) -> str:
+        return f"<ThreadedCamera {self.name} {self.url}>"
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def url(self) -> str:
+        """Its address with the dialect pinned."""
+        return self._emulator.url
+
+    @property
+    def host(self) -> str:
+        """The address it listens on."""
+        return self._emulator.host
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        return self._emulator.port
+
+    @property
+    def transport(self) -> Literal["tcp", "udp"]:
+        """``tcp`` or ``udp``."""
+        return self._emulator.transport
+
+    @property
+    def dialect(self) -> str:
+        """Name of its wire dialect."""
+        return self._emulator.dialect
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self._emulator.name
+
+    @property
+    def seed(self) -> int:
+        """Seed of all that is left to chance."""
+        return self._emulator.seed
+
+    @property
+    def scenario(self) -> Scenario:
+        """What it was made of."""
+        return self._emulator.scenario
+
+    @property
+    def device(self) -> Device:
+        """The camera behind the wire; its methods and properties work in any thread."""
+        return cast("Device", _InThread(self._thread, self._emulator.device))
+
+    @property
+    def scene(self) -> TableScene:
+        """The table it looks at; ``scene.pieces`` may be changed in any thread."""
+        return self._emulator.scene
+
+    @property
+    def has_session(self) -> bool:
+        """Whether a client has the session."""
+        return self._look(lambda: self._emulator.has_session)
+
+    @property
+    def links(self) -> list[str]:
+        """Address and port of all clients that are connected."""
+        return self._look(lambda: self._emulator.links)
+
+    @property
+    def visits(self) -> list[Visit]:
+        """The last connections that have ended, oldest first; over UDP there are none."""
+        return self._look(lambda: list(self._emulator.visits))
+
+    @property
+    def faults(self) -> list[Fault]:
+        """The faults that still wait."""
+        return self._look(lambda: self._emulator.faults)
+
+    @property
+    def fired(self) -> list[FiredFault]:
+        """The last faults that have happened, oldest first."""
+        return self._look(lambda: list(self._emulator.fired))
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """The commands that its timeline knows."""
+        return self._emulator.commands
+
+    @property
+    def cues_done(self) -> list[int]:
+        """How often each cue of its timeline has happened."""
+        return self._look(lambda: self._emulator.cues_done)
+
+    # ------------------------------------------------------------------ what it does
+
+    def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
+        """Add faults; as :meth:`~smartcam.emulator.EmulatedCamera.inject`."""
+        self._thread.run(self._emulator.inject, *faults)
+
+    def clear_faults(self) -> None:
+        """Forget the faults that wait, and end those that last."""
+        self._thread.run(self._emulator.clear_faults)
+
+    def command(self, name: str) -> None:
+        """Give a command of the timeline.
+
+        Raises:
+            ConfigurationError: no cue has it.
+        """
+        self._thread.run(self._emulator.command, name)
+
+    def advance(self, seconds: float) -> None:
+        """Move its clock, which must be a manual one; all that falls due has happened then.
+
+        Raises:
+            ConfigurationError: it runs in real time, or the time is negative.
+        """
+        clock = self._emulator.clock
+        if not isinstance(clock, ManualClock):
+            raise ConfigurationError("the emulator runs in real time: give it manual_clock=True")
+        self._thread.run(clock.advance, seconds)
+
+    def run(self, function: Callable[[EmulatedCamera], T]) -> T:
+        """Call ``function`` with the :class:`~smartcam.emulator.EmulatedCamera`, in its thread."""
+        return self._thread.run(function, self._emulator)
+
+    def wait_received(
+        self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
+    ) -> None:
+        """Wait until clients have sent that many messages of a kind; the device has handled them.
+
+        In a coroutine use :meth:`received`: this holds up the event loop that calls it.
+
+        Raises:
+            ResponseTimeoutError: they did not come in time.
+        """
+        work = self._emulator.wait_received(what, count=count, timeout=timeout)
+        self._thread.wait(work, timeout + CALL_TIMEOUT)
+
+    async def received(
+        self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
+    ) -> None:
+        """As :meth:`wait_received`, in a coroutine of asyncio or, with anyio, of trio.
+
+        Raises:
+            ResponseTimeoutError: they did not come in time.
+
+        Cancellation: safe.
+        """
+        work = self._emulator.wait_received(what, count=count, timeout=timeout)
+        future = self._thread.submit(work)
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:
+            import anyio.to_thread  # who has trio and no asyncio has anyio
+
+            await anyio.to_thread.run_sync(future.result, abandon_on_cancel=True)
+        else:
+            await asyncio.wrap_future(future)
+
+    def _look(self, function: Callable[[], T]) -> T:
+        """Call in the thread; here, where it does not run and nothing changes any more."""
+        try:
+            return self._thread.run(function)
+        except ConfigurationError:
+            return function()
+
+
+class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
+    """An :class:`~smartcam.emulator.EmulatedFleet` in a thread; a context manager.
+
+    Args:
+        scenarios: the path of a scenario file, or scenarios.
+        options: those of :class:`~smartcam.emulator.EmulatedFleet`.
+
+    Raises:
+        ConfigurationError: something given is wrong.
+    """
+
+    def __init__(self, scenarios: Any, **options: Any) -> None:
+        self._fleet = EmulatedFleet(scenarios, **options)
+        super().__init__(LoopThread("smartcam.emulator[fleet]"), self._fleet, True)
+        self._cameras = {
+            name: ThreadedCamera.in_thread(self._thread, emulator)
+            for name, emulator in self._fleet.cameras.items()
+        }
+
+    def __getitem__(self, name: str) -> ThreadedCamera:
+        """Return a camera.
+
+        Raises:
+            KeyError: none is called so.
+        """
+        return self._cameras[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._cameras)
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """Their addresses by name."""
+        return self._fleet.urls

@@ -1,0 +1,52 @@
+"""What a link proxy really did: its log and its counts."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from smartcam.emulator._tally import Tally
+
+MAX_ENTRIES = 10_000
+"""Entries kept; the oldest go first. The counts go on."""
+
+
+class Entry(NamedTuple):
+    """One thing that happened.
+
+    Attributes:
+        what: a rule's name in small letters, or ``connect``, ``eof`` (a side sends no more),
+            ``lost`` (a side reset the connection), ``no target``, ``too many``, ``not accepted``,
+            ``resume``, ``full`` and ``refused`` (a datagram that did not go out).
+        connection: its number, from 1; 0 where there is none.
+        direction: ``up`` or ``down``; empty where it is about both.
+        at: offset in the sender's stream, or number of the datagram; None for what the proxy was
+            told while it ran.
+    """
+
+    what: str
+    connection: int = 0
+    direction: str = ""
+    at: int | None = None
+
+
+class LinkLog:
+    """Keeps the last entries and counts all of them.
+
+    Attributes:
+        log: the last entries, the oldest first.
+        counts: how often each thing happened.
+        passed: what left the proxy, by direction: bytes on TCP, datagrams on UDP.
+    """
+
+    def __init__(self) -> None:
+        self.log: deque[Entry] = deque(maxlen=MAX_ENTRIES)
+        self.counts: Tally[str] = Tally()
+        self.passed: Tally[str] = Tally()
+
+    def note(
+        self, what: str, connection: int = 0, direction: str = "", at: int | None = None
+    ) -> None:
+        """Keep an entry; the arguments are its fields."""
+        self.log.append(Entry(what, connection, direction, at))
+        self.counts.add(what)

@@ -1,0 +1,151 @@
+"""What the TCP and the UDP half of the link proxy have in common: a port and who is connected."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+from smartcam.testing.proxy._rules import DIRECTIONS, Direction
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.testing.proxy._log import LinkLog
+    from smartcam.testing.proxy._rules import Rule
+
+
+class Proxied(ABC):
+    """What goes from one client to the target and back."""
+
+    def __init__(self, relay: Relay[Any], number: int) -> None:
+        self.number = number  # of the connection, from 1
+        self.log: LinkLog = relay.log
+        self._loop = asyncio.get_running_loop()
+
+    def note(self, what: str, direction: str = "", at: int | None = None) -> None:
+        """Log something."""
+        self.log.note(what, self.number, direction, at)
+
+    @abstractmethod
+    def add(self, rules: Sequence[Rule]) -> None:
+        """Let rules hold from here on."""
+
+    @abstractmethod
+    def cut(self) -> None:
+        """End in order."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """End hard."""
+
+
+C = TypeVar("C", bound=Proxied)
+
+
+class Relay(ABC, Generic[C]):
+    """Listens on a port and pairs each client with a socket to the target."""
+
+    kind: ClassVar[socket.SocketKind]
+    rule_kind: ClassVar[type[Rule]]
+
+    def __init__(self, rules: Sequence[Rule], log: LinkLog) -> None:
+        self.rules = rules  # looked at when a connection is made
+        self.log = log
+        self.family: socket.AddressFamily = socket.AF_INET  # of the target, by open()
+        self.target: Any = None  # its address, by open()
+        # directions in which nothing passes, on connections to come as well
+        self.stalled: set[Direction] = set()
+        self.members: dict[Any, C] = {}  # who is connected
+        self._socket: socket.socket | None = None
+        self._address: Any = None
+        self._refusing = False
+        self._number = 0
+
+    def open(self, host: str, family: socket.AddressFamily, target: Any) -> int:
+        """Listen on a free port of ``host``; return it."""
+        self.family, self.target = family, target
+        self._bind((host, 0))
+        self._listen()
+        return int(self._address[1])
+
+    def chosen(self, connection: int | None) -> list[C]:
+        """Return one connection, where it is open, or all."""
+        return [one for one in self.members.values() if connection in {None, one.number}]
+
+    def add(self, rules: Sequence[Rule]) -> None:
+        """Let rules hold from here on."""
+        for one in self.chosen(None):
+            one.add(rules)
+
+    def cut(self, connection: int | None) -> None:
+        """End in order."""
+        for one in self.chosen(connection):
+            one.cut()
+
+    def reset(self, connection: int | None) -> None:
+        """End hard."""
+        for one in self.chosen(connection):
+            one.reset()
+
+    def stall(self, direction: Direction | None, connection: int | None) -> None:
+        """Pass nothing any more."""
+        if connection is None:
+            self.stalled |= set(DIRECTIONS if direction is None else [direction])
+
+    def resume(self) -> None:
+        """Pass everything again."""
+        self.stalled.clear()
+
+    def refuse(self, refused: bool) -> None:
+        """Close the port for what comes, or open it again; it stays ours all the time."""
+        if refused == self._refusing:
+            return
+        self._refusing = refused
+        if refused:
+            self._shut()
+            self._bind(self._address)
+            self._turn_away()
+        else:
+            self._take_again()
+
+    def close(self) -> None:
+        """Shut the port and end what is open, at once."""
+        self._shut()
+        self.reset(None)
+
+    def _bind(self, address: Any) -> None:
+        sock = socket.socket(socket.AF_INET, self.kind)
+        try:
+            sock.setblocking(False)
+            if self.kind is socket.SOCK_STREAM:
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(address)
+        except OSError:
+            sock.close()
+            raise
+        self._socket, self._address = sock, sock.getsockname()
+
+    def _listen(self) -> None:
+        if self._socket is not None:
+            if self.kind is socket.SOCK_STREAM:
+                self._socket.listen()
+            asyncio.get_running_loop().add_reader(self._socket, self._receive, self._socket)
+
+    def _shut(self) -> None:
+        sock, self._socket = self._socket, None
+        if sock is not None:
+            asyncio.get_running_loop().remove_reader(sock)
+            sock.close()
+
+    @abstractmethod
+    def _receive(self, sock: socket.socket) -> None:
+        """Take what has come to the port."""
+
+    def _turn_away(self) -> None:
+        """Have the system refuse what comes to the port."""
+
+    def _take_again(self) -> None:
+        """Take again what comes to the port."""
+        self._listen()

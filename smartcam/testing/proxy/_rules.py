@@ -1,0 +1,356 @@
+"""What a link proxy does to what passes it: small values, in one list.
+
+A rule is for one direction, ``up`` from client to camera or ``down`` from camera to client, and for
+one connection or for every one. On TCP there are two kinds of place:
+
+- A *point* is reached as soon as ``at`` bytes have come from the sender: 0 is reached when the
+  connection is made, a message's size right behind its last byte.
+- A *range* begins with byte ``at``, counted from 0, and is ``count`` bytes long.
+
+Offsets count what the sender sent, whatever other rules make of it. Rules at one place act in the
+order of the list. On UDP a rule picks datagrams: one by its number, or each with a probability.
+
+The emulator's :mod:`~smartcam.emulator.faults` act on messages; these know none. Where a fault has
+the same verb, the rule says what it acts on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from random import Random
+    from typing import Self
+
+Direction = Literal["up", "down"]
+"""``up`` is from client to camera."""
+
+DIRECTIONS: tuple[Direction, Direction] = ("up", "down")
+
+MAX_COPY = 1 << 20
+"""Bytes that one rule may insert or duplicate: a proxy keeps them in memory."""
+
+MAX_HOLD = 1 << 16
+"""Bytes that one rule may hold back: fewer than the proxy keeps before it stops reading."""
+
+
+_Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
+"""What a value must be, and whether one is."""
+
+_BOUNDS: Mapping[str, _Bound] = {
+    "direction": ("direction must be 'up' or 'down'", lambda way: way in DIRECTIONS),
+    "connection": ("connections count from 1", lambda number: number is None or number >= 1),
+    "at": ("at must be 0 or more bytes", lambda place: place >= 0),
+    "count": ("count must be 1 or more bytes", lambda count: count is None or count >= 1),
+    "size": (f"size must be 1 to {MAX_HOLD} bytes", lambda size: 1 <= size <= MAX_HOLD),
+    "data": (f"data must be 1 to {MAX_COPY} bytes", lambda data: 1 <= len(data) <= MAX_COPY),
+    "mask": ("mask must be 1 to 255", lambda mask: 1 <= mask <= 0xFF),
+    "pause": ("pause must be 0 or more seconds", lambda seconds: seconds >= 0),
+    "seconds": ("times must be 0 or more seconds", lambda seconds: seconds >= 0),
+    "jitter": ("times must be 0 or more seconds", lambda seconds: seconds >= 0),
+    "bytes_per_second": ("the rate must be more than 0 bytes a second", lambda rate: rate > 0),
+    "number": ("datagrams count from 1", lambda number: number is None or number >= 1),
+    "probability": ("probability must be 0 to 1", lambda share: 0 <= share <= 1),
+    "copies": ("copies must be 1 to 100", lambda copies: 1 <= copies <= 100),
+    "behind": ("behind must be 1 or more datagrams", lambda count: count >= 1),
+}
+"""What the fields of a rule must be."""
+
+_POSITIVE: Mapping[str, _Bound] = {
+    **_BOUNDS,
+    "seconds": ("seconds must be more than 0", lambda seconds: seconds > 0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """What all rules have.
+
+    Args:
+        direction: which way it looks at.
+        connection: number of the connection it is for, from 1; None is every one. On UDP each
+            client address is a connection.
+    """
+
+    direction: Direction = "down"
+    connection: int | None = None
+    name: ClassVar[str]
+    """The name in the proxy's log and counts."""
+    _bounds: ClassVar[Mapping[str, _Bound]] = _BOUNDS
+
+    def __init_subclass__(cls, name: str = "") -> None:
+        cls.name = name or cls.__name__.lower()
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            if one.name in self._bounds:
+                text, holds = self._bounds[one.name]
+                _check(self, holds(getattr(self, one.name)), text)
+
+    def concerns(self, connection: int, direction: Direction) -> bool:
+        """Whether the rule is for this direction of this connection."""
+        return self.direction == direction and self.connection in {None, connection}
+
+    def ahead(self, by: int) -> Self:
+        """Return the rule for a place so many bytes, or datagrams, later."""
+        return self
+
+
+def _check(rule: Rule, right: bool, text: str) -> None:
+    if not right:
+        raise ConfigurationError(f"{rule}: {text}")
+
+
+def check_rules(rules: Sequence[Rule], kind: type[Rule], transport: str) -> None:
+    """Refuse rules of the other transport.
+
+    Raises:
+        ConfigurationError: names the first one.
+    """
+    for rule in rules:
+        _check(rule, isinstance(rule, kind), f"it means nothing on {transport.upper()}")
+
+
+# ---------------------------------------------------------------------- TCP
+
+
+class StreamRule(Rule):
+    """A rule for TCP."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedRule(StreamRule):
+    """A rule for a place in the stream, ``at`` bytes from its beginning."""
+
+    at: int = 0
+
+    def ahead(self, by: int) -> Self:
+        """Return the rule for a place so many bytes later."""
+        return replace(self, at=self.at + by)
+
+
+class PointRule(PlacedRule):
+    """A rule that acts once, when ``at`` bytes have come."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeRule(PlacedRule):
+    """A rule that acts on ``count`` bytes from byte ``at`` on; None is all of them."""
+
+    count: int | None = 1
+
+    @property
+    def end(self) -> int | None:
+        """The place behind its last byte, None where it has none."""
+        return None if self.count is None else self.at + self.count
+
+    def change(self, data: bytes) -> bytes:
+        """Return the bytes of the range as they pass."""
+        return data
+
+
+class Cut(PointRule):
+    """End the connection in order: FIN to both sides, behind what has passed.
+
+    What comes later is read and dropped, so that no reset overtakes the end.
+    """
+
+
+class ResetConnection(PointRule, name="reset"):
+    """End the connection hard: RST to both sides.
+
+    It may overtake bytes that have passed and that the peer has not read.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stall(PointRule):
+    """Keep both sides open and pass nothing any more, until the proxy is told to resume.
+
+    Args:
+        both: stop the other direction too: a dead peer. Ends of the stalled sides are not noticed.
+    """
+
+    both: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitBytes(PointRule, name="split"):
+    """Begin a new segment at ``at``.
+
+    Args:
+        pause: seconds before what follows is written. At 0 it is two turns of the event loop, and
+            a receiver on the same loop gets both parts apart unless the system is slow to deliver;
+            give it a pause where a test depends on that.
+    """
+
+    pause: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoalesceBytes(PointRule, name="coalesce"):
+    """Hold back what follows ``at`` and pass it in one write.
+
+    Args:
+        size: bytes to wait for; what came with them goes in the same write.
+        seconds: the longest wait. The sender's end and a rule that acts in between end it too.
+    """
+
+    size: int
+    seconds: float = 1.0
+    _bounds: ClassVar[Mapping[str, _Bound]] = _POSITIVE
+
+
+@dataclass(frozen=True, kw_only=True)
+class InsertBytes(PointRule, name="insert"):
+    """Put bytes of the proxy's own in."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flip(RangeRule):
+    """Change bits.
+
+    Args:
+        mask: the bits of each byte that change, 1 to 255.
+    """
+
+    mask: int = 0xFF
+
+    def change(self, data: bytes) -> bytes:
+        """Return the bytes with the bits changed."""
+        return bytes(byte ^ self.mask for byte in data)
+
+
+class DropBytes(RangeRule, name="drop"):
+    """Leave a range out."""
+
+    def change(self, data: bytes) -> bytes:
+        """Return nothing."""
+        return b""
+
+
+class DuplicateBytes(RangeRule, name="duplicate"):
+    """Send a range again, right behind its end, as other rules left it."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check(
+            self,
+            self.count is not None and self.count <= MAX_COPY,
+            f"count must be at most {MAX_COPY} bytes",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drip(RangeRule):
+    """Write a range byte by byte.
+
+    Args:
+        pause: seconds between two writes; at 0 it is two turns of the event loop.
+    """
+
+    count: int | None = None
+    pause: float = 0.0
+
+
+class Pace(StreamRule):
+    """A rule about time that holds for the whole connection."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayBytes(Pace, name="delay"):
+    """Pass everything later; the order stays, the end of the stream comes later too.
+
+    Args:
+        seconds: for everything.
+        jitter: seconds; up to so much more, evenly spread, for each piece that comes.
+        seed: of the jitter.
+    """
+
+    seconds: float
+    jitter: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate(Pace):
+    """Pass so many bytes a second and not more."""
+
+    bytes_per_second: float
+
+
+# ---------------------------------------------------------------------- UDP
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatagramRule(Rule):
+    """A rule for UDP.
+
+    Args:
+        number: of the datagram in its direction and connection, from 1; None lets the probability
+            decide.
+        probability: of each datagram, 0 to 1.
+        seed: of the chance; the same seed picks the same datagrams.
+    """
+
+    number: int | None = None
+    probability: float = 1.0
+    seed: int = 0
+
+    def picks(self, number: int, chance: Random) -> bool:
+        """Whether the rule acts on a datagram."""
+        if self.number is None:
+            return chance.random() < self.probability
+        return number == self.number
+
+    def ahead(self, by: int) -> Self:
+        """Return the rule for a datagram so many later."""
+        return self if self.number is None else replace(self, number=self.number + by)
+
+
+class Lose(DatagramRule):
+    """Let it vanish."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeat(DatagramRule):
+    """Send it more than once.
+
+    Args:
+        copies: how many more.
+    """
+
+    copies: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Late(DatagramRule):
+    """Send it later; others overtake it.
+
+    Args:
+        seconds: how much.
+        jitter: seconds; up to so much more.
+    """
+
+    seconds: float
+    jitter: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reorder(DatagramRule):
+    """Send it behind those that follow.
+
+    Args:
+        behind: how many of the same direction and connection overtake it.
+        seconds: the longest wait for them.
+    """
+
+    behind: int = 1
+    seconds: float = 1.0
+    _bounds: ClassVar[Mapping[str, _Bound]] = _POSITIVE
