@@ -21,82 +21,120 @@ of cameras and robots. It needs the extra ``calibration``, which is imported whe
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.calibration.codes import Code, Remark
-    from smartcam.calibration.detection.find import find_target
-    from smartcam.calibration.hand_eye.calibration import (
-        HandEyeCalibration,
+    from smartcam.calibration._codes import Code, Remark
+    from smartcam.calibration._detection.find import find_target
+    from smartcam.calibration._files.directory import Folder
+    from smartcam.calibration._files.load import load_calibration
+    from smartcam.calibration._geometry.frames import PoseHistory, Transform
+    from smartcam.calibration._geometry.solvers import (
+        Chain,
+        Height,
+        PlaneProjection,
+        ToolOffset,
+        chain_of,
+    )
+    from smartcam.calibration._hand_eye.calibration import (
         calibrate_hand_eye,
         calibrate_hand_eye_from_poses,
     )
-    from smartcam.calibration.lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-    from smartcam.calibration.lens.model import CameraModel
-    from smartcam.calibration.lens.poses import TargetPose, locate
-    from smartcam.calibration.plane.calibration import Drift, PlaneCalibration, fit_plane
-    from smartcam.calibration.plane.touches import fit_touches
-    from smartcam.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
-    from smartcam.calibration.targets import Charuco, Checkerboard, CircleGrid
-    from smartcam.calibration.views import TargetView
+    from smartcam.calibration._hand_eye.equations import RobotSigmas
+    from smartcam.calibration._hand_eye.result import HandEyeCalibration
+    from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._lens.poses import TargetPose, locate
+    from smartcam.calibration._plane.calibration import Drift, PlaneCalibration, fit_plane
+    from smartcam.calibration._plane.moving_camera import MovingCamera
+    from smartcam.calibration._plane.tool import fit_tool_tip
+    from smartcam.calibration._plane.touches import fit_touches
+    from smartcam.calibration._printing.sheets import Sheet, make_sheet, scaled
+    from smartcam.calibration._sheet.calibration import (
+        SheetCalibration,
+        calibrate_sheet,
+        fit_corners,
+    )
+    from smartcam.calibration._stereo.calibration import StereoCalibration, calibrate_stereo
+    from smartcam.calibration._targets import (
+        Charuco,
+        Checkerboard,
+        CircleGrid,
+        target_from_data,
+        target_to_data,
+    )
+    from smartcam.calibration._views import TargetView
 
 __all__ = [
     "CameraModel",
+    "Chain",
     "Charuco",
     "Checkerboard",
     "CircleGrid",
     "Code",
     "Drift",
+    "Folder",
     "HandEyeCalibration",
+    "Height",
     "IntrinsicCalibration",
+    "MovingCamera",
     "PlaneCalibration",
+    "PlaneProjection",
+    "PoseHistory",
     "Remark",
+    "RobotSigmas",
+    "Sheet",
+    "SheetCalibration",
     "StereoCalibration",
     "TargetPose",
     "TargetView",
+    "ToolOffset",
+    "Transform",
     "calibrate_hand_eye",
     "calibrate_hand_eye_from_poses",
     "calibrate_intrinsics",
+    "calibrate_sheet",
     "calibrate_stereo",
+    "chain_of",
     "find_target",
+    "fit_corners",
     "fit_plane",
+    "fit_tool_tip",
     "fit_touches",
+    "load_calibration",
     "locate",
+    "make_sheet",
+    "scaled",
+    "target_from_data",
+    "target_to_data",
 ]
 
-_HOMES = {
-    "CameraModel": "lens.model",
-    "Charuco": "targets",
-    "Checkerboard": "targets",
-    "CircleGrid": "targets",
-    "Code": "codes",
-    "Drift": "plane.calibration",
-    "HandEyeCalibration": "hand_eye.calibration",
-    "IntrinsicCalibration": "lens.intrinsics",
-    "PlaneCalibration": "plane.calibration",
-    "Remark": "codes",
-    "StereoCalibration": "stereo.calibration",
-    "TargetPose": "lens.poses",
-    "TargetView": "views",
-    "calibrate_hand_eye": "hand_eye.calibration",
-    "calibrate_hand_eye_from_poses": "hand_eye.calibration",
-    "calibrate_intrinsics": "lens.intrinsics",
-    "calibrate_stereo": "stereo.calibration",
-    "find_target": "detection.find",
-    "fit_plane": "plane.calibration",
-    "fit_touches": "plane.touches",
-    "locate": "lens.poses",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_codes": "Code Remark",
+            "_detection.find": "find_target",
+            "_files.directory": "Folder",
+            "_files.load": "load_calibration",
+            "_geometry.frames": "PoseHistory Transform",
+            "_geometry.solvers": "Chain Height PlaneProjection ToolOffset chain_of",
+            "_hand_eye.calibration": "calibrate_hand_eye calibrate_hand_eye_from_poses",
+            "_hand_eye.equations": "RobotSigmas",
+            "_hand_eye.result": "HandEyeCalibration",
+            "_lens.intrinsics": "IntrinsicCalibration calibrate_intrinsics",
+            "_lens.model": "CameraModel",
+            "_lens.poses": "TargetPose locate",
+            "_plane.calibration": "Drift PlaneCalibration fit_plane",
+            "_plane.moving_camera": "MovingCamera",
+            "_plane.tool": "fit_tool_tip",
+            "_plane.touches": "fit_touches",
+            "_printing.sheets": "Sheet make_sheet scaled",
+            "_sheet.calibration": "SheetCalibration calibrate_sheet fit_corners",
+            "_stereo.calibration": "StereoCalibration calibrate_stereo",
+            "_targets": "Charuco Checkerboard CircleGrid target_from_data target_to_data",
+            "_views": "TargetView",
+        },
+    )

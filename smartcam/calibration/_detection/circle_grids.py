@@ -1,0 +1,255 @@
+"""Grids of dots in images: found, numbered from their origin, centred.
+
+A grid that is seen in part could be numbered in more than one way. It is refused: all its dots must
+be there, and none beyond them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._detection.blobs import dark_spots
+from smartcam.calibration._detection.dots import GridMap, refine_dots
+from smartcam.calibration._detection.grid_growing import lattices
+from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, scaled
+from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
+from smartcam.calibration._detection.sampling import mean_level
+from smartcam.calibration._geometry.homography import local_steps
+from smartcam.calibration._views import TargetView
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._detection.blobs import Spots
+    from smartcam.calibration._detection.dots import Dots
+    from smartcam.calibration._detection.ordering import Arrangement
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._targets import CircleGrid
+
+LOOKS: Final = ((1, 1.0), (1, 0.3), (2, 0.3))
+"""How an image is looked at: its size in parts of the usual one, and the side of the square that a
+pixel is compared with, in distances between dots of a grid that fills the image."""
+
+MORE_SPOTS = 1000
+"""Beside twice the dots of the target: of an image with more, the largest are looked at."""
+
+LEAST_TOLD = 9
+"""Dots in rows and columns that an error tells of at least."""
+
+MOST_OFF = 0.15
+"""Of the distance between dots, by which one lies apart from where the others say it is."""
+
+RING = np.column_stack([np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)])
+"""(16, 2), points of the unit circle."""
+
+
+def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> TargetView:
+    """Find the centres of a grid's dots, dark on light or light on dark.
+
+    Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
+    """
+    seen = _Seen()
+    for inked, found, ways in _grids(image, target, seen):
+        if _is_whole(inked, target, found[ways[0].order.ravel()]):
+            return _view(inked, target, found, ways, name)
+        seen.largest = len(found) + 1
+    raise _not_found(target, seen)
+
+
+@dataclass
+class _Seen:
+    """What a search came by, for its error."""
+
+    spots: int | None = None  # how many dark ones, in the first look at the image
+    # dots in rows and columns at most; not counted on where there are more than those of the target
+    largest: int = 0
+
+
+def _grids(
+    image: GreyImage, target: CircleGrid, seen: _Seen
+) -> Iterator[tuple[GreyImage, Array, list[Arrangement]]]:
+    """Yield dots (N, 2), pixels, that stand as the target's do, and the ways to number them.
+
+    They are dark in the image that comes with them, which is the given one or its negative.
+    """
+    usual = min(1.0, USUAL_SIZE / max(image.size))
+    negative = GreyImage(255 - image.levels, 255 - image.bytes)
+    for (times, part), inked in itertools.product(LOOKS, (image, negative)):
+        looked_at = scaled(inked, times * usual)
+        around = round(part * max(looked_at.shape) / _longest(target))
+        spots = dark_spots(looked_at, around, most=MORE_SPOTS + 2 * len(target.points))
+        if seen.spots is None:
+            seen.spots = len(spots.areas)
+        for points, places in _laid_out(spots, target, seen):
+            found = (points + 0.5) / (times * usual) - 0.5
+            ways = arrangements(found, places, target)
+            if ways and _is_flat(target, found[ways[0].order.ravel()]):
+                yield inked, found, ways
+
+
+def _laid_out(
+    spots: Spots, target: CircleGrid, seen: _Seen
+) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+    """Yield as many dots (N, 2) in rows and columns as the target has, and their places (N, 2)."""
+    count = target.columns * target.rows
+    larger = ((target.origin_diameter or target.diameter) / target.diameter) ** 2
+    for grid in lattices(spots.points, spots.areas, least=LEAST_TOLD, most=count, larger=larger):
+        seen.largest = max(seen.largest, len(grid))
+        if len(grid) == count:
+            yield spots.points[list(grid.values())], np.array(list(grid), dtype=np.intp)
+
+
+def _longest(target: CircleGrid) -> float:
+    """Return the longer side of a grid, distances between its dots."""
+    return max(target.columns, target.rows / 2 if target.asymmetric else target.rows)
+
+
+def _is_flat(target: CircleGrid, points: Array) -> bool:
+    """Return whether dots are where a flat grid's are seen."""
+    flat = target.points[:, :2]
+    mapped = GridMap(flat, points)
+    steps = np.linalg.norm(local_steps(mapped, flat, target.spacing), axis=2).min(axis=1)
+    off = np.linalg.norm(mapped(flat) - points, axis=1)
+    return bool((off < MOST_OFF * steps).all())
+
+
+def _is_whole(image: GreyImage, target: CircleGrid, points: Array) -> bool:
+    """Return whether no dots stand where the grid's rows and columns would go on.
+
+    A dot there is dark, and all around it is light; what is outside of the image is neither.
+    """
+    flat = target.points[:, :2]
+    mapped = GridMap(flat, points)
+    next_to = _next_to(target)
+    half = sum(_contrast(image, target, mapped)) / 2
+    inside = _levels(image, mapped, next_to, target.diameter / 4)
+    outside = _levels(image, mapped, next_to, (_apart(target) + target.diameter) / 4)
+    there = np.isfinite(inside).any(axis=1)
+    darkest = np.where(np.isfinite(inside), inside, -np.inf).max(axis=1)
+    lightest = np.where(np.isfinite(outside), outside, np.inf).min(axis=1)
+    beyond: NDArray[np.bool_] = there & (darkest < half) & (lightest > half)
+    return not beyond.any()
+
+
+def _apart(target: CircleGrid) -> float:
+    """Return the least distance between two dots, metres."""
+    return target.spacing * (math.sqrt(0.5) if target.asymmetric else 1.0)
+
+
+def _contrast(image: GreyImage, target: CircleGrid, mapped: GridMap) -> tuple[float, float]:
+    """Return the mean level within dots and that of the gaps around them."""
+    flat = target.points[:, None, :2]
+    gap = (_apart(target) + target.diameter) / 4
+    inside, outside = (
+        mean_level(image, mapped((flat + radius * RING).reshape(-1, 2)))
+        for radius in (target.diameter / 4, gap)
+    )
+    return inside, outside
+
+
+def _next_to(target: CircleGrid) -> Array:
+    """Return (N, 2), metres: where rows and columns would go on, all around the grid."""
+    half = target.spacing / 2
+    own = np.rint(target.points[:, :2] / half).astype(np.intp)
+    steps = [(1, 1), (1, -1)] if target.asymmetric else [(2, 0), (0, 2)]
+    ways = np.array(steps + [(-x, -y) for x, y in steps])
+    around = {(x, y) for x, y in (own[:, None] + ways).reshape(-1, 2).tolist()}
+    return half * np.array(sorted(around - {(x, y) for x, y in own.tolist()}))
+
+
+def _levels(image: GreyImage, mapped: GridMap, flat: Array, radius: float) -> Array:
+    """Return grey levels (N, 16) on circles around places; NaN outside of the image."""
+    u, v = mapped((flat[:, None] + radius * RING).reshape(-1, 2)).T
+    width, height = image.size
+    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    column, row = (np.rint(np.where(inside, one, 0)).astype(np.intp) for one in (u, v))
+    levels = np.where(inside, image.levels[row, column], np.nan)
+    return levels.reshape(len(flat), len(RING))
+
+
+def _view(
+    image: GreyImage, target: CircleGrid, found: Array, ways: list[Arrangement], name: str
+) -> TargetView:
+    way, margin = _number(image, target, found, ways)
+    flat, order = target.points[:, :2], way.order.ravel()
+    diameters = np.full(len(flat), target.diameter)
+    diameters[0] = target.origin_diameter or target.diameter
+    seen = GridMap(flat, found[order])
+    dots = _refine(image, target, seen, found[order], diameters)
+    shifts = GridMap(flat, dots.points - seen.shifts(flat, diameters)).shifts(flat, diameters)
+    return TargetView(
+        target=target,
+        size=image.size,
+        ids=np.arange(len(flat), dtype=np.intp),
+        points=dots.points - shifts,
+        covariance=dots.covariance,
+        margin=margin,
+        name=name,
+    )
+
+
+def _refine(
+    image: GreyImage, target: CircleGrid, seen: GridMap, points: Array, diameters: Array
+) -> Dots:
+    """Return dots, each looked at to the middle of the gap to the next one."""
+    flat, radii = target.points[:, :2], diameters / 2
+    gaps = _apart(target) - 2 * radii
+    gaps[1:] = np.minimum(gaps[1:], np.linalg.norm(flat[1:], axis=1) - radii[0] - radii[1:])
+    gaps[0] = gaps[1:].min()
+    directions = local_steps(seen, flat, target.diameter / 2) / (target.diameter / 2)
+    reaches = radii + gaps / 2
+    return refine_dots(
+        image,
+        points,
+        directions * radii[:, None, None],
+        directions * reaches[:, None, None],
+    )
+
+
+def _number(
+    image: GreyImage, target: CircleGrid, found: Array, ways: list[Arrangement]
+) -> tuple[Arrangement, float | None]:
+    what = f"{target.columns} x {target.rows} dots"
+    if target.origin_diameter is None:
+        return leftmost(ways, what), None
+    flat = target.points[:, :2]
+    rim = RING * (target.diameter + target.origin_diameter) / 4
+    between = target.spacing * (RING / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
+    seen = {}
+    for way in ways:
+        mapped = GridMap(flat, found[way.order.ravel()])
+        seen[int(way.order[0, 0])] = [mean_level(image, mapped(at)) for at in (rim, between)]
+    light = sum(paper for _, paper in seen.values()) / len(seen)
+
+    def level(order: NDArray[np.intp]) -> float:
+        """Return the level of the rim, were the paper there as light as in the mean."""
+        dark, paper = seen[int(order[0, 0])]
+        return dark * light / max(paper, 1.0)
+
+    return marked(ways, level, f"{what}, of which the larger one is the origin")
+
+
+def _not_found(target: CircleGrid, seen: _Seen) -> CalibrationError:
+    """Return an error that says what is seen instead."""
+    count = target.columns * target.rows
+    if seen.largest > count:
+        what = "saw more than these in rows and columns, as of a larger grid"
+    else:
+        what = f"saw {seen.spots} dark spots and no such grid among them"
+        if seen.largest:
+            what += f", at most {seen.largest} in rows and columns"
+    return CalibrationError(
+        f"circles: expected {target.columns} x {target.rows} dots, {what}",
+        code=Code.TARGET_NOT_FOUND,
+        expected=count,
+        got=seen.largest or seen.spots,
+    )

@@ -1,0 +1,160 @@
+r"""Where the corners of a checkerboard are.
+
+Two edges cross at a corner. Behind a lens that blurs by a Gaussian of width ``s`` the grey levels
+around it are ``offset + gain * erf(d1 / s') * erf(d2 / s')``, where ``d`` is the distance from an
+edge and ``s' = sqrt(2) * s``. Seven values, the place and the angle of each edge, blur, gain and
+offset, are fitted to all pixels around a corner. The corner is where the edges cross.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._detection.levenberg import (
+    BLUR,
+    GAIN,
+    OFFSET,
+    covariances,
+    fits_of,
+    refined,
+)
+from smartcam.calibration._detection.pixels import cut_windows, edge
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._detection.image import GreyImage
+    from smartcam.calibration._detection.levenberg import Fits
+    from smartcam.calibration._detection.pixels import Windows
+    from smartcam.calibration._geometry.rotations import Array
+
+MOST_REACH = 13
+"""Pixels to each side of a window at most: more of the edges adds little and takes time."""
+
+WORST_RESIDUAL = 0.35
+"""Rms of the residuals in parts of the gain at most; without an edge it is 1."""
+
+LEAST_SINE = 0.17
+"""Of the angle between the two edges: 10 degrees."""
+
+UNREFINED = 0.25
+"""Standard deviation of a corner that could not be refined, pixels: what detectors reach."""
+
+PLACES, ANGLES = slice(0, 4, 2), slice(1, 4, 2)
+
+
+class Corners(NamedTuple):
+    """Corners as the image's grey levels have them."""
+
+    points: Array  # (N, 2), pixels
+    covariance: Array  # (N, 2, 2), pixels^2
+    # (N,), half the step from black to white, grey levels; positive where the squares between the
+    # two ways, and opposite, are black
+    gains: Array
+    # (N,), whether the fit was good; a corner is where it started elsewhere
+    fitted: NDArray[np.bool_]
+
+
+def refine_corners(
+    image: GreyImage, points: Array, ways: Array, clear: Array | None = None
+) -> Corners:
+    """Return corners to a fraction of a pixel, never worse than they were.
+
+    A fit that does not come to rest near its start, or that does not look like a corner, leaves the
+    corner where OpenCV's ``cornerSubPix`` puts it.
+
+    ``points`` (N, 2) are found to a pixel or two. ``ways`` (N, 2, 2), pixels, lead along the two
+    edges; to both sides they span the part of the corner's four squares that is looked at.
+    ``clear`` (N, 2) is the part of ``ways`` from an edge within which nothing is printed on the
+    squares; None: all of it.
+    """
+    reach = np.linalg.norm(ways, axis=2).min(axis=1)
+    start = _start(image, points, reach if clear is None else reach * clear.min(axis=1))
+    windows = cut_windows(image, start, ways, MOST_REACH, round_=False, clear=clear)
+    guess = _guess(start - windows.middle, ways)
+    fits, good = refined(_evaluate, windows, guess, moving=(0, 2), worst=WORST_RESIDUAL)
+    corners, covariance, crossing = _crossings(fits, windows)
+    corners += windows.middle
+    moved = np.linalg.norm(corners - start, axis=1)
+    good &= crossing & (moved < np.clip(0.5 * reach, 0.75, 3.0))
+    start[good] = corners[good]
+    covariance[~good] = UNREFINED**2 * np.eye(2)
+    return Corners(start, covariance, fits.values[:, GAIN], good)
+
+
+def _start(image: GreyImage, points: Array, reach: Array) -> Array:
+    """Return points by OpenCV's refinement, with the window of the narrowest corner."""
+    cv2 = load("cv2")
+    half = int(np.clip(0.8 * reach.min(), 2, 5))
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-2)
+    found = points.astype(np.float32).reshape(-1, 1, 2)
+    found = cv2.cornerSubPix(image.bytes, found, (half, half), (-1, -1), stop)
+    refined: Array = np.array(found, dtype=np.float64).reshape(-1, 2)
+    return refined
+
+
+def _guess(near: Array, ways: Array) -> Array:
+    """Return values (N, 7): edges as they should lie."""
+    values = np.zeros((len(near), 7))
+    # an edge along (x, y) has the normal (-y, x): cos(angle) u + sin(angle) v = place
+    angles = np.arctan2(ways[:, :, 0], -ways[:, :, 1])
+    values[:, ANGLES] = angles
+    values[:, PLACES] = np.cos(angles) * near[:, :1] + np.sin(angles) * near[:, 1:]
+    return values
+
+
+def _evaluate(windows: Windows, values: Array) -> Fits:
+    x, y, weights = windows.x, windows.y, windows.weights
+    narrow = values.astype(np.float32)
+    blur, gain, offset = (narrow[:, [column]] for column in (BLUR, GAIN, OFFSET))
+    cosines, sines = np.cos(narrow[:, ANGLES]), np.sin(narrow[:, ANGLES])
+    places = narrow[:, PLACES]
+    scale = 1 / (np.sqrt(np.float32(2)) * blur)
+    far, along, shapes, slopes = [], [], [], []
+    # d = cos(a) x + sin(a) y - place moves with place by -1, and with a by cos(a) y - sin(a) x, the
+    # way along the edge. The level gain E(d1 / s) E(d2 / s) + offset, E = erf, moves with d1 by
+    # gain E'(d1 / s) E(d2 / s) / s, and with the blur, to which s is in proportion, by
+    # -gain (E'_1 d1 / s E_2 + E'_2 d2 / s E_1) / blur.
+    for side in (0, 1):
+        cosine, sine, place = (part[:, [side]] for part in (cosines, sines, places))
+        far.append((cosine * x + sine * y - place) * scale)
+        along.append(cosine * y - sine * x)
+        shape, slope = edge(far[side])
+        shapes.append(shape)
+        slopes.append(slope)
+    first = slopes[0] * shapes[1] * weights
+    second = slopes[1] * shapes[0] * weights
+    product = shapes[0] * shapes[1] * weights
+    columns = (
+        first,
+        first * along[0],
+        second,
+        second * along[1],
+        first * far[0] + second * far[1],
+        product,
+        weights,
+    )
+    steep, one = gain * scale, np.ones_like(gain)
+    factors = (-steep, steep, -steep, steep, -gain / blur, one, one)
+    return fits_of(values, columns, factors, windows.levels - gain * product - offset * weights)
+
+
+def _crossings(fits: Fits, windows: Windows) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the crossings of the edges, their covariances, and the mask of those found."""
+    # N p = q with the normals as rows of N: p = N^-1 q, and dp = N^-1 (dq - dN p); a normal turned
+    # by da moves by da along its edge, so dN p is da times the way along it.
+    places, angles = fits.values[:, PLACES], fits.values[:, ANGLES]
+    normals = np.stack([np.cos(angles), np.sin(angles)], axis=2)
+    crossing = np.abs(np.linalg.det(normals)) > LEAST_SINE
+    normals[~crossing] = np.eye(2)
+    inverse = np.linalg.inv(normals)
+    corners: Array = (inverse @ places[:, :, None])[:, :, 0]
+    along = normals[:, :, 0] * corners[:, 1:] - normals[:, :, 1] * corners[:, :1]
+    moves = np.zeros((len(corners), 2, fits.values.shape[1]))
+    moves[:, :, PLACES] = inverse
+    moves[:, :, ANGLES] = -inverse * along[:, None]
+    covariance: Array = moves @ covariances(fits, windows.counts) @ moves.transpose(0, 2, 1)
+    return corners, covariance, crossing

@@ -1,0 +1,63 @@
+"""Printed targets in images: :func:`find_target`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._detection.charucos import find_charuco
+from smartcam.calibration._detection.checkerboards import find_checkerboard
+from smartcam.calibration._detection.circle_grids import find_circles
+from smartcam.calibration._detection.image import grey_image
+from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration._views import TargetView
+
+
+def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
+    """Find a target's points in an image.
+
+    Corners of squares are found where two fitted edges cross, dots by the fitted ellipse of their
+    rim, from whose middle the centre is told by how the whole grid is seen. All points of a
+    checkerboard and of a grid of dots must be seen; of a ChArUco board at least four corners. Dots
+    may be dark on light or light on dark; a grid that goes on beside them is refused.
+
+    Points are numbered as the target does. Its origin is told by its mark, its larger dot or its
+    ids; without these by the outermost square there, which is black, where only one of the corners
+    in question has a black one. Where nothing tells it, the target's x points to the right of the
+    image rather than to the left. A mirrored image is noticed only where the target's marks allow
+    it.
+
+    Args:
+        image: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; 16 to 20,000 pixels wide
+            and high.
+        target: what is printed on the sheet.
+        name: of the image, for messages.
+
+    Returns:
+        Points with a covariance that follows from the noise in the image alone: what its
+        compression, the print or the lens do to an edge comes on top. A corner that is covered
+        stays where it was found first, with a standard deviation of a quarter of a pixel or more.
+
+    Raises:
+        CalibrationError: SHAPE: no such image, or a ChArUco board of an unknown dictionary;
+            TARGET_NOT_FOUND; AMBIGUOUS_ORIGIN: the mark is not darker than the other corners by 30
+            grey levels of 255; MIRRORED.
+        MissingExtraError: OpenCV is not installed.
+    """
+    grey = grey_image(image)
+    match target:
+        case Checkerboard():
+            return find_checkerboard(grey, target, name)
+        case Charuco():
+            return find_charuco(grey, target, name)
+        case CircleGrid():
+            return find_circles(grey, target, name)
+    raise CalibrationError(
+        f"target: expected a Checkerboard, Charuco or CircleGrid, got {type(target).__name__}",
+        code=Code.SHAPE,
+        got=type(target).__name__,
+    )

@@ -1,0 +1,85 @@
+"""An image as detectors take it: grey levels from 0 to 255."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SMALLEST = 16
+"""Width and height of an image at least, pixels."""
+
+LARGEST = 20_000
+"""Width and height of an image at most, pixels."""
+
+USUAL_SIZE = 1600
+"""Longest side of the image in which OpenCV looks for a grid first, pixels.
+
+In a larger one it takes seconds and finds less.
+"""
+
+
+class GreyImage(NamedTuple):
+    """An image without its colours."""
+
+    levels: NDArray[np.float32]  # (H, W), float32, 0 to 255; what refinement works on
+    bytes: NDArray[np.uint8]  # (H, W), uint8, the same; what OpenCV's detectors take
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        height, width = self.bytes.shape
+        return width, height
+
+
+def grey_image(image: Any) -> GreyImage:
+    """Return an image's grey levels.
+
+    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; else SHAPE is raised. The
+    brightest level of uint16 becomes 255, whether the camera fills 10, 12 or 16 bits.
+    """
+    shape, kind = np.shape(image), getattr(image, "dtype", None)
+    fits = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
+    if not (
+        isinstance(image, np.ndarray)
+        and fits
+        and kind in (np.uint8, np.uint16)
+        and all(SMALLEST <= side <= LARGEST for side in shape[:2])
+    ):
+        what = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
+        raise CalibrationError(
+            "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
+            f"{SMALLEST} to {LARGEST} pixels wide and high, got {what}",
+            code=Code.SHAPE,
+            expected="uint8 or uint16, (H, W) or (H, W, 3)",
+            got=what,
+        )
+    cv2 = load("cv2")
+    flat = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if len(shape) == 3 else image
+    flat = np.ascontiguousarray(flat)
+    if flat.dtype == np.uint8:
+        return GreyImage(flat.astype(np.float32), flat)
+    levels = flat.astype(np.float32) * np.float32(255 / max(1, int(flat.max())))
+    return GreyImage(levels, np.rint(levels).astype(np.uint8))
+
+
+def scaled(image: GreyImage, scale: float) -> NDArray[np.uint8]:
+    """Return an image's bytes, ``scale`` times as wide and high.
+
+    A place ``p`` of it is ``(p + 0.5) / scale - 0.5`` in the image.
+    """
+    if scale == 1.0:
+        return image.bytes
+    cv2 = load("cv2")
+    kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    bytes_: NDArray[np.uint8] = cv2.resize(
+        image.bytes, None, fx=scale, fy=scale, interpolation=kind
+    )
+    return bytes_

@@ -1,0 +1,149 @@
+"""Many small least-squares problems of one kind, solved side by side.
+
+Levenberg's and Marquardt's method, for fits to the pixels around each of many points: NumPy's cost
+of a call is paid once for all of them, and those that no longer move drop out. So it is no use of
+:mod:`smartcam.calibration._least_squares`, which solves one problem after the other.
+
+The models are of blurred edges. Their last three values are the lens' blur, the gain (half the step
+from black to white) and the offset of the grey levels.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._detection.pixels import Floats, Windows
+    from smartcam.calibration._geometry.rotations import Array
+
+BLUR, GAIN, OFFSET = -3, -2, -1
+
+LEAST_BLUR = 0.25
+"""Pixels: the pixel's own width; a drawn image may have less, which no fit can tell."""
+
+MOST_BLUR = 6.0
+"""Pixels; a fit that needs more has seen something else than an edge."""
+
+LEAST_GAIN = 4.0
+"""Grey levels of 255: half the step from black to white at least."""
+
+MOST_STEPS = 20
+"""Of a fit; most take four to seven."""
+
+STILL = 1e-3
+"""Pixels by which a point moves in the last step at most."""
+
+RIDGE = 1e-6
+"""Added to the diagonal: what no pixel determines stays finite."""
+
+
+class Fits(NamedTuple):
+    """A model with M values at each of N points."""
+
+    values: Array  # (N, M)
+    cost: Array  # (N,), sum of the squared residuals
+    hessian: Array  # (N, M, M), the Jacobian's transpose by the Jacobian
+    gradient: Array  # (N, M), the Jacobian's transpose by the residuals
+
+    def put(self, which: NDArray[np.intp], others: Fits, chosen: NDArray[np.bool_]) -> None:
+        """Take over the chosen ones of others; ``which`` says whose they are."""
+        for mine, other in zip(self, others, strict=True):
+            mine[which[chosen]] = other[chosen]
+
+
+def fits_of(
+    values: Array, columns: Sequence[Floats], factors: Sequence[Floats], residuals: Floats
+) -> Fits:
+    """Return the normal equations of fits with ``values`` (N, M).
+
+    ``columns``: M of the Jacobian, (N, P) each, to be multiplied by ``factors`` (N, 1).
+    ``residuals`` (N, P): measured less modelled. Both are 0 where a pixel does not count.
+    """
+    # J = (f_1 c_1, f_2 c_2, ...): J^T J and J^T r of the columns c, in single precision, are
+    # scaled by the factors f afterwards, in double precision.
+    jacobian = np.stack(columns, axis=1)
+    scale = np.concatenate(factors, axis=1).astype(np.float64)
+    hessian = (jacobian @ jacobian.transpose(0, 2, 1)) * scale[:, :, None] * scale[:, None]
+    gradient = (jacobian @ residuals[:, :, None])[:, :, 0] * scale
+    cost = np.einsum("np,np->n", residuals, residuals).astype(np.float64)
+    return Fits(values.copy(), cost, hessian, gradient)
+
+
+def refined(
+    evaluate: Callable[[Windows, Array], Fits],
+    windows: Windows,
+    values: Array,
+    *,
+    moving: Sequence[int],
+    worst: float,
+) -> tuple[Fits, NDArray[np.bool_]]:
+    """Return the best fits, and which of them (N,) are good.
+
+    A good one came to rest, with a blur and a gain that an edge may have.
+
+    ``values`` (N, M) are where it starts; of gain and offset the best are taken. ``moving`` are
+    those in pixels, which must come to rest. ``worst``: rms of a good one's residuals in parts of
+    its gain.
+    """
+    values[:, BLUR], values[:, GAIN:] = 1.0, 0.0
+    # The model is linear in gain and offset, so one solution of their normal equations is the best.
+    flat = evaluate(windows, values)
+    linear = flat.hessian[:, GAIN:, GAIN:] + RIDGE * np.eye(2)
+    values[:, GAIN:] = np.linalg.solve(linear, flat.gradient[:, GAIN:, None])[:, :, 0]
+    fits, settled = _solve(evaluate, windows, values, moving)
+    blur, gain = fits.values[:, BLUR], np.abs(fits.values[:, GAIN])
+    rms = np.sqrt(fits.cost / windows.counts)
+    return fits, settled & (blur < MOST_BLUR) & (gain > LEAST_GAIN) & (rms < worst * gain)
+
+
+def _solve(
+    evaluate: Callable[[Windows, Array], Fits],
+    windows: Windows,
+    values: Array,
+    moving: Sequence[int],
+) -> tuple[Fits, NDArray[np.bool_]]:
+    """Return the best fits, with a cost not above the start's, and which (N,) came to rest."""
+    best = evaluate(windows, values)
+    settled = np.zeros(len(values), dtype=np.bool_)
+    damping = np.full(len(values), 1e-3)
+    active = np.arange(len(values))
+    identity = np.eye(values.shape[1])
+    for _ in range(MOST_STEPS):
+        hessian = best.hessian[active]
+        # (J^T J + damping diag(J^T J)) step = J^T r, each point with a damping of its own.
+        # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
+        # (1963).
+        diagonal = np.einsum("nii->ni", hessian) * damping[active, None] + RIDGE
+        damped = hessian + diagonal[:, :, None] * identity
+        step = np.linalg.solve(damped, best.gradient[active, :, None])[:, :, 0]
+        trial = best.values[active] + step
+        trial[:, BLUR] = np.clip(trial[:, BLUR], LEAST_BLUR, 2 * MOST_BLUR)
+        tried = evaluate(windows, trial)
+        better = tried.cost <= best.cost[active]
+        best.put(active, tried, better)
+        damping[active] *= np.where(better, 0.1, 10.0)
+        still = np.abs(step[:, moving]).max(axis=1) < STILL
+        settled[active[still]] = True
+        windows, active = windows.some(~still), active[~still]
+        if not len(active):
+            break
+    return best, settled
+
+
+def covariances(fits: Fits, counts: Array) -> Array:
+    """Return each fit's covariance (N, M, M), with the noise that its residuals show.
+
+    ``counts`` (N,): pixels that count.
+    """
+    # s^2 (J^T J)^-1 with s^2 = sum r^2 / (pixels - M)
+    size = fits.values.shape[1]
+    variance = fits.cost / np.maximum(counts - size, 1)
+    inverse = np.linalg.inv(fits.hessian + RIDGE * np.eye(size))
+    covariance: Array = inverse * variance[:, None, None]
+    return covariance

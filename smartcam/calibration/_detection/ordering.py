@@ -1,0 +1,133 @@
+"""Which of the points that were found is which of the target's.
+
+A detector returns a grid whose first point may be any of its corners. The ways to lay the target's
+rows and columns over it are few; those that keep the sheet's front towards the camera are
+``proper``, the others show it mirrored.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._targets import CircleGrid
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._targets import Checkerboard
+
+LEAST_MARGIN = 30.0
+"""Grey levels of 255 by which a marked origin is darker than the next corner at least."""
+
+_TURNS: Final = [
+    np.array(entries).reshape(2, 2)
+    for entries in itertools.product((-1, 0, 1), repeat=4)
+    if abs(entries[0] * entries[3] - entries[1] * entries[2]) == 1
+]
+"""What may be between the steps that were followed and those to the next column and row: turns,
+mirrored or not, and where a tilted sheet's diagonals look shorter than its sides, shears."""
+
+
+class Arrangement(NamedTuple):
+    """One way to number the points that were found."""
+
+    # (rows, columns): which of them is the target's point in that row and column
+    order: NDArray[np.intp]
+    proper: bool  # whether the sheet's front is seen, and not its mirror image
+    rightward: float  # cosine of the angle between the target's x and the image's u
+
+
+def arrangements(
+    points: Array, places: NDArray[np.intp], target: Checkerboard | CircleGrid
+) -> list[Arrangement]:
+    """Return all ways in which a grid can be numbered.
+
+    ``points`` (N, 2), pixels, are all points of the target in any order; ``places`` (N, 2) the
+    column and the row of each, counted from anywhere in any direction; of a grid with shifted rows
+    the steps to the two nearest neighbours.
+    """
+    wanted = _places(target)
+    ways: list[Arrangement] = []
+    if len(points) != len(wanted):
+        return ways
+    for turn in _TURNS:
+        turned = places @ turn
+        number = {place: index for index, place in enumerate(_from_zero(turned))}
+        order = [number.get(place) for place in wanted]
+        if None not in order:
+            shaped = np.array(order, dtype=np.intp).reshape(target.rows, target.columns)
+            ways.append(_arrangement(points, shaped))
+    return ways
+
+
+def _from_zero(places: NDArray[np.intp]) -> list[tuple[int, int]]:
+    return [(x, y) for x, y in (places - places.min(axis=0)).tolist()]
+
+
+def _places(target: Checkerboard | CircleGrid) -> list[tuple[int, int]]:
+    """Return the columns and rows of a target's points, as :func:`arrangements` takes them."""
+    row, column = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    if isinstance(target, CircleGrid) and target.asymmetric:
+        half = 2 * column + row % 2
+        column, row = (half + row) // 2, (half - row) // 2
+    return _from_zero(np.stack([column, row], axis=1))
+
+
+def rows_of(columns: int, rows: int) -> NDArray[np.intp]:
+    """Return the places (N, 2) of points that come row by row."""
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    return np.stack([column, row], axis=1)
+
+
+def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:
+    origin, right, up = points[order[0, 0]], points[order[0, -1]], points[order[-1, 0]]
+    x, y = right - origin, up - origin
+    turn = float(x[0] * y[1] - x[1] * y[0])  # v points down: negative where y is left of x
+    return Arrangement(order, turn < 0, float(x[0] / np.hypot(*x)))
+
+
+def leftmost(ways: Sequence[Arrangement], what: str) -> Arrangement:
+    """Return the proper one whose x points most to the image's right: the same one every time.
+
+    Raises MIRRORED where none is proper; ``what`` names the target.
+    """
+    proper = [way for way in ways if way.proper]
+    if not proper:
+        raise CalibrationError(
+            f"{what}: expected an image of the sheet as one reads it, got one that is mirrored",
+            code=Code.MIRRORED,
+            expected="y to the left of x",
+            got="y to the right of x",
+        )
+    return max(proper, key=lambda way: way.rightward)
+
+
+def marked(
+    ways: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], what: str
+) -> tuple[Arrangement, float]:
+    """Return the arrangement with a dark mark at its origin, and by how much it is darker.
+
+    The margin to the next corner is in grey levels of 255, which ``level`` gives where the mark of
+    an arrangement's order should be. ``what`` are the target and its mark, for messages. Raises
+    AMBIGUOUS_ORIGIN where the margin is too small; MIRRORED.
+    """
+    levels = {int(way.order[0, 0]): level(way.order) for way in ways}
+    origin, second = sorted(levels, key=lambda corner: levels[corner])[:2]
+    margin = levels[second] - levels[origin]
+    if not margin >= LEAST_MARGIN:
+        raise CalibrationError(
+            f"{what}: expected the origin to be darker than the other corners by "
+            f"{LEAST_MARGIN:g} grey levels of 255, got {margin:.0f}",
+            code=Code.AMBIGUOUS_ORIGIN,
+            expected=LEAST_MARGIN,
+            got=margin,
+        )
+    return leftmost([way for way in ways if way.order[0, 0] == origin], what), margin

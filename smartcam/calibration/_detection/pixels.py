@@ -1,0 +1,88 @@
+"""The pixels around points, and what a blurred edge looks like in them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from smartcam.calibration._detection.image import GreyImage
+    from smartcam.calibration._geometry.rotations import Array
+
+Floats: TypeAlias = NDArray[np.float32]
+
+LINEAR: Final = 1.12967583
+CUBIC: Final = 0.0997927
+"""``erf(x)`` is taken as ``tanh(x * (LINEAR + CUBIC * x^2))``: off by 0.0003 at most, which is far
+below one grey level, and ten times as fast (fitted)."""
+
+LEAST_REACH = 3
+"""Pixels to each side of a window at least."""
+
+
+class Windows(NamedTuple):
+    """Pixels around points; P of them for each of N."""
+
+    middle: NDArray[np.intp]  # (N, 2), the pixel around which each lies
+    x: Floats  # (P,), columns from the middle
+    y: Floats  # (P,), rows from the middle
+    levels: Floats  # (N, P), 0 to 255; 0 where the weight is 0
+    weights: Floats  # (N, P), 1 for a pixel that counts, 0 for one that does not
+
+    @property
+    def counts(self) -> Array:
+        """(N,), how many pixels of each count."""
+        counts: Array = self.weights.sum(axis=1, dtype=np.float64)
+        return counts
+
+    def some(self, which: NDArray[np.bool_]) -> Windows:
+        """Return those of some points."""
+        if which.all():
+            return self
+        return self._replace(
+            middle=self.middle[which], levels=self.levels[which], weights=self.weights[which]
+        )
+
+
+def cut_windows(
+    image: GreyImage,
+    points: Array,
+    ways: Array,
+    most: int,
+    *,
+    round_: bool,
+    clear: Array | None = None,
+) -> Windows:
+    """Return the pixels around points (N, 2).
+
+    Two ``ways`` (N, 2, 2) from each point span the half sides of the parallelogram whose pixels
+    count, or the half axes of the ellipse (``round_``). ``most``: pixels to each side of a window.
+    ``clear`` (N, 2), parts of the ways: of the parallelogram only the cross counts that is this
+    wide along each of them; None: all of it.
+    """
+    reach = np.hypot(ways[:, 0], ways[:, 1]) if round_ else np.abs(ways).sum(axis=1)
+    half = int(np.clip(np.ceil(reach.max()), LEAST_REACH, most))
+    span = np.arange(-half, half + 1)
+    y, x = (side.ravel() for side in np.meshgrid(span, span, indexing="ij"))
+    middle = np.rint(points).astype(np.intp)
+    columns, rows = middle[:, :1] + x, middle[:, 1:] + y
+    width, height = image.size
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    levels = image.levels[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+    # a pixel in parts of the two ways
+    parts = np.linalg.inv(ways.transpose(0, 2, 1)) @ np.stack([x, y])
+    within = (parts**2).sum(axis=1) <= 1 if round_ else (np.abs(parts) <= 1).all(axis=1)
+    if clear is not None:
+        within &= (np.abs(parts) <= clear[:, :, None]).any(axis=1)
+    near = np.maximum(np.abs(x), np.abs(y)) < LEAST_REACH
+    weights = (inside & (within | near)).astype(np.float32)
+    return Windows(middle, x.astype(np.float32), y.astype(np.float32), levels * weights, weights)
+
+
+def edge(distance: Floats) -> tuple[Floats, Floats]:
+    """Return a blurred edge's ``erf`` and slope; distances are in ``sqrt(2)`` times the blur."""
+    square = distance * distance
+    shape = np.tanh(distance * (LINEAR + CUBIC * square))
+    return shape, (1 - shape * shape) * (LINEAR + 3 * CUBIC * square)

@@ -1,0 +1,21 @@
+"""Grey levels between pixels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from smartcam.calibration._detection.image import GreyImage
+    from smartcam.calibration._geometry.rotations import Array
+
+
+def mean_level(image: GreyImage, points: Array) -> float:
+    """Return the mean grey level at points (N, 2); those of the image's rim beyond it."""
+    cv2 = load("cv2")
+    at = points.astype(np.float32)[None]
+    levels = cv2.remap(image.levels, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return float(levels.mean())

@@ -1,0 +1,154 @@
+"""The folder of calibrations: names that clients give, and the files they stand for.
+
+A name never leads out of the folder. It is refused by its letters before anything is opened, and a
+symbolic link on the way is refused too: what stands in the folder is in it.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from smartcam.calibration._codes import Code
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    import os
+
+NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
+"""What a name is made of: no dot, no slash, nothing that a file system gives a meaning to."""
+
+MAX_NAME = 64
+"""Characters of a name."""
+
+EXPORTS = "exports"
+"""Where exported files stand, in the folder."""
+
+_SUFFIXES = (".json", ".yaml", ".txt", ".calib")
+_RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])", re.IGNORECASE)
+"""Names that Windows keeps for devices."""
+
+
+class Folder:
+    """A folder of calibrations; made where it is not there.
+
+    Args:
+        path: the folder. It is the user's own choice, so it may be a symbolic link.
+
+    Attributes:
+        path: the folder, absolute.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path: Path = Path(path).resolve()
+        self.path.mkdir(parents=True, exist_ok=True)
+
+    def names(self) -> list[str]:
+        """Return the names of the calibrations there, sorted."""
+        files = (one for one in self.path.glob("*.json") if one.is_file() and not one.is_symlink())
+        return sorted(one.stem for one in files if _is_name(one.stem))
+
+    def calibration(self, name: str) -> Path:
+        """Return the file of a calibration.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``.
+        """
+        return self._within(f"{_checked(name)}.json")
+
+    def journal(self, name: str, wizard: str = "") -> Path:
+        """Return the journal of a wizard.
+
+        Args:
+            name: of the calibration.
+            wizard: name of the wizard; empty for the one that makes the calibration.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``.
+        """
+        of = f"{_checked(name)}.{_checked(wizard)}" if wizard else _checked(name)
+        return self._within(f"{of}.journal")
+
+    def checks(self, name: str) -> Path:
+        """Return the file of a calibration's checks.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``.
+        """
+        return self._within(f"{_checked(name)}.checks.jsonl")
+
+    def export(self, target: str) -> Path:
+        """Return the file that an export goes to; its folder is made.
+
+        Args:
+            target: its name, with the suffix ``.json`` or ``.yaml``.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``.
+            OSError: the folder cannot be made.
+        """
+        target = target.removeprefix(f"{EXPORTS}/")
+        stem, dot, suffix = target.rpartition(".")
+        if f"{dot}{suffix}" not in _SUFFIXES:
+            raise _bad(target, f"a name that ends in one of {', '.join(_SUFFIXES)}")
+        path = self._within(EXPORTS, f"{_checked(stem)}.{suffix}")
+        path.parent.mkdir(exist_ok=True)
+        return path
+
+    def find(self, name_or_path: str) -> Path:
+        """Return the file of a calibration by its name, or an exported one by its path.
+
+        Args:
+            name_or_path: ``NAME``, or ``exports/NAME.json``.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``.
+        """
+        if "/" not in name_or_path:
+            path = self.calibration(name_or_path)
+        elif name_or_path.startswith(f"{EXPORTS}/"):
+            path = self.export(name_or_path)
+        else:
+            raise _bad(name_or_path, f"a name, or {EXPORTS}/NAME.json")
+        if not path.is_file():
+            known = ", ".join(self.names()[:20]) or "none: the folder is empty"
+            raise CalibrationError(
+                f"no calibration {name_or_path!r}; there are {known}",
+                code=Code.NOT_FOUND,
+                got=name_or_path,
+            )
+        return path
+
+    def _within(self, *parts: str) -> Path:
+        path = self.path
+        for part in parts:
+            path /= part
+            if path.is_symlink():
+                raise _bad(part, "no symbolic link")
+        return path
+
+
+def _is_name(text: str) -> bool:
+    return bool(
+        len(text) <= MAX_NAME and re.fullmatch(NAME, text) and not _RESERVED.fullmatch(text)
+    )
+
+
+def _checked(name: str) -> str:
+    if not _is_name(name):
+        raise _bad(name, f"1 to {MAX_NAME} letters, digits, '-' and '_'")
+    return name
+
+
+def _bad(name: str, expected: str) -> CalibrationError:
+    shown = repr(name) if len(name) <= MAX_NAME else f"{name[:MAX_NAME]!r}..."
+    return CalibrationError(
+        f"the name {shown} cannot be used: expected {expected}",
+        code=Code.BAD_NAME,
+        got=name,
+        expected=expected,
+    )

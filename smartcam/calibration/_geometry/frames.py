@@ -1,0 +1,324 @@
+"""Frames: how coordinate systems lie against each other, and when they did so.
+
+A :class:`Transform` knows which way it goes: from ``source`` coordinates into ``target``
+coordinates. Two of them can be put one behind the other only where the frame between them is the
+same, so one that is taken the wrong way round does not pass. A :class:`PoseHistory` keeps those of
+a frame that moves, and gives the one at a moment.
+
+Right-handed, metres, Hamilton quaternions ``x, y, z, w``.
+"""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.rigid import Rigid, exp_rotation, log_rotation
+from smartcam.calibration._geometry.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_multiply,
+)
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Header, Pose, Position, Quaternion
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._geometry.rotations import Array
+
+_ORTHONORMAL: Final = 1e-6
+"""How far ``R R^T`` may be from one: at a metre this is a micrometre."""
+
+_UNIT: Final = 0.01
+"""How far a quaternion's length may be from one; it is made one. Robots print few digits; what is
+farther off is no quaternion, or is in another order."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transform:
+    """A rigid motion ``T_target_source``: ``p_target = rotation @ p_source + translation``.
+
+    Attributes:
+        target: the frame that it leads to.
+        source: the frame that it comes from.
+        rotation: (3, 3), determinant +1. Read-only.
+        translation: (3,), metres: the source's origin in the target. Read-only.
+        at: when it was so; None for one that does not change.
+
+    Raises:
+        CalibrationError: no rotation (``NOT_RIGID``: a reflection and a scale, too), not finite,
+            or a time without a time zone (``BAD_TIME``).
+    """
+
+    target: str
+    source: str
+    rotation: Array
+    translation: Array
+    at: datetime | None = None
+
+    def __post_init__(self) -> None:
+        """Take read-only copies, and check them."""
+        rotation = np.array(self.rotation, dtype=np.float64)
+        translation = np.array(self.translation, dtype=np.float64)
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise CalibrationError(
+                f"{self.label}: expected a (3, 3) rotation and a (3,) translation, got "
+                f"{rotation.shape} and {translation.shape}",
+                code=Code.NOT_RIGID,
+                expected=((3, 3), (3,)),
+                got=(rotation.shape, translation.shape),
+            )
+        with np.errstate(all="ignore"):
+            off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+            turn = float(np.linalg.det(rotation))
+        if not (off < _ORTHONORMAL and turn > 0 and np.isfinite(translation).all()):
+            raise CalibrationError(
+                f"{self.label}: expected a rotation and a finite translation, got a matrix of "
+                f"determinant {turn:.6g}, off by {off:.3g}, and {translation.tolist()}",
+                code=Code.NOT_RIGID,
+                expected="a rotation, determinant 1",
+                got=turn,
+            )
+        if self.at is not None and self.at.tzinfo is None:
+            raise CalibrationError(
+                f"{self.label}: expected a time with its time zone, got {self.at}",
+                code=Code.BAD_TIME,
+                expected="a time zone",
+                got=self.at,
+            )
+        rotation.flags.writeable = translation.flags.writeable = False
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @classmethod
+    def from_quaternion(
+        cls,
+        target: str,
+        source: str,
+        translation: ArrayLike,
+        quaternion: ArrayLike,
+        at: datetime | None = None,
+    ) -> Transform:
+        """Return one of a position and an orientation.
+
+        Args:
+            target: the frame in which both are given.
+            source: the frame whose pose they are.
+            translation: (3,), metres.
+            quaternion: (4,), ``x, y, z, w``. Its length is made one.
+            at: when it was so.
+
+        Raises:
+            CalibrationError: ``NOT_RIGID``: the quaternion's length is more than 1 % off.
+        """
+        values = np.asarray(quaternion, dtype=np.float64)
+        length = float(np.linalg.norm(values))
+        if values.shape != (4,) or not abs(length - 1.0) < _UNIT:
+            raise CalibrationError(
+                f"T_{target}_{source}: expected a quaternion x, y, z, w of length 1, got "
+                f"{values.tolist()} of length {length:.6g}",
+                code=Code.NOT_RIGID,
+                expected=1.0,
+                got=length,
+            )
+        rotation = matrix_from_quaternion(values / length)
+        return cls(target, source, rotation, np.asarray(translation, dtype=np.float64), at)
+
+    @classmethod
+    def from_pose(cls, pose: Pose, source: str) -> Transform:
+        """Return one of a pose in the frame that its header names, with its stamp.
+
+        Raises:
+            CalibrationError: ``NOT_RIGID``, ``BAD_TIME``.
+        """
+        header = pose.header
+        return cls.from_quaternion(
+            header.frame_id, source, pose.position, pose.orientation, header.stamp
+        )
+
+    @property
+    def label(self) -> str:
+        """Its name as it is written in formulas: ``T_target_source``."""
+        return f"T_{self.target}_{self.source}"
+
+    @property
+    def rigid(self) -> Rigid:
+        """The motion without the frames' names."""
+        return Rigid(self.rotation, self.translation)
+
+    @property
+    def quaternion(self) -> Array:
+        """(4,), ``x, y, z, w``, whose largest element is positive."""
+        return quaternion_from_matrix(self.rotation)
+
+    def pose(self, seq: int = 0) -> Pose:
+        """Return the source's pose in the target.
+
+        Raises:
+            CalibrationError: ``BAD_TIME``: it has no time, and a pose must have one.
+        """
+        if self.at is None:
+            raise CalibrationError(
+                f"{self.label}: expected a time for the pose's header, got none",
+                code=Code.BAD_TIME,
+                expected="a time",
+            )
+        position = Position(*self.translation.tolist())
+        orientation = Quaternion(*self.quaternion.tolist())
+        return Pose(Header(seq, self.at, self.target), position, orientation)
+
+    def inverse(self) -> Transform:
+        """Return ``T_source_target``."""
+        return Transform(self.source, self.target, *self.rigid.inverse(), self.at)
+
+    def undated(self) -> Transform:
+        """Return the same without its time: to compare what was with what is."""
+        return dataclasses.replace(self, at=None)
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """Return ``T_a_b @ T_b_c = T_a_c``.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: the frames between them differ; ``NOT_SIMULTANEOUS``:
+                their times do.
+        """
+        if self.source != other.target:
+            raise CalibrationError(
+                f"{self.label} @ {other.label}: expected a transform into {self.source!r}, got one "
+                f"into {other.target!r}",
+                code=Code.WRONG_FRAME,
+                expected=self.source,
+                got=other.target,
+            )
+        if self.at is not None and other.at is not None and self.at != other.at:
+            raise CalibrationError(
+                f"{self.label} @ {other.label}: expected both at one time, got {self.at} and "
+                f"{other.at}",
+                code=Code.NOT_SIMULTANEOUS,
+                expected=self.at,
+                got=other.at,
+            )
+        at = other.at if self.at is None else self.at
+        return Transform(self.target, other.source, *(self.rigid @ other.rigid), at)
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Return points of the source, (..., 3) in metres, in the target."""
+        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def turn(self, quaternions: ArrayLike) -> Array:
+        """Return orientations in the source, (..., 4), as orientations in the target."""
+        return quaternion_multiply(self.quaternion, np.asarray(quaternions, dtype=np.float64))
+
+    def between(self, later: Transform, at: datetime) -> Transform:
+        """Return it at a moment between this one and a later one of the same frames.
+
+        The position moves on a straight line, the orientation turns about one axis at one speed.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``; ``BAD_TIME``: the moment is not between the two.
+        """
+        if (self.target, self.source) != (later.target, later.source):
+            raise CalibrationError(
+                f"between: expected two of {self.label}, got {later.label}",
+                code=Code.WRONG_FRAME,
+                expected=self.label,
+                got=later.label,
+            )
+        if self.at is None or later.at is None or not self.at <= at <= later.at:
+            raise CalibrationError(
+                f"{self.label}: expected a time between {self.at} and {later.at}, got {at}",
+                code=Code.BAD_TIME,
+                expected=(self.at, later.at),
+                got=at,
+            )
+        if later.at == self.at:
+            return self
+        part = (at - self.at) / (later.at - self.at)
+        # R1 exp(s log(R1^T R2)) goes the shortest way from R1 to R2 at one speed: slerp.
+        # Source: Shoemake, Animating Rotation with Quaternion Curves (1985).
+        step = exp_rotation(part * log_rotation(self.rotation.T @ later.rotation))
+        translation = self.translation + part * (later.translation - self.translation)
+        return Transform(self.target, self.source, self.rotation @ step, translation, at)
+
+
+class PoseHistory:
+    """Poses of a frame that moves in another one, by their times.
+
+    Args:
+        size: how many moments are kept; the oldest goes first.
+        max_gap: seconds between two moments at most, to take one in between. A robot that
+            accelerates with ``a`` leaves the straight line between them by ``a * max_gap^2 / 8``:
+            a tenth of a second and 1 m/s^2 are 1.25 mm.
+    """
+
+    def __init__(self, *, size: int = 1000, max_gap: float = 0.1) -> None:
+        self._transforms: list[Transform] = []
+        self._times: list[datetime] = []
+        self._size = size
+        self._max_gap = timedelta(seconds=max_gap)
+
+    def add(self, transform: Transform) -> None:
+        """Put in where the frame was at a moment; one more of the same moment takes its place.
+
+        They may come in any order.
+
+        Raises:
+            CalibrationError: ``BAD_TIME``: without a time; ``WRONG_FRAME``: of other frames than
+                those before.
+        """
+        if transform.at is None:
+            raise CalibrationError(
+                f"{transform.label}: expected a time, got none", code=Code.BAD_TIME, got=None
+            )
+        if self._transforms and transform.label != self._transforms[0].label:
+            wanted = self._transforms[0].label
+            raise CalibrationError(
+                f"pose history: expected {wanted} as before, got {transform.label}",
+                code=Code.WRONG_FRAME,
+                expected=wanted,
+                got=transform.label,
+            )
+        place = bisect.bisect_left(self._times, transform.at)
+        same = transform.at in self._times[place : place + 1]
+        self._times[place : place + same] = [transform.at]
+        self._transforms[place : place + same] = [transform]
+        del self._times[: -self._size], self._transforms[: -self._size]
+
+    def at(self, moment: datetime) -> Transform:
+        """Return the pose at a moment, interpolated between those before and after.
+
+        Raises:
+            CalibrationError: ``BAD_TIME``: before the first or after the last known moment (nothing
+                is extrapolated), or in a gap longer than ``max_gap``.
+        """
+        place = bisect.bisect_left(self._times, moment)
+        if moment in self._times[place : place + 1]:
+            return self._transforms[place]
+        if place in (0, len(self._times)):
+            known = (
+                f"from {self._times[0]} to {self._times[-1]}" if self._times else "that is known"
+            )
+            raise CalibrationError(
+                f"pose history: expected a time {known}, got {moment}: nothing is extrapolated",
+                code=Code.BAD_TIME,
+                expected=known,
+                got=moment,
+            )
+        before, after = self._transforms[place - 1 : place + 1]
+        gap = self._times[place] - self._times[place - 1]
+        if gap > self._max_gap:
+            raise CalibrationError(
+                f"{before.label}: expected two poses at most {self._max_gap.total_seconds():g} s "
+                f"apart around {moment}, got {gap.total_seconds():g} s",
+                code=Code.BAD_TIME,
+                expected=self._max_gap,
+                got=gap,
+            )
+        return before.between(after, moment)

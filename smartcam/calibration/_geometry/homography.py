@@ -1,0 +1,87 @@
+"""A plane as a camera without distortion sees it: ``w (p, 1) = matrix (u, v, 1)``.
+
+The matrix is (3, 3) where points come out in a plane, and (4, 3) where they come out in space.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.calibration._geometry.rotations import Array
+
+
+def fit_homography(flat: Array, pixels: Array) -> Array | None:
+    """Return the (3, 3) matrix from points of a plane to pixels; None where nothing fits.
+
+    There are four points or more: ``flat`` (N, 2), metres, and ``pixels`` (N, 2).
+    """
+    # Each pair gives two linear equations of the nine elements, u (h3 x) = h1 x and
+    # v (h3 x) = h2 x; their least singular vector, of normalised points, begins a refinement of
+    # the pixels' squares.
+    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, sections 4.1 and 4.4.4.
+    cv2 = load("cv2")
+    found = cv2.findHomography(flat, pixels)[0]
+    return None if found is None else np.array(found, dtype=np.float64)
+
+
+def apply_homography(matrix: Array, points: Array) -> Array:
+    """Map points (N, 2) to (N, 2) or (N, 3)."""
+    mapped = points @ matrix[:, :2].T + matrix[:, 2]
+    places: Array = mapped[:, :-1] / mapped[:, -1:]
+    return places
+
+
+def derivatives(matrix: Array, points: Array) -> Array:
+    """Return the derivatives of mapped points by u and v, (N, 2, 2) or (N, 3, 2).
+
+    With ``p = q / w`` it is ``dp = (dq - p dw) / w``.
+    """
+    places = apply_homography(matrix, points)
+    depth = points @ matrix[-1, :2] + matrix[-1, 2]
+    slopes: Array = (matrix[:-1, :2] - places[:, :, None] * matrix[-1, :2]) / depth[:, None, None]
+    return slopes
+
+
+def element_derivatives(matrix: Array, points: Array) -> Array:
+    """Return the derivatives of mapped points by the matrix' elements, (N, 2, 9) or (N, 3, 12).
+
+    The same ``dp = (dq - p dw) / w``, where an element of ``q`` or ``w`` moves with its row of the
+    matrix by ``(u, v, 1)``.
+    """
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    scaled = homogeneous / (homogeneous @ matrix[-1])[:, None]
+    size = len(matrix) - 1
+    result = np.zeros((len(points), size, size + 1, 3))
+    for axis in range(size):
+        result[:, axis, axis] = scaled
+    result[:, :, size] = -apply_homography(matrix, points)[:, :, None] * scaled[:, None, :]
+    return result.reshape(len(points), size, 3 * (size + 1))
+
+
+def tangent_frames(slopes: Array, ahead: Array) -> Array:
+    """Return rotations (N, 3, 3) whose z is a plane's normal, and x a direction of the camera's.
+
+    ``slopes`` (N, 3, 2): the derivatives where they stand, or multiples of them. ``ahead`` (N, 2):
+    the directions in the camera's coordinates.
+    """
+    first = np.einsum("nij,nj->ni", slopes, ahead)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    normals = np.cross(slopes[:, :, 0], slopes[:, :, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first), normals], axis=-1)
+
+
+def local_steps(seen: Callable[[Array], Array], points: Array, step: float) -> Array:
+    """Return the image vectors of ``step`` along x and along y, (N, 2, 2), pixels.
+
+    ``seen`` gives where points (N, 2) of the plane are seen; ``step`` is in the plane's unit.
+    """
+    ways = [(seen(points + way) - seen(points - way)) / 2 for way in step * np.eye(2)]
+    return np.stack(ways, axis=1)

@@ -1,0 +1,483 @@
+"""Solvers: the parts that a way from the camera's coordinates to the robot's is made of.
+
+Each does one part of the transformation and knows nothing of the others; a :class:`Chain` applies
+them in order. All of them take and give :class:`Poses`: arrays of points and orientations. What the
+camera says is a pose on its own plane: ``z`` is 0 and the orientation a turn about ``z``.
+
+The thesis' two solvers are :class:`CameraPosition2D` and :class:`RealWorldPosition`. Where their
+description differs from what stands here, what stands here is right: the origin is subtracted
+before turning, the part's own angle loses the origin's, and the plane has a direction in itself
+beside its normal.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol, overload, runtime_checkable
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.homography import apply_homography, derivatives, tangent_frames
+from smartcam.calibration._geometry.rotations import (
+    as_points,
+    as_vector,
+    check_finite,
+    frame_from_axes,
+    matrix_from_quaternion,
+    quaternion_about_z,
+    quaternion_from_matrix,
+    quaternion_multiply,
+    rotate,
+)
+from smartcam.calibration._plane.validation import check_positive
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Localization, Pose, Position, Quaternion
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+
+
+class Poses(NamedTuple):
+    """Positions and orientations of many things.
+
+    Attributes:
+        points: (N, 3) float64.
+        quaternions: (N, 4) float64, ``x, y, z, w``, of unit length.
+    """
+
+    points: Array
+    quaternions: Array
+
+    @classmethod
+    def planar(cls, points: ArrayLike, thetas: ArrayLike | None = None) -> Poses:
+        """Return poses on a plane.
+
+        Args:
+            points: (N, 2), in any unit.
+            thetas: (N,), radians, counter-clockwise; None is 0 for each.
+
+        Raises:
+            CalibrationError: ``SHAPE``.
+        """
+        flat = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        angles = np.zeros(len(flat)) if thetas is None else np.asarray(thetas, dtype=np.float64)
+        if flat.shape != (len(angles), 2):
+            raise CalibrationError(
+                f"poses on a plane: expected points of shape ({len(angles)}, 2), got {flat.shape}",
+                code=Code.SHAPE,
+                expected=(len(angles), 2),
+                got=flat.shape,
+            )
+        return cls(np.column_stack([flat, np.zeros(len(flat))]), quaternion_about_z(angles))
+
+    @classmethod
+    def of(cls, localizations: Iterable[Localization]) -> Poses:
+        """Return the poses of what a camera found."""
+        poses = [part.pose for part in localizations]
+        points = np.array([pose.position for pose in poses], dtype=np.float64)
+        quaternions = np.array([pose.orientation for pose in poses], dtype=np.float64)
+        return cls(points.reshape(-1, 3), quaternions.reshape(-1, 4))
+
+    def moved(self, rotation: Array, translation: Array) -> Poses:
+        """Return all of them after one rigid motion, given in the frame that they are in.
+
+        Args:
+            rotation: (3, 3).
+            translation: (3,).
+        """
+        turned = quaternion_multiply(quaternion_from_matrix(rotation), self.quaternions)
+        return Poses(self.points @ rotation.T + translation, turned)
+
+    def put(self, localizations: Iterable[Localization]) -> list[Localization]:
+        """Return as many localizations with these poses, and the headers that they had."""
+        rows = zip(localizations, self.points.tolist(), self.quaternions.tolist(), strict=True)
+        return [
+            part._replace(pose=Pose(part.pose.header, Position(*at), Quaternion(*turn)))
+            for part, at, turn in rows
+        ]
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """One part of a coordinate transformation."""
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the poses behind this part; those that came are left as they are."""
+        ...
+
+
+class CameraPosition2D:
+    """From the camera's coordinates to those of the origin mark on its plane.
+
+    ``p' = scale R(-theta) (p - origin)``, and each orientation loses ``theta``. A height above the
+    camera's plane stays one.
+
+    Args:
+        origin: (2,), the origin mark as the camera sees it, in the camera's unit.
+        theta: its angle there, radians, counter-clockwise with y up.
+        scale: metres in one of the camera's units; 1 where the camera gives metres.
+
+    Raises:
+        CalibrationError: ``SHAPE``, or ``NOT_FINITE``: a scale that is not positive, too.
+
+    Source: the thesis' ``solver_camera_2D_position``, 3.2.5.1; that the origin is subtracted, and
+    first, is derived: the origin itself must come to zero.
+    """
+
+    def __init__(self, origin: ArrayLike, theta: float = 0.0, scale: float = 1.0) -> None:
+        check_positive(scale, "scale", "metres in one of the camera's units")
+        self.origin: Array = as_vector(origin, 2, "origin mark").copy()
+        self.theta: float = float(as_vector([theta], 1, "theta of the origin mark")[0])
+        self.scale: float = float(scale)
+        cos, sin = np.cos(self.theta), np.sin(self.theta)
+        self._back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the poses as the origin mark sees them, metres."""
+        # the origin first: turned first, it would not come to zero
+        centred = poses.points - np.array([*self.origin, 0.0])
+        return Poses(self.scale * centred, poses.quaternions).moved(self._back, np.zeros(3))
+
+
+class RealWorldPosition:
+    """From the plane of the origin mark into the robot's space: ``p' = rotation p + origin``.
+
+    Args:
+        origin: (3,), where the robot touched the origin mark, metres.
+        rotation: (3, 3), whose columns are the plane's x, y and normal in the robot's frame.
+
+    Raises:
+        CalibrationError: ``NOT_RIGID``: no rotation.
+
+    Source: the thesis' ``solver_real_world_position``, 3.2.5.1. Point, normal and scale leave the
+    turn about the normal open; so the whole rotation stands here (derived).
+    """
+
+    def __init__(self, origin: ArrayLike, rotation: ArrayLike) -> None:
+        transform = Transform(
+            "robot",
+            "plane",
+            np.asarray(rotation, dtype=np.float64),
+            np.asarray(origin, dtype=np.float64),
+        )
+        self.origin: Array = transform.translation
+        self.rotation: Array = transform.rotation
+
+    @classmethod
+    def from_touches(cls, origin: ArrayLike, on_a: ArrayLike, on_b: ArrayLike) -> RealWorldPosition:
+        """Return the plane of three touches: x is along ray A, the normal along A cross B.
+
+        Args:
+            origin: (3,), the origin mark, metres.
+            on_a: (3,), anywhere on ray A.
+            on_b: (3,), on ray B, or anywhere on its side of ray A.
+
+        Raises:
+            CalibrationError: ``COINCIDENT``; ``COLLINEAR``: the rays are less than 10 degrees
+                apart.
+        """
+        o, a, b = (np.asarray(point, dtype=np.float64) for point in (origin, on_a, on_b))
+        return cls(o, frame_from_axes(a - o, b - o))
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the poses in the robot's frame."""
+        return poses.moved(self.rotation, self.origin)
+
+
+class PlaneProjection:
+    """From the plane of a camera that is tilted, or whose axes have scales of their own.
+
+    ``w (x, y, z, 1) = matrix (u, v, 1)``. An orientation follows its x axis as it is mapped at that
+    place, and stands on the plane.
+
+    Args:
+        matrix: (4, 3), metres; ``w`` is positive in the camera's field.
+
+    Raises:
+        CalibrationError: ``SHAPE`` or ``NOT_FINITE``; in :meth:`solve`: ``OUT_OF_FIELD``: a point
+            behind the plane's horizon; ``OUT_OF_PLANE``: a pose that is not in the camera's plane.
+    """
+
+    def __init__(self, matrix: ArrayLike) -> None:
+        rows = as_points(matrix, 3, "projection")
+        if len(rows) != 4:
+            raise CalibrationError(
+                f"projection: expected shape (4, 3), got {rows.shape}",
+                code=Code.SHAPE,
+                expected=(4, 3),
+                got=rows.shape,
+            )
+        self.matrix: Array = rows.copy()
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the poses in the robot's frame."""
+        points, (x, y, z, w) = poses.points, poses.quaternions.T
+        if points[:, 2].any() or x.any() or y.any():
+            raise CalibrationError(
+                "projection: expected poses in the camera's plane, turned about its z, got some "
+                "with a height or a tilt",
+                code=Code.OUT_OF_PLANE,
+            )
+        seen = points[:, :2]
+        depth = seen @ self.matrix[3, :2] + self.matrix[3, 2]
+        if not np.all(depth > 0):
+            hidden = seen[int(np.argmin(depth))].tolist()
+            raise CalibrationError(
+                f"projection: expected points that the camera can see, got {hidden}: behind the "
+                "plane's horizon",
+                code=Code.OUT_OF_FIELD,
+                got=hidden,
+            )
+        # The x axis (cos, sin) = (w^2 - z^2, 2 z w) goes where the map's derivative takes it; the
+        # plane is spanned by the derivative's columns.
+        ahead = np.column_stack([w * w - z * z, 2.0 * z * w])
+        axes = tangent_frames(derivatives(self.matrix, seen), ahead)
+        return Poses(apply_homography(self.matrix, seen), quaternion_from_matrix(axes))
+
+
+class Height:
+    """Parts that stand out of the plane: from where the camera sees them to where they are.
+
+    A point at ``height`` above the plane is seen where the ray through it meets the plane, farther
+    from the point below the camera than it is. Without ``viewpoint`` the rays are taken as parallel
+    to the normal, as with a telecentric lens: then only the height is added.
+
+    Args:
+        height: metres above the plane, in the direction of ``normal``; negative is below.
+        normal: (3,), the plane's, of any length.
+        viewpoint: (3,), where the rays meet: the camera's centre of projection, metres. In the same
+            frame as the poses that come, as ``normal`` is.
+
+    Raises:
+        CalibrationError: ``SHAPE`` or ``NOT_FINITE``; ``SHORT_LEVER``: a normal without a length;
+            in :meth:`solve`, a viewpoint that is not above the points by more than the height.
+    """
+
+    def __init__(
+        self,
+        height: float,
+        normal: ArrayLike = (0.0, 0.0, 1.0),
+        viewpoint: ArrayLike | None = None,
+    ) -> None:
+        direction = as_vector(normal, 3, "normal")
+        length = float(np.linalg.norm(direction))
+        if not length > 0:
+            raise CalibrationError(
+                f"height: expected a normal, got {direction.tolist()}",
+                code=Code.SHORT_LEVER,
+                expected="a length above 0",
+                got=length,
+            )
+        self.height: float = float(as_vector([height], 1, "height")[0])
+        self.normal: Array = direction / length
+        self.viewpoint: Array | None = (
+            None if viewpoint is None else as_vector(viewpoint, 3, "viewpoint").copy()
+        )
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the poses at the height of what was seen."""
+        points = poses.points
+        if self.viewpoint is None:
+            return Poses(points + self.height * self.normal, poses.quaternions)
+        # On the ray p + s (v - p) the height over the plane is s n (v - p); it is h for
+        # s = h / n (v - p).
+        rays = self.viewpoint - points
+        above = rays @ self.normal
+        if not np.all(above > max(self.height, 0.0)):
+            raise CalibrationError(
+                f"height: expected the viewpoint more than {max(self.height, 0.0):g} m above each "
+                f"point, got {float(above.min()):g} m",
+                code=Code.SHORT_LEVER,
+                expected=self.height,
+                got=float(above.min()),
+            )
+        return Poses(points + rays * (self.height / above)[:, None], poses.quaternions)
+
+
+class ToolOffset:
+    """From the pose of a part to one that is fixed to it: where a tool is to go.
+
+    ``T_robot_tool = T_robot_part @ T_part_tool``. With the inverse of a tool's tip on the flange it
+    gives the flange's pose that puts the tip onto the part.
+
+    Args:
+        translation: (3,), metres, in the part's frame.
+        quaternion: (4,), the tool's orientation in the part's frame, ``x, y, z, w``.
+
+    Raises:
+        CalibrationError: ``NOT_RIGID``: no quaternion.
+    """
+
+    def __init__(
+        self,
+        translation: ArrayLike = (0.0, 0.0, 0.0),
+        quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+    ) -> None:
+        offset = Transform.from_quaternion("part", "tool", translation, quaternion)
+        self.translation: Array = offset.translation
+        self.quaternion: Array = offset.quaternion
+
+    @classmethod
+    def facing(cls) -> ToolOffset:
+        """Return the half turn about x: a tool whose z points into the plane, as grippers' do."""
+        return cls(quaternion=(1.0, 0.0, 0.0, 0.0))
+
+    @classmethod
+    def flange(cls, tip: ArrayLike, quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> ToolOffset:
+        """Return the transform from the tip's pose to the flange's.
+
+        Args:
+            tip: (3,), the tip in the flange's frame, metres.
+            quaternion: (4,), the tool's orientation in the flange's frame.
+
+        Raises:
+            CalibrationError: ``NOT_RIGID``.
+        """
+        # T_base_flange = T_base_tip T_flange_tip^-1
+        back = Transform.from_quaternion("flange", "tip", tip, quaternion).inverse()
+        return cls(back.translation, back.quaternion)
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the tool's poses, in the frame of the poses that came."""
+        return Poses(
+            poses.points + rotate(poses.quaternions, self.translation),
+            quaternion_multiply(poses.quaternions, self.quaternion),
+        )
+
+
+class Chain:
+    """Solvers, one behind the other; itself a solver, so chains can be parts of chains.
+
+    Args:
+        solvers: in the order in which they are applied.
+        frame: name of the frame that they lead to; it stands in the headers of :meth:`to_robot`.
+        camera_frame: name of the frame that localizations must come in; None for any.
+        y_down: whether the camera's y axis points down and is turned up before they come, as
+            :func:`smartcam.connect` does and compares; None: not known.
+    """
+
+    def __init__(
+        self,
+        solvers: Sequence[Solver],
+        *,
+        frame: str = "robot",
+        camera_frame: str | None = None,
+        y_down: bool | None = None,
+    ) -> None:
+        self.solvers: tuple[Solver, ...] = tuple(solvers)
+        self.frame: str = frame
+        self.camera_frame: str | None = camera_frame
+        self.y_down: bool | None = y_down
+
+    def then(self, *solvers: Solver) -> Chain:
+        """Return a chain with these behind its own."""
+        return Chain(
+            [*self.solvers, *solvers],
+            frame=self.frame,
+            camera_frame=self.camera_frame,
+            y_down=self.y_down,
+        )
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the poses behind the last solver.
+
+        Raises:
+            CalibrationError: ``NOT_FINITE``: they are no numbers; and what the solvers raise.
+        """
+        with np.errstate(all="ignore"):
+            for solver in self.solvers:
+                poses = solver.solve(poses)
+        check_finite(poses.points, "chain: positions")
+        check_finite(poses.quaternions, "chain: orientations")
+        return poses
+
+    def transform(self, points: ArrayLike) -> Array:
+        """Return points of the camera, (N, 2), in the robot's frame, (N, 3) in metres."""
+        return self.solve(Poses.planar(points)).points
+
+    @overload
+    def to_robot(self, localizations: Localization) -> Localization: ...
+    @overload
+    def to_robot(self, localizations: Iterable[Localization]) -> list[Localization]: ...
+    def to_robot(
+        self, localizations: Localization | Iterable[Localization]
+    ) -> Localization | list[Localization]:
+        """Return one or many localizations with their poses in the robot's frame.
+
+        Names, qualities, numbers and times are those of the localizations that came.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: one comes in another frame than ``camera_frame``; and
+                what the solvers raise.
+        """
+        if isinstance(localizations, Localization):
+            return self._found([localizations])[0]
+        return self._found(list(localizations))
+
+    def _found(self, parts: list[Localization]) -> list[Localization]:
+        check_frames(parts, self.camera_frame, "chain: ")
+        found = []
+        for part in self.solve(Poses.of(parts)).put(parts):
+            header = part.pose.header._replace(frame_id=self.frame)
+            found.append(part._replace(pose=part.pose._replace(header=header)))
+        return found
+
+
+def check_frames(localizations: Sequence[Localization], frame: str | None, what: str = "") -> None:
+    """Raise (WRONG_FRAME) where a localization comes in another frame than ``frame``; None: any.
+
+    ``what`` begins the text.
+    """
+    frames = {part.pose.header.frame_id for part in localizations}
+    if frame is not None and not frames <= {frame}:
+        got = ", ".join(sorted(frames - {frame}))
+        raise CalibrationError(
+            f"{what}expected poses in the frame {frame!r}, got some in {got!r}",
+            code=Code.WRONG_FRAME,
+            expected=frame,
+            got=got,
+        )
+
+
+def chain_of(
+    calibration: PlaneCalibration, *, origin: ArrayLike = (0.0, 0.0), theta: float = 0.0
+) -> Chain:
+    """Return the chain that does what a plane's calibration does.
+
+    Args:
+        calibration: from :func:`~smartcam.calibration.fit_plane`.
+        origin: (2,), the camera's point that becomes the plane's origin between the two solvers;
+            where it is changes nothing in the robot's frame, but solvers that are put in between
+            see their poses from there.
+        theta: the angle of the plane's x axis in the camera's coordinates, radians.
+
+    Returns:
+        The thesis' two solvers for ``rigid``, ``similarity`` and ``touches``; one
+        :class:`PlaneProjection` for ``affine`` and ``homography``, where ``origin`` and ``theta``
+        are ignored.
+
+    Raises:
+        CalibrationError: ``SHAPE`` or ``NOT_FINITE``: no such origin.
+    """
+    frame, camera_frame = calibration.robot_frame, calibration.camera_frame
+    y_down = calibration.y_down
+    if calibration.model in {"affine", "homography"}:
+        projection = PlaneProjection(calibration.matrix)
+        return Chain([projection], frame=frame, camera_frame=camera_frame, y_down=y_down)
+    sheet = as_vector(origin, 2, "origin")
+    turned = matrix_from_quaternion(quaternion_about_z(theta))
+    return Chain(
+        [
+            CameraPosition2D(sheet, theta, calibration.scale),
+            RealWorldPosition(calibration.transform([sheet])[0], calibration.rotation @ turned),
+        ],
+        frame=frame,
+        camera_frame=camera_frame,
+        y_down=y_down,
+    )

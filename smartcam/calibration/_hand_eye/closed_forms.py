@@ -1,0 +1,187 @@
+"""Where the solution begins: OpenCV's closed-form methods, and what no method can make up for."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.rigid import Rigid, log_rotation
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._hand_eye.equations import RobotPoses
+
+LEAST_POSES = 3
+"""Two motions about axes that differ determine the camera."""
+
+SAME_TURN = math.radians(0.5)
+"""Poses turned less against each other count as one."""
+
+LEAST_TURN = math.radians(2.0)
+"""Rms turn of the poses about the second of their axes; one axis alone determines nothing."""
+
+# A motion of the robot between two poses, A, and what the camera sees of it, B, are the same
+# motion: A X = X B, so R_A R_X = R_X R_B and (R_A - I) t_X = R_X t_B - t_A. Each pair of poses
+# gives one, two about different axes determine X. Tsai, Park and Horaud find the rotation first,
+# and then the translation, which is linear; the other two find both at once:
+# - tsai: with P = 2 sin(angle / 2) axis, [P_A + P_B]x P' = P_B - P_A is linear, and P' gives R_X.
+#   Tsai and Lenz, A New Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye
+#   Calibration (1989).
+# - park: log R_A = R_X log R_B, so R_X = (M^T M)^(-1/2) M^T with M = sum log(R_B) log(R_A)^T.
+#   Park and Martin, Robot Sensor Calibration: Solving AX = XB on the Euclidean Group (1994).
+# - horaud: of quaternions q_A q_X = q_X q_B, an eigenvector of a 4 x 4 matrix. Horaud and Dornaika,
+#   Hand-Eye Calibration (1995).
+# - andreff: (I - R_A (x) R_B) vec(R_X) = 0 with Kronecker's product, and t_X in the same equations.
+#   Andreff, Horaud and Espiau, On-line Hand-Eye Calibration (1999).
+# - daniilidis: of dual quaternions a q = q b, both parts at once; q is of the last two right
+#   singular vectors of a 6 N x 8 matrix. Daniilidis, Hand-Eye Calibration Using Dual Quaternions
+#   (1999).
+HAND_EYE = {
+    "tsai": "CALIB_HAND_EYE_TSAI",
+    "park": "CALIB_HAND_EYE_PARK",
+    "horaud": "CALIB_HAND_EYE_HORAUD",
+    "andreff": "CALIB_HAND_EYE_ANDREFF",
+    "daniilidis": "CALIB_HAND_EYE_DANIILIDIS",
+}
+
+# Without differences of poses: A X = Z B for each pose, with both X and Z unknown.
+# - shah: R_A R_X = R_Z R_B by Kronecker's product, from the largest singular vectors; then t_X and
+#   t_Z together. Shah, Solving the Robot-World/Hand-Eye Calibration Problem Using the Kronecker
+#   Product (2013).
+# - li: rotations and translations in one linear system by Kronecker's product. Li, Wang and Wu,
+#   Simultaneous robot-world and hand-eye calibration using dual-quaternions and Kronecker product
+#   (2010).
+ROBOT_WORLD = {
+    "shah": "CALIB_ROBOT_WORLD_HAND_EYE_SHAH",
+    "li": "CALIB_ROBOT_WORLD_HAND_EYE_LI",
+}
+
+
+def check_motion(robot: RobotPoses) -> None:
+    """Raise where the robot's poses do not determine where the camera is.
+
+    ``TOO_FEW``: fewer than three poses; ``POSES_TOO_SIMILAR``: fewer than three whose orientations
+    differ; ``INSUFFICIENT_ROTATION``: turned about one axis only.
+    """
+    turns = robot.poses.rotation
+    if len(turns) < LEAST_POSES:
+        raise CalibrationError(
+            f"hand-eye: expected at least {LEAST_POSES} poses with a view, got {len(turns)}",
+            code=Code.TOO_FEW,
+            expected=LEAST_POSES,
+            got=len(turns),
+        )
+    against = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
+    apart = np.linalg.norm(against, axis=-1) > SAME_TURN
+    distinct: list[int] = []
+    for index in range(len(turns)):
+        if apart[index, distinct].all():
+            distinct.append(index)
+    if len(distinct) < LEAST_POSES:
+        raise CalibrationError(
+            f"hand-eye: expected at least {LEAST_POSES} orientations of the robot that are "
+            f"{math.degrees(SAME_TURN):g} deg apart or more, got {len(distinct)}: pure shifts do "
+            "not tell where the camera is",
+            code=Code.POSES_TOO_SIMILAR,
+            expected=LEAST_POSES,
+            got=len(distinct),
+        )
+    second = second_turn(robot)
+    if not second > LEAST_TURN:
+        raise CalibrationError(
+            "hand-eye: expected turns about two axes or more, "
+            f"{math.degrees(LEAST_TURN):g} deg rms about the second one, got "
+            f"{math.degrees(second):.2g} deg: along a single axis the camera is not determined",
+            code=Code.INSUFFICIENT_ROTATION,
+            expected=LEAST_TURN,
+            got=second,
+        )
+
+
+def second_turn(robot: RobotPoses) -> float:
+    """Return the rms turn of the poses against each other about the second of their axes, rad."""
+    turns = robot.poses.rotation
+    first, later = np.triu_indices(len(turns), 1)
+    between = log_rotation(np.swapaxes(turns[first], 1, 2) @ turns[later])
+    # Rotation vectors of one axis are multiples of each other: the second singular value is 0. Over
+    # the root of their number it is an rms.
+    singular = np.asarray(np.linalg.svd(between, compute_uv=False), dtype=np.float64)
+    return float(singular[1] / math.sqrt(len(between)))
+
+
+def solve_linear(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid] | None:
+    """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`LINEAR`); None where it fails.
+
+    ``seen``: ``T_camera_target`` of each view.
+    """
+    try:
+        found = LINEAR[name](name, robot, seen)
+    except (load("cv2").error, np.linalg.LinAlgError):
+        return None
+    return found if _sound(found) else None
+
+
+def _hand_eye(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid]:
+    cv2, carrier = load("cv2"), robot.between.inverse()
+    # the fifth argument is an output: a method without its name would be ignored
+    found = cv2.calibrateHandEye(
+        *_lists(carrier), *_lists(seen), method=getattr(cv2, HAND_EYE[name])
+    )
+    camera = _rigid(*found)
+    return camera, mean_target(camera, robot, seen)
+
+
+def _robot_world(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid]:
+    cv2 = load("cv2")
+    found = cv2.calibrateRobotWorldHandEye(
+        *_lists(seen), *_lists(robot.between), method=getattr(cv2, ROBOT_WORLD[name])
+    )
+    return _rigid(*found[2:]).inverse(), _rigid(*found[:2]).inverse()
+
+
+def _rigid(turn: Any, shift: Any) -> Rigid:
+    motion = Rigid(np.asarray(turn, dtype=np.float64), np.ravel(shift).astype(np.float64))
+    if not np.isfinite(motion.rotation).all():
+        raise np.linalg.LinAlgError("no rotation")
+    return motion
+
+
+LINEAR: dict[str, Callable[[str, RobotPoses, Rigid], tuple[Rigid, Rigid]]] = {
+    **dict.fromkeys(HAND_EYE, _hand_eye),
+    **dict.fromkeys(ROBOT_WORLD, _robot_world),
+}
+"""OpenCV's methods by their authors."""
+
+
+def mean_target(camera: Rigid, robot: RobotPoses, seen: Rigid) -> Rigid:
+    """Return the mean of where each view alone puts the target, ``Z``."""
+    # S = X^-1 A Z, so each view alone says Z = A^-1 X S.
+    each = robot.between.inverse() @ (camera @ seen)
+    # The rotation nearest to the mean matrix, in the sum of squared elements: U diag(1, 1, +-1) V^T
+    # of U S V^T. SciPy's Rotation.mean is the same, but refuses reflections, which a closed form
+    # may give; they are sorted out later.
+    # Source: Hartley, Trumpf, Dai and Li, Rotation Averaging (2013), on the chordal L2 mean.
+    left, _, right = np.linalg.svd(each.rotation.mean(axis=0))
+    proper = np.diag([1.0, 1.0, float(np.linalg.det(left @ right))])
+    return Rigid(left @ proper @ right, each.translation.mean(axis=0))
+
+
+def _lists(motions: Rigid) -> tuple[list[Array], list[Array]]:
+    return list(np.ascontiguousarray(motions.rotation)), list(motions.translation)
+
+
+def _sound(found: tuple[Rigid, Rigid]) -> bool:
+    for motion in found:
+        if not all(np.isfinite(part).all() for part in motion):
+            return False
+        off = np.abs(motion.rotation @ motion.rotation.T - np.eye(3)).max()
+        if off > 1e-6 or np.linalg.det(motion.rotation) < 0:
+            return False
+    return True

@@ -1,0 +1,383 @@
+"""The equations of a camera and a robot: ``T_camera_target = X^-1 A Z``, and how they are solved.
+
+``X`` is where the camera is on what carries it, ``Z`` where the target is on what carries that, and
+``A`` is the robot between the two: ``T_flange_base`` for a camera on the hand, ``T_base_flange``
+for one that looks at the hand. A view's pose changes by a turn w and a shift d in the camera's
+frame, R becomes ``exp([w]x) R`` and t ``t + d``; all derivatives pass through them, so points in an
+image and poses that come without one are adjusted by the same steps.
+
+A robot that knows its poses with some noise gets a correction for each of them; they are eliminated
+from the normal equations, see :mod:`smartcam.calibration._least_squares`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self, TypeAlias
+
+import numpy as np
+
+from smartcam.calibration._geometry.rigid import Rigid, cross_matrix, right_jacobian
+from smartcam.calibration._least_squares import Normal, minimize
+from smartcam.calibration._lens.bundle import lens_values, with_lens
+from smartcam.calibration._lens.projection import linearize, pose_changes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel
+
+    Index = NDArray[np.intp] | slice
+
+Setup: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
+"""Where the camera is: on the robot's hand, or beside the robot, looking at it."""
+
+SMALLEST_GAIN = 1e-11
+"""Of a step, where the result is given out."""
+
+ROUGH_GAIN = 1e-7
+"""Of a step, where the result is compared: a hundredth of its standard deviation off."""
+
+FIRST_DAMPING = 1e-6
+"""Part of the diagonal: closed forms are near enough for steps that hardly need any."""
+
+ROUNDING = 100.0
+"""Squared standard deviations of a residual: beside the cost, what a gain is compared with."""
+
+
+class RobotSigmas(NamedTuple):
+    """How well a robot knows where it is: standard deviations of each axis.
+
+    Attributes:
+        rotation: radians.
+        translation: metres.
+    """
+
+    rotation: float
+    translation: float
+
+
+class RobotNoise(NamedTuple):
+    """Of robot and camera."""
+
+    robot: RobotSigmas  # standard deviations of its poses
+    # factor by which the views' poses are off more than their points tell: what the points of a
+    # view have in common, such as errors of the lens, does not average out
+    shared: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class RobotPoses:
+    """The robot's poses, and how they stand between camera and target."""
+
+    poses: Rigid  # V times ``T_base_flange``
+    in_hand: bool  # whether the camera is on the hand
+
+    @property
+    def between(self) -> Rigid:
+        """``A`` of each view: from what carries the target to what carries the camera."""
+        return self.poses.inverse() if self.in_hand else self.poses
+
+    def taken(self, index: Index) -> RobotPoses:
+        """Return some of the poses."""
+        return dataclasses.replace(self, poses=self.poses.taken(index))
+
+
+def carried(camera: Rigid, robot: RobotPoses, target: Rigid) -> Rigid:
+    """Return ``T_camera_target`` of each view."""
+    return camera.inverse() @ (robot.between @ target)
+
+
+def _chain(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Array]:
+    """Return the derivatives of the views' poses, (V, 6, 12) and (V, 6, 6).
+
+    The first with steps of camera and target, as :meth:`Rigid.turned_before` takes them, the second
+    with a step of the robot's pose.
+    """
+    # S = X^-1 A Z has R_S = R_X^T R_A R_Z and t_S = R_X^T (R_A t_Z + t_A - t_X). Each step (a, b)
+    # turns by R exp([a]x) and shifts by b; what it does to S is written exp([w]x) R_S, t_S + d.
+    # By R exp([a]x) = exp([R a]x) R, to first order:
+    #     X: R_X^T becomes exp(-[a]x) R_X^T:  w = -a,            d = t_S x a - R_X^T b
+    #     Z:                                  w = R_S a,         d = R_X^T R_A b
+    #     robot beside the camera, A = T:     w = R_X^T R_T a,   d = w x arm + R_X^T b,
+    #         arm = R_X^T R_T t_Z = t_S + R_X^T (t_X - t_T)
+    #     camera on the hand, A = T^-1:       w = -R_X^T a,      d = w x arm - R_X^T R_T^T b,
+    #         arm = R_X^T R_T^T (t_Z - t_T) = t_S + R_X^T t_X
+    # Source of the conventions: Sola, Deray and Atchuthan, A micro Lie theory (arXiv 1812.01537).
+    seen = carried(camera, robot, target)
+    back = camera.rotation.T
+    count, turn = seen.size, robot.poses.rotation
+    outer = np.zeros((count, 6, 12))
+    outer[:, :3, 0:3] = -np.eye(3)
+    outer[:, 3:, 0:3] = cross_matrix(seen.translation)
+    outer[:, 3:, 3:6] = -back
+    outer[:, :3, 6:9] = seen.rotation
+    outer[:, 3:, 9:12] = back @ robot.between.rotation
+    inner = np.zeros((count, 6, 6))
+    if robot.in_hand:
+        arm = seen.translation + camera.translation @ camera.rotation
+        inner[:, :3, :3] = -back
+        inner[:, 3:, :3] = cross_matrix(arm) @ back
+        inner[:, 3:, 3:] = -back @ np.swapaxes(turn, 1, 2)
+    else:
+        arm = seen.translation + (camera.translation - robot.poses.translation) @ camera.rotation
+        inner[:, :3, :3] = back @ turn
+        inner[:, 3:, :3] = -cross_matrix(arm) @ back @ turn
+        inner[:, 3:, 3:] = back
+    return outer, inner
+
+
+@dataclass(frozen=True, slots=True)
+class Observations(ABC):
+    """What the camera saw, view by view."""
+
+    whitening: Array  # what makes its errors independent with a variance of 1
+    # numbers of the parameters that are adjusted beside the poses, ascending: 0 is the target's
+    # scale, 1 to 4 are fx, fy, cx, cy, from 5 on the distortion
+    free: tuple[int, ...] = field(default=(), kw_only=True)
+
+    @property
+    def extra(self) -> int:
+        """How many parameters are adjusted beside the poses."""
+        return len(self.free)
+
+    def spread(self, factor: float) -> Self:
+        """Return them with all standard deviations larger by a factor."""
+        return dataclasses.replace(self, whitening=self.whitening / factor)
+
+    def scale(self, change: Array) -> float:
+        """Return the target's size over the nominal one, of a change (extra,)."""
+        return 1.0 + float(change[0]) if 0 in self.free else 1.0
+
+    @abstractmethod
+    def taken(self, index: Index) -> Self:
+        """Return some of the views."""
+
+    @abstractmethod
+    def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
+        """Return whitened residuals (V, M) and their derivatives (V, M, 6 + extra).
+
+        ``seen``: ``T_camera_target`` of each view. ``change`` (extra,): of the parameters beside
+        the poses.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class PixelObservations(Observations):
+    """Points in images; views with fewer than others are filled up with points of no weight.
+
+    Attributes:
+        whitening: (V, N, 2, 2), of each point.
+        model: the camera.
+        points: (V, N, 3), on the target, metres.
+        pixels: (V, N, 2).
+    """
+
+    model: CameraModel
+    points: Array
+    pixels: Array
+
+    def taken(self, index: Index) -> PixelObservations:
+        """Return some of the views."""
+        return dataclasses.replace(
+            self,
+            points=self.points[index],
+            pixels=self.pixels[index],
+            whitening=self.whitening[index],
+        )
+
+    def camera(self, change: Array) -> CameraModel:
+        """Return the camera with some of its parameters changed, (extra,)."""
+        if not any(self.free):
+            return self.model
+        return with_lens(self.model, lens_values(self.model) + self._full(change)[1:])
+
+    def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
+        """Return whitened residuals (V, 2 N) and their derivatives (V, 2 N, 6 + extra).
+
+        They are NaN for a change to no target or no lens: of a size or focal length below 0.
+        """
+        views, count = self.pixels.shape[:2]
+        full = self._full(change)
+        if min(1.0 + full[0], *(np.diag(self.model.matrix)[:2] + full[1:3])) <= 0:
+            nothing = np.full((views, 2 * count), np.nan)
+            return nothing, np.full((*nothing.shape, 6 + self.extra), np.nan)
+        # A point of a target of size s is at p = s R m + t: dp/ds = R m. Poses move p as
+        # pose_changes has it, lenses move the pixel as the projection says.
+        nominal = self.points @ np.swapaxes(seen.rotation, 1, 2)
+        near = self.scale(change) * nominal
+        there = linearize((near + seen.translation[:, None]).reshape(-1, 3), self.camera(change))
+        moved = pose_changes(there.by_point, near.reshape(-1, 3))
+        grown = there.by_point @ nominal.reshape(-1, 3, 1)
+        beside = np.concatenate([grown, there.by_lens], axis=2)[:, :, list(self.free)]
+        slopes = np.concatenate([moved, beside], axis=2).reshape(views, count, 2, -1)
+        off = (there.pixels.reshape(views, count, 2) - self.pixels)[..., None]
+        off, slopes = self.whitening @ off, self.whitening @ slopes
+        return off.reshape(views, -1), slopes.reshape(views, 2 * count, -1)
+
+    def _full(self, change: Array) -> Array:
+        full = np.zeros(5 + len(self.model.distortion))
+        full[list(self.free)] = change
+        return full
+
+
+@dataclass(frozen=True, slots=True)
+class PoseObservations(Observations):
+    """Poses of the target that come without an image.
+
+    Where the target's scale is adjusted, all distances from the camera are in its proportion.
+
+    Attributes:
+        whitening: (V, 6, 6), of errors ``(w, d)``.
+        poses: V times ``T_camera_target``.
+    """
+
+    poses: Rigid
+
+    def taken(self, index: Index) -> PoseObservations:
+        """Return some of the views."""
+        return dataclasses.replace(
+            self, poses=self.poses.taken(index), whitening=self.whitening[index]
+        )
+
+    def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
+        """Return whitened residuals (V, 6) and their derivatives (V, 6, 6 + extra)."""
+        # The turn e = log(R_S R_m^T) becomes log(exp([w]x) exp([e]x)), to first order e +
+        # J_l(e)^-1 w, and the left Jacobian is J_l(e) = J_r(-e).
+        # Source: Sola, Deray and Atchuthan, A micro Lie theory (arXiv 1812.01537), appendix B.
+        off = self.poses.scaled(self.scale(change)).after(seen)
+        slopes = np.zeros((len(off), 6, 6 + self.extra))
+        slopes[:, :3, :3] = np.linalg.inv(right_jacobian(-off[:, :3]))
+        slopes[:, 3:, 3:6] = np.eye(3)
+        slopes[:, 3:, 6:] = -self.poses.translation[..., None][..., : self.extra]
+        whitened = (self.whitening @ off[..., None])[..., 0]
+        return whitened, self.whitening @ slopes
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Where camera and target are."""
+
+    camera: Rigid  # ``X``
+    target: Rigid  # ``Z``
+    # (extra,), of the parameters beside the poses
+    change: Array = field(default_factory=lambda: np.zeros(0))
+    # (V, 6), of the robot's poses; empty where it was not adjusted
+    corrections: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    # weighted sum of squares, of residuals and corrections; infinite before an adjustment, and
+    # where points lie behind the camera
+    cost: float = math.inf
+    # (12 + extra, 12 + extra), of ``X``, ``Z`` and the others; what the robot's corrections leave
+    # of it. None of closed forms.
+    information: Array | None = None
+    # with which it was found; None where the robot's poses were taken as they are
+    noise: RobotNoise | None = None
+
+
+def _corrected(robot: RobotPoses, corrections: Array) -> RobotPoses:
+    return dataclasses.replace(robot, poses=robot.poses.turned_before(corrections))
+
+
+def sums(
+    robot: RobotPoses, seen: Observations, at: Solution, *, poses_only: bool = False
+) -> tuple[Array, float]:
+    """Return the products of an adjustment's derivatives and residuals, view by view.
+
+    (V, 6 + P + 1, 6 + P + 1): by the correction of the robot's pose, by ``X``, ``Z`` and the
+    parameters beside them (P), and the residuals as they were without the corrections; and the
+    squares of the residuals with them. The derivatives are taken at ``at``. ``poses_only`` leaves
+    out how well the points of a view fit each other, whatever its pose.
+    """
+    moved = _corrected(robot, at.corrections)
+    off, slopes = seen.evaluate(carried(at.camera, moved, at.target), at.change)
+    outer, inner = _chain(at.camera, moved, at.target)
+    # A correction v stands in R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x). With
+    # it the equations are linearised at v; the residuals of v = 0 are, to first order, r - J v.
+    inner[:, :, :3] = inner[:, :, :3] @ right_jacobian(at.corrections[:, :3])
+    own = slopes[:, :, :6] @ inner
+    before = off[..., None] - own @ at.corrections[..., None]
+    rows = np.concatenate([own, slopes[:, :, :6] @ outer, slopes[:, :, 6:], before], axis=2)
+    # Of residuals r = J w + e only the part in the columns of J tells of the pose: Q^T r, J = Q R.
+    if poses_only:
+        rows = np.swapaxes(np.linalg.qr(slopes[:, :, :6])[0], 1, 2) @ rows
+    return np.swapaxes(rows, 1, 2) @ rows, float((off**2).sum())
+
+
+def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> Normal:
+    """Return the equations of a step: shared are ``X``, ``Z`` and what is beside them."""
+    with np.errstate(all="ignore"):
+        total, squares = sums(robot, seen, at)
+    cost = squares if math.isfinite(squares) else math.inf
+    own, rest = slice(0, 6 if at.noise else 0), slice(6, -1)
+    right = -total[:, :, -1] - (total[:, :, :6] @ at.corrections[..., None])[..., 0]
+    normal = Normal(
+        cost,
+        total[:, rest, rest].sum(axis=0),
+        right[:, rest].sum(axis=0),
+        total[:, own, own],
+        right[:, own],
+        total[:, own, rest],
+    )
+    if at.noise is None:
+        return normal
+    # A correction is a residual, too, measured as 0 with the robot's variance: the mean and the
+    # covariance of what its controller says.
+    weights = 1.0 / np.repeat(at.noise.robot, 3) ** 2
+    return normal._replace(
+        cost=cost + float((weights * at.corrections**2).sum()),
+        own=normal.own + np.diag(weights),
+        own_right=normal.own_right - weights * at.corrections,
+    )
+
+
+def adjust(
+    robot: RobotPoses,
+    seen: Observations,
+    start: Solution,
+    noise: RobotNoise | None = None,
+    *,
+    gain: float = SMALLEST_GAIN,
+) -> Solution:
+    """Minimise the weighted squares by Levenberg and Marquardt's steps.
+
+    Its ``cost`` is infinite where the target begins behind the camera. ``noise``: None: the robot's
+    poses are exact. ``gain``: part of the cost that a step must gain, and beside it 100 times as
+    much of a residual's variance: exact samples leave nothing but rounding to gain.
+    """
+    spread = seen if noise is None else seen.spread(noise.shared)
+    change = start.change if start.change.size else np.zeros(seen.extra)
+    none = np.zeros((robot.poses.size, 6))
+    at, normal = minimize(
+        Solution(start.camera, start.target, change, none, noise=noise),
+        lambda at: _normal(robot, spread, at),
+        _stepped,
+        gain=gain,
+        noise=ROUNDING,
+        damping=FIRST_DAMPING,
+    )
+    if not math.isfinite(normal.cost):
+        return at
+    return dataclasses.replace(at, cost=normal.cost, information=normal.reduced()[0])
+
+
+def _stepped(at: Solution, step: Array, corrections: Array) -> Solution:
+    return dataclasses.replace(
+        at,
+        camera=at.camera.turned_before(step[:6]),
+        target=at.target.turned_before(step[6:12]),
+        change=at.change + step[12:],
+        corrections=at.corrections + corrections if corrections.size else at.corrections,
+    )
+
+
+def information(robot: RobotPoses, seen: Observations, truth: Solution) -> Array:
+    """Return Fisher's information of ``X`` and ``Z`` at a truth, (12 + extra, 12 + extra).
+
+    ``robot`` and ``seen`` are without noise; ``truth`` has the noise of the robot.
+    """
+    none = np.zeros((robot.poses.size, 6))
+    return _normal(robot, seen, dataclasses.replace(truth, corrections=none)).reduced()[0]

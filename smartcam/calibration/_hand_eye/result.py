@@ -1,0 +1,341 @@
+"""What a hand-eye calibration found, and what it is for: from pixels to the robot's base."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._files import storage
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rotations import Array, as_points, check_finite
+from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
+from smartcam.calibration._hand_eye.model_selection import on_plane, point_errors
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.poses import CAMERA, TARGET, PoseInCamera, check_view
+from smartcam.calibration._targets import resized
+from smartcam.calibration._views import TargetView
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._targets import Target
+
+KIND = "hand-eye"
+"""What the files are called in the store."""
+
+
+def _frames(context: storage.Context, of: str) -> tuple[str, str]:
+    """Return target and source of the pose of the flange, the camera or the target."""
+    base, flange = context.get("frames", ("", ""))
+    on_flange = (of == CAMERA) == (context.get("setup") == "eye-in-hand")
+    return (base, flange) if of == "flange" else (flange if on_flange else base, of)
+
+
+FlangePose = Annotated[Transform, storage.motion(lambda known: _frames(known, "flange"))]
+CameraPlace = Annotated[Transform, storage.motion(lambda known: _frames(known, CAMERA))]
+TargetPlace = Annotated[Transform, storage.motion(lambda known: _frames(known, TARGET))]
+OpenNumbers = Annotated[Array, storage.rows(storage.Number | None, least=3, nulls=True)]
+FRAMES = Annotated[tuple[str, str], storage.row(tuple[str, str])]
+SIGMAS = storage.row(tuple[storage.Number, storage.Number], RobotSigmas._make)
+COVARIANCE = storage.Form(
+    list[list[storage.Number]] | None,
+    lambda rows, _: np.full((12, 12), np.nan) if rows is None else storage.as_array(rows),
+    lambda rows: rows.tolist() if np.isfinite(rows).all() else None,
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandEyeCalibration(storage.SavedCalibration):
+    """What :func:`~smartcam.calibration.calibrate_hand_eye` finds; immutable.
+
+    Attributes:
+        setup: ``eye-in-hand`` or ``eye-to-hand``.
+        camera_pose: ``T_flange_camera``; ``T_base_camera`` for a camera beside the robot.
+        target_pose: ``T_base_target``; ``T_flange_target`` there: that of the target as large as
+            ``target_scale`` says, see :attr:`target`.
+        camera: the camera; None where poses of the target were given instead of views.
+        target_scale: size of the target over the nominal one, as the robot's motions tell it; 1
+            where it was not adjusted. ``camera_pose``, ``target_pose`` and all errors are those of
+            the target of this size; a remark ``SCALE_MISMATCH`` says that it is more than half a
+            percent off the nominal one. Where a ruler says that the target has its nominal size, it
+            is the robot's or the lens' lengths that are off by this factor.
+        method: what the candidate is called that was taken.
+        candidates: rms held-out error of each candidate on the target, metres; None where a
+            candidate has none.
+        errors: (V,), rms error of each pose on the target, metres, with all used poses taken in;
+            NaN for a bad pose in which the target would not be before the camera.
+        mean_error: mean over all points of the used poses, metres: what others publish as their 3D
+            error.
+        leave_one_out: (V,), the same of a calibration from the others, with the robot's pose as it
+            was given, metres; NaN where there is none.
+        held_out_error: rms of these over all points of the used poses, metres; None where there is
+            none. It is what picking has to expect.
+        covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
+            along those of its target, m) and of ``target_pose``, the lens taken as exact unless it
+            was adjusted; NaN where fewer than 5 poses told the robot's noise.
+        robot_sigmas: of each axis of the robot's poses, as given or estimated; None where they were
+            taken for exact.
+        robot_poses: ``T_base_flange``, as given.
+        used: whether each pose was used; False for a bad one.
+        views: as given; empty where poses were.
+        target_poses: ``T_camera_target`` of each pose, from its own view or as given.
+        warnings: what one should know before using it.
+    """
+
+    kind: ClassVar[str] = KIND
+    _called: ClassVar[str] = "hand-eye calibration"
+    _others: ClassVar[storage.Others] = {
+        "frames": (FRAMES, lambda one: (one.robot_poses[0].target, one.robot_poses[0].source)),
+        "target": (
+            storage.StoredTarget | None,
+            lambda one: one.views[0].target if one.views else None,
+        ),
+    }
+    _shared: ClassVar[frozenset[str]] = frozenset({"frames", "setup", "target"})
+
+    setup: Setup
+    camera_pose: CameraPlace
+    target_pose: TargetPlace
+    camera: CameraModel | None
+    target_scale: storage.Positive
+    method: str
+    candidates: dict[str, storage.Number | None]
+    errors: OpenNumbers
+    mean_error: storage.NonNegative
+    leave_one_out: OpenNumbers
+    held_out_error: storage.Number | None
+    covariance: Annotated[Array, COVARIANCE]
+    robot_sigmas: Annotated[RobotSigmas, SIGMAS] | None
+    robot_poses: Annotated[tuple[FlangePose, ...], storage.AsList(3)]
+    used: Annotated[tuple[bool, ...], storage.AsList(3)]
+    views: Annotated[tuple[TargetView, ...], storage.AsList()] = ()
+    target_poses: Annotated[tuple[PoseInCamera, ...], storage.AsList(3)] = ()
+    warnings: storage.Remarks = ()
+
+    def __post_init__(self) -> None:
+        for array in (self.errors, self.leave_one_out, self.covariance):
+            array.flags.writeable = False
+
+    def _check(self, found: Mapping[str, Any], called: str) -> None:
+        count = len(self.robot_poses)
+        names = ("errors", "leave_one_out", "used", "target_poses")
+        storage.check_counts(found, names, count, called)
+        if self.views and (found["target"] is None or len(self.views) != count):
+            raise storage.refused(
+                called, f"views: expected {count}, and their target", len(self.views)
+            )
+        if self.covariance.shape != (12, 12):
+            got = len(self.covariance)
+            raise storage.refused(called, "covariance: expected 12 rows of 12", got)
+
+    @property
+    def target(self) -> Target | None:
+        """The target as large as ``target_scale`` says; None where poses of it were given."""
+        return resized(self.views[0].target, self.target_scale) if self.views else None
+
+    @property
+    def rotation_error(self) -> float:
+        """Expected rms error of the camera's orientation, all axes together, radians, or NaN."""
+        return math.sqrt(float(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def translation_error(self) -> float:
+        """Expected rms error of the camera's position, all axes together, metres, or NaN."""
+        return math.sqrt(float(np.trace(self.covariance[3:6, 3:6])))
+
+    @property
+    def worst(self) -> int:
+        """Index of the pose with the largest held-out error, or error where there is none."""
+        errors = self.errors if np.isnan(self.leave_one_out).any() else self.leave_one_out
+        return int(np.argmax(errors))
+
+    def camera_at(self, robot_pose: Transform | Pose | None = None) -> Transform:
+        """Return ``T_base_camera``.
+
+        Args:
+            robot_pose: ``T_base_flange``; a camera beside the robot has no need of it.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: no pose, or one of other frames.
+        """
+        if self.setup == "eye-to-hand":
+            return self.camera_pose
+        if robot_pose is None:
+            raise CalibrationError(
+                "eye-in-hand: expected the robot's pose when the image was taken, got none",
+                code=Code.WRONG_FRAME,
+                expected="a pose of the robot",
+            )
+        return as_transform(robot_pose, self.camera_pose.target) @ self.camera_pose
+
+    def to_plane(
+        self,
+        pixels: ArrayLike,
+        *,
+        plane: Transform,
+        robot_pose: Transform | Pose | None = None,
+        height: float = 0.0,
+    ) -> Array:
+        """Map what a camera sees to a plane, wherever the robot is.
+
+        Args:
+            pixels: (N, 2).
+            plane: ``T_base_plane``; the plane is its z = 0. Such is ``target_pose`` of a camera on
+                the hand.
+            robot_pose: ``T_base_flange`` when the image was taken; none for a camera beside the
+                robot.
+            height: of the features over the plane, along its z, metres.
+
+        Returns:
+            (N, 3), in the robot's base, metres.
+
+        Raises:
+            CalibrationError: SHAPE or NOT_FINITE; WRONG_FRAME; OUT_OF_FIELD: a ray that does not
+                meet the plane before the camera; NO_CALIBRATION: without a camera's lens.
+        """
+        lens, seen = self._lens("to_plane"), as_points(pixels, 2, "pixels")
+        found = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
+        places = plane.apply(found)
+        check_finite(places, "to_plane: points")
+        return places
+
+    def point_errors(
+        self,
+        robot_poses: Sequence[Transform | Pose],
+        views: Sequence[TargetView | Transform],
+    ) -> tuple[Array, ...]:
+        """Return by how much the calibration is off on the target, at any poses of the robot.
+
+        Poses and views that it was not made from tell how good it is. The error of a point is the
+        distance, in the target's plane, from where the target should have it by the robot's pose to
+        where its ray passes.
+
+        Args:
+            robot_poses: ``T_base_flange``.
+            views: of the same target in the same place, as many; or ``T_camera_target``, of which
+                the error is that of the target's origin.
+
+        Returns:
+            Of each view (N,), of each pose of the target (1,), metres; infinite where a ray does
+            not meet the target's plane before the camera.
+
+        Raises:
+            CalibrationError: SHAPE: not as many; ``WRONG_FRAME``: poses of other frames;
+                ``DIFFERENT_TARGETS``; ``NO_CALIBRATION``: views, without a camera's lens; and what
+                :func:`~smartcam.calibration._lens.poses.check_view` says.
+        """
+        if len(robot_poses) != len(views):
+            raise CalibrationError(
+                f"point_errors: expected as many views as poses of the robot, got {len(views)} and "
+                f"{len(robot_poses)}",
+                code=Code.SHAPE,
+                expected=len(robot_poses),
+                got=len(views),
+            )
+        return tuple(
+            self._errors(as_transform(pose, self._flange).undated(), one)
+            for pose, one in zip(robot_poses, views, strict=True)
+        )
+
+    def _errors(self, robot_pose: Transform, view: TargetView | Transform) -> Array:
+        in_hand = self.setup == "eye-in-hand"
+        between = robot_pose.inverse() if in_hand else robot_pose
+        seen = self.camera_pose.inverse() @ between @ self.target_pose
+        if isinstance(view, Transform):
+            off = seen.translation - self.target_scale * view.translation
+            return np.array([float(np.linalg.norm(off))])
+        lens = self._lens("point_errors")
+        check_view(view, lens.size)
+        if self.views and view.target != self.views[0].target:
+            raise CalibrationError(
+                f"point_errors: expected views of {self.views[0].target}, got one of {view.target}",
+                code=Code.DIFFERENT_TARGETS,
+                expected=self.views[0].target,
+                got=view.target,
+            )
+        points = self.target_scale * view.object_points
+        return point_errors(lens, seen.rigid, view.points, points)
+
+    @property
+    def _flange(self) -> str:
+        return (self.camera_pose if self.setup == "eye-in-hand" else self.target_pose).target
+
+    def predicted_error(
+        self,
+        pixels: ArrayLike,
+        *,
+        plane: Transform,
+        robot_pose: Transform | Pose | None = None,
+    ) -> Array:
+        """Return the rms error to expect of :meth:`to_plane`, of what the camera's pose adds to it.
+
+        The robot's own error at ``robot_pose`` and that of the pixels come on top, and that of the
+        lens unless it was adjusted.
+
+        Args:
+            pixels: (N, 2).
+            plane: as for :meth:`to_plane`.
+            robot_pose: as for :meth:`to_plane`.
+
+        Returns:
+            (N,), metres; NaN where :attr:`covariance` is.
+
+        Raises:
+            CalibrationError: as :meth:`to_plane`.
+        """
+        lens, seen = self._lens("predicted_error"), as_points(pixels, 2, "pixels")
+        behind = self.camera_at(robot_pose) @ self.camera_pose.inverse()
+        # J by central differences of steps of the camera's pose; the covariance is J C J^T.
+        slopes, small = [], 1e-6
+        for axis in range(6):
+            ends = []
+            for sign in (-small, small):
+                moved = self.camera_pose.rigid.turned_before(sign * np.eye(6)[axis])
+                at = behind @ Transform(self.camera_pose.target, self.camera_pose.source, *moved)
+                ends.append(_met(lens, seen, at.inverse() @ plane, 0.0))
+            slopes.append((ends[1] - ends[0]) / (2 * small))
+        by_step = np.stack(slopes, axis=-1)
+        joint = by_step @ self.covariance[:6, :6] @ np.swapaxes(by_step, 1, 2)
+        error: Array = np.sqrt(np.trace(joint, axis1=1, axis2=2))
+        return error
+
+    def _lens(self, what: str) -> CameraModel:
+        if self.camera is None:
+            raise CalibrationError(
+                f"{what}: expected a calibration with the camera's lens, got one from poses of "
+                "the target",
+                code=Code.NO_CALIBRATION,
+                expected="camera",
+            )
+        return self.camera
+
+
+def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) -> Array:
+    """Return the crossings of pixels' rays with a plane of the camera's frame (OUT_OF_FIELD)."""
+    rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
+    raised = plane.rotation[:, 2] * height + plane.translation
+    found = on_plane(rays, plane.rotation, raised)
+    missed = ~np.isfinite(found).all(axis=1)
+    if missed.any():
+        row = int(np.argmax(missed))
+        raise CalibrationError(
+            "to_plane: expected pixels whose rays meet the plane before the camera, got "
+            f"{pixels[row].tolist()} in row {row}, whose ray does not",
+            code=Code.OUT_OF_FIELD,
+            got=pixels[row].tolist(),
+        )
+    above: Array = found + np.array([0.0, 0.0, height])
+    return above
+
+
+def as_transform(pose: Transform | Pose, flange: str) -> Transform:
+    """Return ``T_base_flange`` of a pose of the robot, whichever way it is given."""
+    return Transform.from_pose(pose, flange) if isinstance(pose, Pose) else pose

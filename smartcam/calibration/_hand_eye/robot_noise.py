@@ -1,0 +1,135 @@
+"""How well a robot knows its poses, told from what a camera on it sees.
+
+The sums of an adjustment are worked out once; for any two standard deviations of the robot they
+give the restricted likelihood of what was seen, in which neither the unknown poses of camera and
+target nor the corrections of the robot's poses are left. Its largest value is looked for.
+
+Source: Patterson and Thompson, Biometrika 58 (1971).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smartcam.calibration._hand_eye.equations import (
+    ROUGH_GAIN,
+    RobotNoise,
+    RobotSigmas,
+    adjust,
+    sums,
+)
+from smartcam.calibration._least_squares import solve_scaled
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._hand_eye.equations import Observations, RobotPoses, Solution
+
+FIRST = RobotSigmas(1e-3, 5e-4)
+"""With which the first adjustment is made: 0.06 degrees and half a millimetre."""
+
+LEAST = RobotSigmas(1e-7, 1e-8)
+"""What no robot is better than: a hundredth of a micrometre."""
+
+MOST = RobotSigmas(0.3, 0.1)
+"""What no robot is worse than."""
+
+FIRST_SHARED = 5.0
+"""With which the first adjustment is made where it is estimated."""
+
+MOST_SHARED = 300.0
+"""A view of 100 points at a tenth of a pixel would say nothing then."""
+
+COARSE = 5
+"""Values of each standard deviation that are tried at first."""
+
+ROUNDS = 4
+"""Of adjusting and estimating; the estimate hardly changes after two."""
+
+SETTLED = 0.02
+"""Part of the estimates by which a round must change them for another one."""
+
+
+def adjust_noisy(
+    robot: RobotPoses, seen: Observations, start: Solution, *, shared: bool = False
+) -> Solution:
+    """Return the adjustment with the noise that makes what was seen most likely.
+
+    ``seen`` is whitened. ``shared``: estimate the errors that the points of a view share, too.
+    """
+    noise = RobotNoise(FIRST, FIRST_SHARED if shared else 1.0)
+    found = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
+    settled = False
+    for _ in range(ROUNDS):
+        if settled or not math.isfinite(found.cost):
+            break
+        before, noise = noise, _estimate(robot, seen, found, noise, shared=shared)
+        settled = bool(np.abs(_logs(noise) - _logs(before)).max() < SETTLED)
+        found = adjust(robot, seen, found, noise, gain=ROUGH_GAIN)
+    return adjust(robot, seen, found, noise)
+
+
+def _logs(noise: RobotNoise) -> Array:
+    logs: Array = np.log([*noise.robot, noise.shared])
+    return logs
+
+
+def _estimate(
+    robot: RobotPoses, seen: Observations, at: Solution, noise: RobotNoise, *, shared: bool
+) -> RobotNoise:
+    """Return the standard deviations whose restricted likelihood is largest."""
+    total = sums(robot, seen, at, poses_only=shared)[0]
+    low, high = np.log([*LEAST, 1.0]), np.log([*MOST, MOST_SHARED])
+    if not shared:
+        low, high = low[:2], high[:2]
+
+    def cost(logs: Array) -> float:
+        inside = np.clip(logs, low, high)
+        beyond = float(((logs - inside) ** 2).sum())
+        return _unlikely(total, np.exp(inside)) + 1e3 * beyond
+
+    axes = [np.linspace(a, b, COARSE) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
+    start = min([_logs(noise)[: len(axes)], *grid], key=cost)
+    settings = {"xatol": 1e-3, "fatol": 1e-4, "maxiter": 300}
+    found = load("scipy.optimize").minimize(cost, start, method="Nelder-Mead", options=settings)
+    values = np.exp(np.clip(found.x, low, high)).tolist()
+    return RobotNoise(RobotSigmas(values[0], values[1]), values[2] if shared else 1.0)
+
+
+def _unlikely(total: Array, values: Array) -> float:
+    """Return -2 log of the restricted likelihood, without its constants.
+
+    ``total`` (V, 6 + P + 1, 6 + P + 1): products of the derivatives by the robot's correction, by
+    the P other unknowns, and of the residuals without corrections. ``values``: sigmas of rotation
+    and translation, (2,), or with the shared errors' factor (3,).
+    """
+    # Residuals r = J x + B c + e, with corrections c of covariance D = diag(sigma^2) and noise e of
+    # covariance I, have V = I + B D B^T. The restricted likelihood does not depend on x:
+    #     -2 log L = log|V| + log|J^T V^-1 J| + r^T V^-1 r - r^T V^-1 J (J^T V^-1 J)^-1 J^T V^-1 r.
+    # By Woodbury's identity V^-1 = I - B s (I + s B^T B s)^-1 s B^T with s = D^(1/2), and
+    # |V| = |I + s B^T B s|: so the products of B, J and r, view by view, are all that is needed,
+    # and V^-1 between J and r is Schur's complement of I + s B^T B s. Errors that a view's points
+    # share make the covariance of its six residuals f^2 times as large: 6 log f^2 for each view.
+    # Source: Patterson and Thompson, Recovery of inter-block information when block sizes are
+    # unequal (1971); Harville, Bayesian inference for variance components using only error
+    # contrasts (1974), for the form with determinants.
+    spread = np.repeat(values[:2], 3)
+    scaled = total.copy()
+    determinants = 0.0
+    if len(values) > 2:
+        scaled /= values[2] ** 2
+        determinants = 12.0 * len(total) * math.log(values[2])
+    # in units of its sigma a correction has a variance of 1
+    scaled[:, :6] *= spread[:, None]
+    scaled[:, :, :6] *= spread
+    inner = scaled[:, :6, :6] + np.eye(6)
+    rest = scaled[:, 6:, 6:] - scaled[:, 6:, :6] @ np.linalg.solve(inner, scaled[:, :6, 6:])
+    reduced = rest.sum(axis=0)
+    outer, right = reduced[:-1, :-1], reduced[:-1, -1]
+    squares = float(reduced[-1, -1] - right @ solve_scaled(outer, right))
+    determinants += float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(outer)[1])
+    return squares + determinants

@@ -1,0 +1,204 @@
+"""What poses of a robot and views say at first sight: whether they belong together, and which.
+
+Some of the poses tell where camera and target are by a closed form; what most of the poses agree
+with is taken. So a few poses that belong to other views do not spoil the rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.rigid import Rigid
+from smartcam.calibration._hand_eye.closed_forms import solve_linear
+from smartcam.calibration._hand_eye.equations import (
+    PixelObservations,
+    RobotPoses,
+    RobotSigmas,
+    Solution,
+    carried,
+)
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._hand_eye.model_selection import Problem
+
+CLOSED: Final = ("park", "shah")
+"""Closed forms that are tried, of unlike kinds: one stands where the other fails."""
+
+PART: Final = 4
+"""Poses of a part: one more than have to be."""
+
+PARTS: Final = 60
+"""Parts that are tried: where a third of the poses is wrong, one in six parts is right."""
+
+GROSS: Final = 10.0
+"""A pose that is more times the median off belongs to another view, if it is nowhere near, too."""
+
+OTHER_WAY: Final = 5.0
+"""Poses that fit as many times better when inverted are taken for given so."""
+
+OTHERWISE: Final = 20.0
+"""The same of other readings, which are rarer than a pose too many of another view."""
+
+POOREST: Final = RobotSigmas(math.radians(2.0), 0.01)
+"""What no robot is worse than that is any good: 2 degrees and 10 mm."""
+
+MILLI: Final = 1e-3
+
+
+class Agreed(NamedTuple):
+    """What most of the poses agree with."""
+
+    camera: Rigid  # ``X``
+    target: Rigid  # ``Z``
+    off: Array  # (V,), by how much each pose is off, metres on the target
+
+    @property
+    def median(self) -> float:
+        """Of all poses, metres."""
+        return float(np.median(self.off))
+
+    def gross(self, limit: float) -> NDArray[np.intp]:
+        """Return the poses that are more than ``limit`` off, and far more than the others."""
+        return np.flatnonzero(self.off > max(limit, GROSS * self.median))
+
+
+def extent(problem: Problem) -> float:
+    """Return the error at which a calibration says nothing, metres.
+
+    That is the target's extent, or without views half of its distance.
+    """
+    if isinstance(problem.seen, PixelObservations):
+        return float(np.ptp(problem.seen.points.reshape(-1, 3), axis=0).max())
+    return 0.5 * float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
+
+
+def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
+    """Return the rms error on the target that a robot of such a noise gives, metres.
+
+    A turn is taken to move the target in proportion to its distance from the camera.
+    """
+    distance = float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
+    return math.sqrt(2.0) * math.hypot(sigmas.translation, sigmas.rotation * distance)
+
+
+def most_error(problem: Problem) -> float:
+    """Return the error beyond which poses and views do not belong together, metres."""
+    return min(extent(problem), expected_error(problem, POOREST))
+
+
+def agreement(problem: Problem) -> Agreed | None:
+    """Return the motion that most of the poses agree with; None where no closed form gives one."""
+    # Least median over proposals of small parts: right as long as most of the poses are.
+    # Source: Rousseeuw, Least Median of Squares Regression (1984).
+    arm = extent(problem) if isinstance(problem.seen, PixelObservations) else 0.0
+    best: Agreed | None = None
+    for numbers in _parts(problem.count):
+        best = _better(problem, numbers, arm, best)
+    if best is not None:
+        near = np.flatnonzero(best.off <= 3.0 * best.median)
+        best = _better(problem, near, arm, best)
+    return best
+
+
+def _parts(count: int) -> Iterator[NDArray[np.intp]]:
+    """Return all poses, and parts of them; always the same ones."""
+    yield np.arange(count)
+    if count > PART:
+        random = np.random.default_rng(count)
+        for _ in range(PARTS):
+            yield np.sort(random.choice(count, PART, replace=False))
+
+
+def _better(
+    problem: Problem, numbers: NDArray[np.intp], arm: float, best: Agreed | None
+) -> Agreed | None:
+    """Return the motion by some of the poses if all of them agree with it better."""
+    for name in CLOSED:
+        found = solve_linear(name, problem.robot.taken(numbers), problem.poses.taken(numbers))
+        if found is None:
+            continue
+        apart = problem.poses.after(carried(found[0], problem.robot, found[1]))
+        turn, shift = (np.linalg.norm(part, axis=1) for part in np.split(apart, 2, axis=1))
+        tried = Agreed(*found, np.hypot(shift, arm * turn))
+        if best is None or tried.median < best.median:
+            best = tried
+    return best
+
+
+def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
+    """Yield ways in which poses may have been meant.
+
+    The poses when read so, how many times better they must fit then, the error's code, and how it
+    reads and what is wrong then.
+    """
+    poses, in_hand = robot.poses, robot.in_hand
+    how = "the other way round: they are inverted, or the camera is on the other side"
+    yield RobotPoses(poses, not in_hand), OTHER_WAY, Code.WRONG_FRAME, how
+    turned = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
+    how = "with rotations transposed: their matrices or quaternions are those of the way back"
+    yield RobotPoses(turned, in_hand), OTHERWISE, Code.WRONG_FRAME, how
+    how = "as millimetres: expected metres"
+    yield RobotPoses(poses.scaled(MILLI), in_hand), OTHERWISE, Code.POOR_FIT, how
+    how = "with the target in millimetres: expected its lengths in metres"
+    yield RobotPoses(poses.scaled(1 / MILLI), in_hand), OTHERWISE, Code.POOR_FIT, how
+
+
+def check_poses(problem: Problem) -> Agreed:
+    """Return the motion that most of the poses agree with.
+
+    Raises ``WRONG_FRAME``, or ``POOR_FIT``: the poses fit far better when they are read otherwise,
+    or do not fit at all.
+    """
+    found = agreement(problem)
+    off = math.inf if found is None else _on_target(problem, found)
+    for robot, clear, code, how in _readings(problem.robot):
+        other = dataclasses.replace(problem, robot=robot)
+        agreed = agreement(other)
+        if agreed is None:
+            continue
+        less = _on_target(other, agreed)
+        if less < most_error(other) and off > clear * less:
+            so = f"{1e3 * off:.3g} mm off" if math.isfinite(off) else "nowhere near"
+            raise CalibrationError(
+                "hand-eye: expected poses of the flange in the base, and the setup as it is, got "
+                f"poses that are {so} so, but {1e3 * less:.3g} mm when read {how}",
+                code=code,
+                expected="T_base_flange",
+                got=less,
+            )
+    most = most_error(problem)
+    if found is None or off > most:
+        so = f"one {1e3 * off:.3g} mm off" if math.isfinite(off) else "nothing near"
+        raise poor_fit(f"{so}, {1e3 * most:.3g} mm at most expected", off)
+    return found
+
+
+def poor_fit(what: str, off: float | None) -> CalibrationError:
+    """Return the error that poses and views do not belong together; ``what`` was got instead.
+
+    ``off``: by how much the target is off, metres; None where that is not known.
+    """
+    return CalibrationError(
+        f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "
+        "those of the views, in their order and in metres, are their angles in the convention that "
+        "was read, and is the setup right?",
+        code=Code.POOR_FIT,
+        got=off,
+    )
+
+
+def _on_target(problem: Problem, agreed: Agreed) -> float:
+    """Return the median error of the points on the target, metres."""
+    solution = Solution(agreed.camera, agreed.target, np.zeros(problem.seen.extra))
+    return float(np.median(np.concatenate(problem.errors(solution))))

@@ -1,0 +1,74 @@
+"""Where and how the target was shown: whether the views can tell a lens well."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.calibration._geometry.rotations import Array
+
+ENOUGH: Final[dict[str, float]] = {"x": 0.7, "y": 0.7, "size": 0.4, "skew": 0.5}
+"""Range of each quantity that is good enough.
+
+Source: ROS' camera_calibration, calibrator.py (published).
+"""
+
+
+class Coverage(NamedTuple):
+    """Bars from 0 to 1, where 1 is good enough.
+
+    Attributes:
+        x: places from left to right.
+        y: places from top to bottom.
+        size: from far to near.
+        skew: from head-on to tilted.
+    """
+
+    x: float
+    y: float
+    size: float
+    skew: float
+
+    @property
+    def lacking(self) -> tuple[str, ...]:
+        """Names of the bars that are not full."""
+        bars = self._asdict().items()
+        return tuple(name for name, value in bars if value < 1.0)
+
+
+def coverage(outlines: Sequence[Array], size: tuple[int, int]) -> Coverage:
+    """Return the bars of views.
+
+    Of each view, x and y are how far the target's middle went of the way that it can go without
+    leaving the image, size is the root of its part of the image's area, and skew is twice by how
+    many radians its first corner is off a right angle. A bar is the range of these over the views,
+    in parts of what is :data:`ENOUGH`.
+
+    ``outlines``: of each view, the target's four outer points in order (4, 2), pixels. ``size``:
+    width and height of the images, pixels.
+    """
+    seen = np.array([_quantities(outline, size) for outline in outlines])
+    ranges = np.ptp(seen, axis=0) if len(seen) else np.zeros(4)
+    full = np.array(list(ENOUGH.values()))
+    return Coverage(*np.minimum(ranges / full, 1.0).tolist())
+
+
+def _quantities(outline: Array, size: tuple[int, int]) -> list[float]:
+    x, y = outline.T
+    # shoelace formula
+    area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+    border = math.sqrt(area)
+    places = [
+        float(np.clip((mean - border / 2) / max(length - border, 1.0), 0.0, 1.0))
+        for mean, length in zip(outline.mean(axis=0).tolist(), size, strict=True)
+    ]
+    first, second = outline[0] - outline[1], outline[2] - outline[1]
+    lengths = float(np.linalg.norm(first) * np.linalg.norm(second))
+    angle = math.acos(max(-1.0, min(1.0, float(first @ second) / lengths))) if lengths else 0.0
+    skew = min(1.0, 2.0 * abs(math.pi / 2 - angle))
+    return [*places, math.sqrt(area / (size[0] * size[1])), skew]

@@ -1,0 +1,476 @@
+"""A camera's lens from views of a printed target."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+
+import numpy as np
+from pydantic import Field
+
+from smartcam.calibration._codes import Code, Remark
+from smartcam.calibration._files import storage
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rigid import Rigid
+from smartcam.calibration._geometry.rotations import Array
+from smartcam.calibration._lens.bundle import Bundle, Sight
+from smartcam.calibration._lens.coverage import Coverage, coverage
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.poses import (
+    CAMERA,
+    TARGET,
+    PoseInCamera,
+    check_view,
+    locate,
+    view_rms,
+)
+from smartcam.calibration._lens.projection import whitening
+from smartcam.calibration._lens.sheet_shape import choose_shape, held_out_residuals, leave_out
+from smartcam.calibration._lens.start import fit_lens, parameter_names
+from smartcam.calibration._views import TargetView
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from smartcam.calibration._lens.bundle import AdjustedBundle
+    from smartcam.calibration._lens.model import DistortionModel
+    from smartcam.calibration._lens.sheet_shape import Sheet
+
+Bar = Annotated[storage.NonNegative, Field(le=1)]
+BARS = storage.row(tuple[Bar, Bar, Bar, Bar], Coverage._make)
+
+LEAST_VIEWS: Final = 3
+"""Two tell a lens without noise; one more tells of noise."""
+
+LEAST_TILT: Final = math.radians(5.0)
+"""Between the steepest two planes; parallel ones leave the focal length open."""
+
+LEAST_MOTION: Final = 0.02
+"""Of the image's longer side: views whose points are closer are one view."""
+
+LEAST_FOCAL: Final = 0.1
+"""Standard deviation of the focal length over itself, beyond which it is not determined."""
+
+BAD: Final = 3.0
+"""Weighted rms of a view over the median of the others: healthy ones reach 1.6 (measured)."""
+
+MOST_BAD: Final = 1 / 3
+"""Of the views that may be left out."""
+
+POOR: Final = 1.0
+"""Pixels rms, beyond which the model of the lens, or the sheet, is not what it should be."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewFit(storage.Stored):
+    """What one view has to do with a lens.
+
+    Attributes:
+        view: as it was given.
+        used: whether the lens is fitted to it; False for a bad view.
+        transform: ``T_camera_target``.
+        residuals: (N, 2), seen minus projected, pixels.
+        rms: of a coordinate of ``residuals``, pixels, their freedom taken off.
+        held_out: the same for a lens that was fitted without this view, where the pose alone is
+            fitted to it; NaN where there were too few others.
+    """
+
+    _keys: ClassVar[storage.Keys] = {"transform": "pose"}
+
+    view: TargetView
+    used: bool
+    transform: PoseInCamera
+    residuals: Annotated[Array, storage.rows(storage.Pair, 2)]
+    rms: storage.NonNegative
+    held_out: storage.Open
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class IntrinsicCalibration(storage.SavedCalibration):
+    """What :func:`calibrate_intrinsics` finds.
+
+    Attributes:
+        camera: the lens.
+        covariance: (4 + K, 4 + K), of fx, fy, cx, cy and the coefficients: as the points'
+            covariance and ``sigma`` lead to, the sheet taken as exact; 0 for what was not fitted.
+        views: one for each given view, in their order.
+        rms: of the residuals of the used views, their freedom taken off: the standard deviation of
+            a coordinate, pixels. It is no accuracy: see ``held_out``.
+        sigma: what the residuals show beside the points' covariance, standard deviation of a
+            coordinate, pixels: the lens or the sheet is not quite as modelled, or the points have
+            more noise than they say.
+        held_out: held-out error, rms of a coordinate over all used views, pixels; see
+            :attr:`ViewFit.held_out`. The six parameters of each held-out pose are taken off the
+            freedom. NaN where there were too few views.
+        coverage: where and how the target was shown.
+        sheet: (T, 3), how far the target's points are from where they were meant to be, metres;
+            None where they are taken as meant.
+        warnings: what one should know.
+    """
+
+    kind: ClassVar[str] = "camera"
+    _called: ClassVar[str] = "calibration of cameras"
+    _others: ClassVar[storage.Others] = {
+        "target": (storage.StoredTarget, lambda one: one.views[0].view.target)
+    }
+
+    camera: CameraModel
+    covariance: Annotated[Array, storage.matrix()]
+    views: Annotated[tuple[ViewFit, ...], storage.AsList(1)]
+    rms: storage.NonNegative
+    sigma: storage.NonNegative
+    held_out: storage.Open
+    coverage: Annotated[Coverage, BARS]
+    sheet: storage.SheetOffsets | None
+    warnings: storage.Remarks
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Standard deviations by name: ``fx``, ``fy``, ``cx``, ``cy`` in pixels, ``k1``, ...
+
+        They hold to first order. The coefficients ``k1`` to ``k6`` of ``rational_polynomial`` make
+        up for each other so far that they may be tens of these deviations off the true ones, while
+        the lens they describe together, and ``fx`` to ``cy``, are right.
+        """
+        names = parameter_names(self.camera.distortion_model)
+        values = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()
+        return dict(zip(names, values, strict=True))
+
+    @property
+    def bad_views(self) -> tuple[str, ...]:
+        """Names of the views that were left out."""
+        return tuple(
+            label(one.view, number) for number, one in enumerate(self.views) if not one.used
+        )
+
+    def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
+        """Return by how much the lens is off at any views.
+
+        Views that it was not fitted to tell how good it is. The pose of the target alone is fitted
+        to each, as for :attr:`ViewFit.held_out`.
+
+        Args:
+            views: of any target; of the same one where its points were adjusted (``sheet``).
+
+        Returns:
+            Of each view (N, 2), seen minus projected, pixels: 2 N - 6 of them are free.
+
+        Raises:
+            CalibrationError: ``DIFFERENT_TARGETS``; and what
+                :func:`~smartcam.calibration.locate` says.
+        """
+        return tuple(self._errors(one) for one in views)
+
+    def _errors(self, view: TargetView) -> Array:
+        meant = self.views[0].view.target
+        if self.sheet is not None and view.target != meant:
+            raise CalibrationError(
+                f"point_errors: expected views of {meant}, whose points were adjusted, got one of "
+                f"{view.target}",
+                code=Code.DIFFERENT_TARGETS,
+                expected=meant,
+                got=view.target,
+            )
+        near = Rigid.stacked([locate(view, self.camera).transform.rigid])
+        points = None if self.sheet is None else meant.points + self.sheet
+        bundle = Bundle.single(self.camera, near, points=points)
+        (residuals,) = held_out_residuals(bundle, [Sight(0, 0, view)], 0, self.sigma**2)
+        return residuals
+
+    def _check(self, found: Mapping[str, Any], called: str) -> None:
+        count = 4 + len(self.camera.distortion)
+        storage.check_shape(self.covariance, (count, count), called, "covariance")
+        for one in self.views:
+            storage.check_shape(one.residuals, one.view.points.shape, called, "residuals")
+        if self.sheet is not None:
+            storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
+
+
+def calibrate_intrinsics(
+    views: Sequence[TargetView],
+    *,
+    distortion_model: DistortionModel = "plumb_bob",
+    fixed: Iterable[str] = (),
+    sheet: Sheet = "exact",
+    drop_bad: bool = True,
+) -> IntrinsicCalibration:
+    """Return the lens that shows the target's points where the views have them.
+
+    The reprojection error is made least, each point weighted by its covariance and by what the
+    residuals show beside it. The order of the views does not matter.
+
+    Args:
+        views: of one target, 3 or more, of images of one size; tilted in several directions, near
+            and far, out to the corners.
+        distortion_model: ``plumb_bob`` for most lenses, ``rational_polynomial`` for wide ones,
+            ``equidistant`` for fisheyes.
+        fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
+        sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
+            adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
+            ``auto``: what has the smaller held-out error, where it is clearly smaller. One camera
+            alone tells a bent sheet from a bent lens less well than two: take it where residuals
+            are large and the sheet is to blame.
+        drop_bad: whether views that fit far worse than the others are left out (and named), at
+            most a third of them; else they are only named.
+
+    Raises:
+        CalibrationError: ``TOO_FEW`` views or points; ``COLLINEAR`` points of a view;
+            ``WRONG_SIZE``: images of several sizes; ``DIFFERENT_TARGETS``; ``POSES_TOO_SIMILAR``:
+            the views are nearly the same; ``INSUFFICIENT_ROTATION``: the target was never tilted,
+            or so little that the focal length stays open; ``SHAPE``: no such coefficient, or no
+            such model; ``NOT_FINITE`` pixels; ``POOR_FIT``: no lens of this model shows them.
+    """
+    given = list(views)
+    check_views(given, "intrinsics", LEAST_VIEWS)
+    _check_motion(given)
+    held = tuple(fixed)
+    used = list(range(len(given)))
+    while True:
+        adjusted = fit_lens([given[number] for number in used], distortion_model, held)
+        worst, ratio = worst_view([given[number] for number in used], adjusted)
+        dropped = len(given) - len(used) + 1
+        enough = len(used) > LEAST_VIEWS and dropped <= MOST_BAD * len(given)
+        if ratio <= BAD or not (drop_bad and enough):
+            break
+        del used[worst]
+    check_tilts(adjusted, "intrinsics")
+    bad = [used[worst]] if ratio > BAD else []
+    return _summary(
+        given, used, adjusted, [*bad, *sorted(set(range(len(given))) - set(used))], sheet
+    )
+
+
+def label(view: TargetView, number: int) -> str:
+    """Return a view's name for texts, or its number."""
+    return view.name or f"view {number}"
+
+
+def check_views(
+    views: Sequence[TargetView], what: str, least: int, size: tuple[int, int] | None = None
+) -> None:
+    """Refuse views that do not belong together, or one that is of no use; ``what`` is for texts.
+
+    ``least``: number of views. ``size``: of the images, pixels; None: that of the first one. Raises
+    ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
+    """
+    if len(views) < least:
+        raise CalibrationError(
+            f"{what}: expected {least} views or more, got {len(views)}",
+            code=Code.TOO_FEW,
+            expected=least,
+            got=len(views),
+        )
+    for number, view in enumerate(views):
+        if view.target != views[0].target:
+            raise CalibrationError(
+                f"{what}: expected views of one target, {views[0].target}, got {view.target} in "
+                f"{label(view, number)}",
+                code=Code.DIFFERENT_TARGETS,
+                expected=views[0].target,
+                got=view.target,
+            )
+        check_view(view, size or views[0].size)
+
+
+def _check_motion(views: Sequence[TargetView]) -> None:
+    """Refuse views that are all nearly the same."""
+    least, largest = LEAST_MOTION * max(views[0].size), 0.0
+    for one in views[1:]:
+        common, first, second = np.intersect1d(views[0].ids, one.ids, return_indices=True)
+        if not len(common):
+            return
+        off = views[0].points[first] - one.points[second]
+        largest = max(largest, float(np.linalg.norm(off, axis=1).max()))
+    if largest < least:
+        raise CalibrationError(
+            f"intrinsics: expected views in which the target moves by {least:.3g} pixels or more, "
+            f"got {len(views)} that differ by {largest:.3g}",
+            code=Code.POSES_TOO_SIMILAR,
+            expected=least,
+            got=largest,
+        )
+
+
+def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
+    """Refuse views of parallel planes, and a focal length that is not determined.
+
+    Raises ``INSUFFICIENT_ROTATION``; ``what`` is for the texts.
+    """
+    normals = adjusted.bundle.poses.rotation[:, :, 2]
+    sines = [np.linalg.norm(np.cross(a, b)) for a, b in itertools.combinations(normals, 2)]
+    tilt = math.asin(min(1.0, float(max(sines))))
+    if tilt < LEAST_TILT:
+        raise CalibrationError(
+            f"{what}: expected the target tilted by {math.degrees(LEAST_TILT):.0f} degrees or "
+            f"more between two views, got {math.degrees(tilt):.2g}: parallel planes leave the "
+            "focal length open",
+            code=Code.INSUFFICIENT_ROTATION,
+            expected=LEAST_TILT,
+            got=tilt,
+        )
+    # values = basis times unknowns, so their covariance is B C B^T
+    spread = adjusted.bundle.basis[0] @ adjusted.covariance @ adjusted.bundle.basis[0].T
+    length = float(adjusted.bundle.cameras[0].matrix[0, 0])
+    relative = math.sqrt(max(float(spread[0, 0]), 0.0)) / length
+    if relative > LEAST_FOCAL:
+        raise CalibrationError(
+            f"{what}: expected views that tell the focal length to {LEAST_FOCAL:.0%}, got "
+            f"{length:.5g} pixels with a standard deviation of {relative:.2g} of it: tilt the "
+            "target more, and show it nearer",
+            code=Code.INSUFFICIENT_ROTATION,
+            expected=LEAST_FOCAL,
+            got=relative,
+        )
+
+
+def worst_view(views: Sequence[TargetView], adjusted: AdjustedBundle) -> tuple[int, float]:
+    """Return the view that fits worst, and its weighted rms over the median of the others."""
+    found = [
+        weighted_rms(view, residuals, adjusted.more)
+        for view, residuals in zip(views, adjusted.residuals, strict=True)
+    ]
+    worst = int(np.argmax(found))
+    others = float(np.median(np.delete(found, worst)))
+    return worst, found[worst] / others if others > 0 else 1.0
+
+
+def weighted_rms(view: TargetView, residuals: Array, more: float) -> float:
+    """Return the rms of a view's residuals in units of their standard deviation."""
+    weighted = whitening(view.covariance, more) @ residuals[..., None]
+    return math.sqrt(float((weighted**2).mean()))
+
+
+def _held_out(adjusted: AdjustedBundle, views: Sequence[TargetView]) -> list[float]:
+    """Return the rms of each view under a lens that was fitted to the others."""
+    if len(views) <= LEAST_VIEWS:
+        return [math.nan] * len(views)
+    sights, found = [Sight(0, number, view) for number, view in enumerate(views)], []
+    for number in range(len(views)):
+        lens = leave_out(adjusted, sights, number)
+        (residuals,) = held_out_residuals(lens, sights, number, adjusted.more)
+        found.append(view_rms(residuals))
+    return found
+
+
+def _together(errors: Sequence[float], views: Sequence[TargetView]) -> float:
+    freedom = [2 * len(view.ids) - 6 for view in views]
+    return math.sqrt(float(np.average(np.square(errors), weights=freedom)))
+
+
+def _summary(
+    views: Sequence[TargetView],
+    used: list[int],
+    adjusted: AdjustedBundle,
+    bad: list[int],
+    sheet: Sheet,
+) -> IntrinsicCalibration:
+    of_used = [views[number] for number in used]
+    adjusted, errors = choose_shape(
+        adjusted,
+        [Sight(0, number, view) for number, view in enumerate(of_used)],
+        sheet,
+        lambda fitted: _held_out(fitted, of_used),
+        lambda errors: _together(errors, of_used),
+    )
+    bundle = adjusted.bundle
+    camera, basis = bundle.cameras[0], bundle.basis[0]
+    held_out = dict(zip(used, errors, strict=True))
+    fits = [
+        _view_fit(view, camera, adjusted, used.index(number), held_out[number])
+        if number in held_out
+        else _view_fit(view, camera)
+        for number, view in enumerate(views)
+    ]
+    squares = sum(float((one**2).sum()) for one in adjusted.residuals)
+    calibration = IntrinsicCalibration(
+        camera=camera,
+        covariance=basis @ adjusted.covariance @ basis.T,
+        views=tuple(fits),
+        rms=math.sqrt(squares / adjusted.freedom),
+        sigma=math.sqrt(adjusted.more),
+        held_out=_together(errors, of_used),
+        sheet=None if bundle.points is None else bundle.points - of_used[0].target.points,
+        coverage=coverage([_outline(fits[number], camera) for number in used], camera.size),
+        warnings=(),
+    )
+    return dataclasses.replace(calibration, warnings=tuple(_remarks(calibration, bad)))
+
+
+def _view_fit(
+    view: TargetView,
+    camera: CameraModel,
+    adjusted: AdjustedBundle | None = None,
+    place: int = 0,
+    held_out: float = math.nan,
+) -> ViewFit:
+    """Return a view's fit to the lens; a bad one's by the pose alone."""
+    if adjusted is None:
+        pose = locate(view, camera)
+        transform, residuals, held_out = pose.transform, pose.residuals, pose.rms
+    else:
+        transform = Transform(CAMERA, TARGET, *adjusted.bundle.poses.taken(place))
+        residuals = adjusted.residuals[place]
+    return ViewFit(
+        view=view,
+        used=adjusted is not None,
+        transform=transform,
+        residuals=residuals,
+        rms=view_rms(residuals),
+        held_out=held_out,
+    )
+
+
+def _outline(fit: ViewFit, camera: CameraModel) -> Array:
+    """Return the target's four outer points (4, 2), hidden ones, too."""
+    low, high = fit.view.target.points.min(axis=0), fit.view.target.points.max(axis=0)
+    corners = np.array(
+        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
+    )
+    seen = camera.project(fit.transform.apply(corners))
+    return np.where(np.isfinite(seen), seen, fit.view.points.mean(axis=0))
+
+
+def remark_sheet(sheet: Array | None) -> Iterator[Remark]:
+    """Yield what is to be said of a sheet whose points are not where they were meant to be."""
+    if sheet is not None:
+        off = 1e3 * math.sqrt(float((sheet**2).sum(axis=1).mean()))
+        most = 1e3 * float(np.linalg.norm(sheet, axis=1).max())
+        yield Remark(
+            Code.SHEET_NOT_EXACT,
+            f"the sheet's points are {off:.2g} mm rms from where they were meant to be, "
+            f"{most:.2g} mm at most: the print or the board is not exact",
+        )
+
+
+def _remarks(calibration: IntrinsicCalibration, bad: list[int]) -> Iterator[Remark]:
+    for number in bad:
+        fit = calibration.views[number]
+        done = "was not used" if not fit.used else "is used all the same"
+        yield Remark(
+            Code.BAD_VIEW,
+            f"{label(fit.view, number)}: {fit.rms:.3g} pixels rms where the lens has "
+            f"{calibration.rms:.3g} in all: it {done}",
+        )
+    if calibration.rms > POOR:
+        yield Remark(
+            Code.POOR_FIT,
+            f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR:g} at most: the lens "
+            f"is not of the model {calibration.camera.distortion_model}, the sheet is not flat, or "
+            "points were taken for others",
+        )
+    yield from remark_sheet(calibration.sheet)
+    if lacking := calibration.coverage.lacking:
+        bars = ", ".join(f"{name} {getattr(calibration.coverage, name):.0%}" for name in lacking)
+        yield Remark(
+            Code.POOR_COVERAGE, f"the views cover too little: {bars} of what is good enough"
+        )
+    if math.isnan(calibration.held_out):
+        yield Remark(
+            Code.NOT_HELD_OUT,
+            f"{sum(one.used for one in calibration.views)} views are no more than a lens has need "
+            "of: none can be left out to see how good it is",
+        )

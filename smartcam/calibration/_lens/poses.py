@@ -1,0 +1,197 @@
+"""Where a target lies before a camera of known lens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Final
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._files import storage
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
+from smartcam.calibration._geometry.rotations import as_points
+from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight, adjust
+from smartcam.calibration._lens.projection import excess
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._views import TargetView
+
+CAMERA: Final = "camera"
+"""Name of the camera's frame."""
+
+TARGET: Final = "target"
+"""Name of the target's frame."""
+
+# T_camera_target
+PoseInCamera = Annotated[Transform, storage.motion(lambda _: (CAMERA, TARGET))]
+
+LEAST_POINTS: Final = 4
+"""A plane's pose has need of four of its points."""
+
+LEAST_SPREAD: Final = 1e-3
+"""Of the points across their longest direction, in parts of that: less is a line."""
+
+NUDGE: Final = 1e-9
+"""Of rays, parts of the focal length, to keep a solver from rounding errors."""
+
+SAME: Final = 1e-3
+"""Turn between two poses, rad, up to which both are the same minimum."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TargetPose:
+    """What :func:`locate` finds.
+
+    Attributes:
+        transform: ``T_camera_target``.
+        covariance: (6, 6), of a small turn (rad) and shift (m) of the target in the camera's frame:
+            the rotation is ``exp([turn]x) R``. As the points' covariance leads to, and larger where
+            the residuals are larger than that explains. Errors of the lens are not in it.
+        residuals: (N, 2), seen minus projected, pixels.
+        rms: of the residuals' lengths over sqrt(2), their freedom taken off: the standard deviation
+            of a coordinate, pixels.
+        ambiguity: of a plane that is far away or seen head-on two poses look nearly the same: rms
+            of this one over that of the other, near 1 where the points cannot tell which is
+            right; 0 where there is no other.
+        other: the other pose; None where there is none.
+    """
+
+    transform: Transform
+    covariance: Array
+    residuals: Array
+    rms: float
+    ambiguity: float
+    other: Transform | None = None
+
+
+def locate(view: TargetView, camera: CameraModel) -> TargetPose:
+    """Return the pose of a target in the camera's frame.
+
+    Both poses that a plane's image leaves open are refined by the reprojection error, each point
+    weighted by its covariance and by what the residuals show beside it; the better one counts.
+
+    Args:
+        view: at least 4 points of the target that are not on a line.
+        camera: the lens, for images of the same size.
+
+    Raises:
+        CalibrationError: ``TOO_FEW`` points; ``COLLINEAR`` points; ``WRONG_SIZE``: the image has
+            another size than the camera's; ``NOT_FINITE``: pixels that are no numbers;
+            ``POOR_FIT``: no pose puts the points before the camera.
+    """
+    check_view(view, camera.size)
+    sights = [Sight(0, 0, view)]
+    found = [
+        adjust(Bundle.single(camera, start), sights, 0.0) for start in plane_poses(view, camera)
+    ]
+    found = sorted(
+        (one for one in found if math.isfinite(one.weighted)), key=lambda one: one.weighted
+    )
+    if not found:
+        raise CalibrationError(
+            f"pose of the target{_of(view)}: expected one before the camera that shows its "
+            f"{len(view.ids)} points where they are, got none",
+            code=Code.POOR_FIT,
+            expected="a pose before the camera",
+        )
+    more = excess(found[0].residuals[0], view.covariance, found[0].freedom)
+    if more:
+        found = [adjust(one.bundle, sights, more) for one in found]
+    best, pose = found[0], found[0].bundle.poses
+    other = next((one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > SAME), None)
+    rms = view_rms(best.residuals[0])
+    return TargetPose(
+        transform=_transform(best),
+        covariance=best.pose_covariance[0],
+        residuals=best.residuals[0],
+        rms=rms,
+        ambiguity=rms / view_rms(other.residuals[0]) if other else 0.0,
+        other=_transform(other) if other else None,
+    )
+
+
+def _transform(one: AdjustedBundle) -> Transform:
+    return Transform(CAMERA, TARGET, *one.bundle.poses.taken(0))
+
+
+def view_rms(residuals: Array) -> float:
+    """Return the rms of a coordinate of residuals (N, 2), six for the pose taken off."""
+    # E[sum r^2] = sigma^2 (2 N - 6): each fitted parameter takes one square away.
+    return math.sqrt(float((residuals**2).sum()) / (2 * len(residuals) - 6))
+
+
+def check_view(view: TargetView, size: tuple[int, int]) -> None:
+    """Refuse a view that leaves the pose open, or whose image is not of a size (pixels).
+
+    Raises as :func:`locate` says.
+    """
+    count = len(view.ids)
+    if count < LEAST_POINTS:
+        raise CalibrationError(
+            f"pose of the target{_of(view)}: expected {LEAST_POINTS} points or more, got {count}",
+            code=Code.TOO_FEW,
+            expected=LEAST_POINTS,
+            got=count,
+        )
+    if tuple(view.size) != tuple(size):
+        raise CalibrationError(
+            f"pose of the target{_of(view)}: expected an image of {size[0]} x {size[1]} pixels, "
+            f"got {view.size[0]} x {view.size[1]}",
+            code=Code.WRONG_SIZE,
+            expected=size,
+            got=view.size,
+        )
+    as_points(view.points, 2, f"points of the target{_of(view)}")
+    plane = view.object_points[:, :2]
+    spread = np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)
+    if spread[1] < LEAST_SPREAD * spread[0]:
+        raise CalibrationError(
+            f"pose of the target{_of(view)}: expected points that are not on one line, got "
+            f"{count} on one",
+            code=Code.COLLINEAR,
+            got=view.ids.tolist(),
+        )
+
+
+def _of(view: TargetView) -> str:
+    return f" in {view.name}" if view.name else ""
+
+
+def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
+    """Return the two poses that a plane's image leaves open, each in an array of one.
+
+    The likelier one comes first.
+
+    Source: Collins and Bartoli, Infinitesimal Plane-based Pose Estimation (2014).
+    """
+    rays = camera.directions(view.points)
+    found = _ippe(view.object_points, rays)
+    if not found:  # on exact rays OpenCV takes the root of a negative rounding error
+        found = _ippe(view.object_points, rays + NUDGE * np.sin(np.arange(len(rays)))[:, None])
+    return found
+
+
+def _ippe(points: Array, rays: Array) -> list[Rigid]:
+    cv2 = load("cv2")
+    try:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(
+            points.reshape(-1, 1, 3),
+            rays.reshape(-1, 1, 2),
+            np.eye(3),
+            None,
+            flags=cv2.SOLVEPNP_IPPE,
+        )
+    except cv2.error:
+        return []
+    return [
+        Rigid(exp_rotation(turn.reshape(1, 3)), np.asarray(shift, dtype=np.float64).reshape(1, 3))
+        for turn, shift in zip(turns, shifts, strict=True)
+        if np.isfinite(turn).all() and np.isfinite(shift).all()
+    ]

@@ -1,0 +1,108 @@
+"""Projection with its derivatives, and residuals in units of their noise: what all fits share.
+
+A pose is a rotation R (3, 3) and a translation t (3,) that lead from the target to the camera. Its
+six small changes are a turn w and a shift d in the camera's frame: R becomes exp([w]x) R, and t
+becomes t + d.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+from smartcam.calibration._statistics import Noise
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel
+
+NEGLIGIBLE = 1e-4
+"""Pixels: standard deviations are not taken smaller, so that views without noise have weights."""
+
+LEVEL = 0.01
+"""How seldom noise alone may pass for an error beside it."""
+
+
+class Projection(NamedTuple):
+    """Points in an image and what moves them."""
+
+    pixels: Array  # (N, 2); NaN for what lies behind the camera
+    by_point: Array  # (N, 2, 3), derivative by the point in the camera's frame, pixels per metre
+    by_lens: Array  # (N, 2, 4 + K), derivative by fx, fy, cx, cy and the K coefficients
+
+
+def linearize(points: Array, camera: CameraModel) -> Projection:
+    """Project points (N, 3) of the camera's frame, with derivatives."""
+    cv2, zero = load("cv2"), np.zeros(3)
+    source = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
+    count = len(camera.distortion)
+    if not len(source):
+        return Projection(np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4 + count)))
+    if camera.distortion_model == "equidistant":
+        seen, by = cv2.fisheye.projectPoints(source, zero, zero, camera.matrix, camera.distortion)
+        # columns: f 2, c 2, k 4, rotation 3, translation 3, skew 1
+        by = by.reshape(-1, 2, 15)
+        by_lens, by_point = by[..., :8], by[..., 11:14]
+    else:
+        seen, by = cv2.projectPoints(source, zero, zero, camera.matrix, camera.distortion)
+        # columns: rotation 3, translation 3, f 2, c 2, k
+        by = by.reshape(-1, 2, 10 + count)
+        by_point, by_lens = by[..., 3:6], by[..., 6:]
+    pixels = np.array(seen, dtype=np.float64).reshape(-1, 2)
+    pixels[source[:, 0, 2] <= 0] = np.nan
+    return Projection(pixels, by_point, by_lens)
+
+
+def pose_changes(by_point: Array, turned_points: Array) -> Array:
+    """Return the derivatives of pixels by the six changes of a pose (N, 2, 6).
+
+    ``by_point`` (N, 2, 3): by the points in the camera's frame. ``turned_points`` (N, 3): R @
+    points, without the translation.
+    """
+    # p = R m + t becomes exp([w]x) R m + t + d, to first order p + w x (R m) + d. So a pixel's
+    # derivative by d is that by p, g, and by w it is (R m) x g, since g (w x q) = w (q x g).
+    x, y, z = turned_points.T[:, :, None]
+    by_x, by_y, by_z = np.moveaxis(by_point, 2, 0)
+    by_turn = (y * by_z - z * by_y, z * by_x - x * by_z, x * by_y - y * by_x)
+    changes: Array = np.stack([*by_turn, by_x, by_y, by_z], axis=2)
+    return changes
+
+
+def whitening(covariance: Array, more: float) -> Array:
+    """Return matrices (N, 2, 2) that make residuals independent, of variance 1.
+
+    ``covariance`` (N, 2, 2): of the residuals. ``more``: variance that each coordinate has beside
+    it, pixels^2.
+    """
+    # With C^-1 = L L^T (Cholesky) the residuals L^T r have the covariance L^T C L = I, and their
+    # squares add up to r^T C^-1 r.
+    whole = covariance + max(more, NEGLIGIBLE**2) * np.eye(2)
+    matrices = np.linalg.cholesky(np.linalg.inv(whole)).swapaxes(1, 2)
+    return np.asarray(matrices, dtype=np.float64)
+
+
+def excess(residuals: Array, covariance: Array, freedom: int) -> float:
+    """Return the variance that residuals have beside what their covariance explains, pixels^2.
+
+    It is what makes the sum of their weighted squares equal to their freedom; 0 where chance makes
+    them as large in 1 of 100 cases or more. ``residuals`` (N, 2), pixels; ``covariance`` (N, 2, 2);
+    ``freedom``: coordinates less fitted parameters; 0 or less says nothing.
+    """
+    # Along each point's principal axes: find s^2 of sum e_j^2 / (l_j + s^2) = freedom, which falls
+    # with s^2, so there is one root at most; at sum e_j^2 / freedom it is negative or 0.
+    # Source: Paule and Mandel, Consensus Values and Weighting Factors (1982).
+    values, vectors = np.linalg.eigh(covariance)
+    squared = np.einsum("nij,ni->nj", vectors, residuals) ** 2
+    values = np.maximum(values, 0.0) + NEGLIGIBLE**2
+
+    def off(more: float) -> float:
+        return float((squared / (values + more)).sum()) - freedom
+
+    if freedom <= 0 or not np.isfinite(squared).all():
+        return 0.0
+    if Noise(1.0).chance(off(0.0) + freedom, freedom) >= LEVEL:
+        return 0.0
+    largest = float(squared.sum()) / freedom
+    return float(load("scipy.optimize").brentq(off, 0.0, largest, xtol=1e-16))

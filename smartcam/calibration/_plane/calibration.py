@@ -1,0 +1,584 @@
+"""From localizations in a camera's plane to poses of a robot.
+
+::
+
+    calibration = fit_plane(camera_points, robot_points, touch_sigma=0.0002)
+    poses = calibration.to_robot(result.value)
+    calibration.predicted_error([[0.10, 0.05]])     # metres, rms
+
+A point is seen by the camera and touched by the robot; three are needed, nine tell how good it is.
+Of six and more, ``robust=True`` leaves out those that are wrong.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, overload
+
+import numpy as np
+from pydantic import StrictBool
+
+from smartcam.calibration._codes import Code, Remark
+from smartcam.calibration._files import storage
+from smartcam.calibration._geometry.homography import element_derivatives
+from smartcam.calibration._geometry.rotations import Array, as_points, as_vector
+from smartcam.calibration._plane.diagnostics import Evidence, check_side, findings
+from smartcam.calibration._plane.fitting import MODELS, Fit, ModelName, Normalization
+from smartcam.calibration._plane.mapping import PlaneMap
+from smartcam.calibration._plane.model_selection import NEGLIGIBLE, Candidates, rms, squares
+from smartcam.calibration._plane.robust import agreeing
+from smartcam.calibration._plane.validation import (
+    check_lever,
+    check_positive,
+    check_samples,
+    lever,
+    normalize,
+    read_pairs,
+)
+from smartcam.calibration._statistics import Noise, normal_deviations
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Localization
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import ArrayLike, NDArray
+
+KIND = "plane"
+
+PlaneModel: TypeAlias = Literal["auto", "rigid", "similarity", "affine", "homography"]
+
+CHUNK = 16_384
+"""Points whose covariances are worked out at once: 5 MB in between."""
+
+LEAST_AXIS = 1e-9
+"""Length of a direction below which it is none."""
+
+STALE_LEVEL = 0.01
+"""How seldom a calibration that still holds is called stale."""
+
+
+class Drift(NamedTuple):
+    """How points touched again compare with the calibration.
+
+    Attributes:
+        offsets: touched minus expected (K, 3), metres.
+        expected: rms length of an offset that touches and calibration explain, metres.
+        chance: how likely they alone give offsets as large as these, 0 to 1.
+        z: the same in standard deviations of a normal distribution.
+        stale: whether that is less likely than the level asked for.
+    """
+
+    offsets: Array
+    expected: float
+    chance: float
+    z: float
+    stale: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlaneCalibration(storage.SavedCalibration):
+    """What :func:`fit_plane` finds; immutable.
+
+    ``==`` asks for one and the same object; compare :meth:`to_data` for the same contents.
+
+    Attributes:
+        model: ``rigid``, ``similarity``, ``affine``, ``homography``, or ``touches`` for
+            :func:`~smartcam.calibration.fit_touches`.
+        camera_points: (N, 2), as given.
+        robot_points: (N, 3), as given, metres.
+        weights: (N,), as given, ones where none were; 0 for a point that ``robust`` left out.
+        matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres.
+        place: centre and size of the points, in both spaces.
+        unit_covariance: (12, 12), of the elements of the matrix between the centred and scaled
+            points, row by row, for touches with a variance of 1 m^2.
+        residuals: (N, 3), robot minus mapped, metres. They are smaller than the error, except of
+            points left out.
+        leave_one_out: (N, 3), robot minus what a calibration from the other points says, metres;
+            NaN where the others alone give none. The point's own touch is part of it. Of a point
+            left out it is the residual.
+        freedom: coordinates of the points that count, minus parameters.
+        touch_sigma: of one coordinate of a touch of weight 1, metres: as given or, where
+            ``sigma_given`` is false, estimated from the residuals; None where there is no telling.
+        sigma_given: whether it was given.
+        candidates: rms held-out error of each model that was compared, metres; None where a model
+            has none.
+        nominal_scale: metres for each unit of the camera's points as the user expects them.
+        tool_z: (3,), direction of the tool's axis into the plane; None where it is not known.
+        height: of the plane over the touched one, metres; see :meth:`at_height`.
+        robot_frame: name of the frame that poses are given in.
+        camera_frame: name of the frame that they must come in; None for any.
+        y_down: whether the camera's y axis pointed down and was turned up before the points came,
+            as :func:`smartcam.connect` does with ``y_down``; None: not known.
+        warnings: what one should know before using it; their texts number the points from 1, as
+            pictures and wizards do.
+    """
+
+    kind: ClassVar[str] = KIND
+    _called: ClassVar[str] = "plane calibration"
+    _later: ClassVar[frozenset[str]] = frozenset({"tool_z", "height", "camera_frame", "y_down"})
+
+    model: ModelName | Literal["touches"]
+    camera_points: Annotated[Array, storage.rows(storage.Pair, 2, least=3)]
+    robot_points: Annotated[Array, storage.rows(storage.Triple, 3, least=3)]
+    weights: Annotated[Array, storage.rows(storage.NonNegative, least=3)]
+    matrix: storage.Matrix43
+    place: Normalization
+    unit_covariance: Annotated[Array, storage.matrix(12)]
+    residuals: Annotated[Array, storage.rows(storage.Triple, 3, least=3)]
+    leave_one_out: Annotated[Array, storage.rows(storage.OpenTriple, 3, least=3, nulls=True)]
+    freedom: storage.Count
+    touch_sigma: storage.NonNegative | None
+    sigma_given: bool
+    candidates: dict[str, storage.Number | None]
+    nominal_scale: storage.Positive | None = None
+    tool_z: storage.Vector3 | None = None
+    height: storage.Number = 0.0
+    robot_frame: str = "robot"
+    camera_frame: str | None = None
+    y_down: StrictBool | None = None
+    warnings: storage.Remarks = ()
+
+    def __post_init__(self) -> None:
+        fields = [getattr(self, field.name) for field in dataclasses.fields(self)]
+        for array in (*fields, self.place.camera, self.place.robot):
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+
+    @cached_property
+    def _map(self) -> PlaneMap:
+        return PlaneMap(self.matrix, self.place.camera)
+
+    @cached_property
+    def _local(self) -> Array:
+        """The matrix between centred and scaled points (4, 3)."""
+        return self.place.inward(self.matrix)
+
+    @property
+    def rotation(self) -> Array:
+        """R_robot_camera (3, 3): x as the camera's x at the centre, z the plane's normal."""
+        return self._map.frame
+
+    @property
+    def normal(self) -> Array:
+        """The plane's normal (3,), towards the side from which the camera's x turns left to y."""
+        normal: Array = self._map.frame[:, 2]
+        return normal
+
+    @property
+    def origin(self) -> Array:
+        """Where the camera's (0, 0) lies (3,), metres."""
+        origin: Array = self.transform([[0.0, 0.0]])[0]
+        return origin
+
+    @property
+    def scale(self) -> float:
+        """Metres for each unit of the camera's points, at their centre."""
+        return self._map.scale
+
+    @property
+    def held_out_error(self) -> float | None:
+        """Rms length of :attr:`leave_one_out`, metres; None where a point has none."""
+        value = rms(self.leave_one_out, self.weights)
+        return None if math.isnan(value) else value
+
+    @property
+    def outliers(self) -> tuple[int, ...]:
+        """Indices of the points that ``robust`` left out; they count in no error."""
+        return tuple(np.flatnonzero(self.weights == 0.0).tolist())
+
+    @property
+    def worst(self) -> int:
+        """Index of the point with the largest held-out error, or residual where there is none.
+
+        Points left out are not asked.
+        """
+        held_out = not np.isnan(self.leave_one_out).any()
+        errors = self.leave_one_out if held_out else self.residuals
+        return int(np.argmax(self.weights * (errors**2).sum(axis=1)))
+
+    def transform(self, points: ArrayLike, out: Array | None = None) -> Array:
+        """Map points of the camera to the robot's space.
+
+        Args:
+            points: (N, 2), in the unit that the calibration was made in; or (N, 3) with a third
+                component 1, which a contiguous array of many points is mapped faster from.
+            out: (N, 3), contiguous float64, written and returned; None for a new array.
+
+        Returns:
+            (N, 3), metres. NaN gives NaN.
+
+        Raises:
+            CalibrationError: SHAPE; OUT_OF_FIELD: a point behind the plane's horizon; NOT_FINITE:
+                one comes out as no number.
+        """
+        return self._map.transform(points, out)
+
+    def inverse(self, points: ArrayLike) -> Array:
+        """Map points of the robot's space to the camera's.
+
+        Args:
+            points: (N, 3), metres; of a point beside the plane its foot counts.
+
+        Returns:
+            (N, 2), in the camera's unit.
+
+        Raises:
+            CalibrationError: SHAPE or NOT_FINITE; OUT_OF_FIELD: not visible from the camera.
+        """
+        return self._map.inverse(points)
+
+    @overload
+    def to_robot(self, localizations: Localization, *, tool_flip: bool = False) -> Localization: ...
+    @overload
+    def to_robot(
+        self, localizations: Iterable[Localization], *, tool_flip: bool = False
+    ) -> list[Localization]: ...
+    def to_robot(
+        self, localizations: Localization | Iterable[Localization], *, tool_flip: bool = False
+    ) -> Localization | list[Localization]:
+        """Return localizations with their poses in the robot's space.
+
+        Their z axis is the plane's normal, their x axis the part's. The header is in the robot's
+        frame; number and time stay.
+
+        Args:
+            localizations: of the camera, one or many.
+            tool_flip: turn each by pi about its own x, so that z points into the plane, as a
+                tool's does that picks it.
+
+        Raises:
+            CalibrationError: WRONG_FRAME: they come in another frame than ``camera_frame``;
+                OUT_OF_PLANE: one is not in the camera's plane; OUT_OF_FIELD: one is behind the
+                plane's horizon; NOT_FINITE: a pose would hold what is no number.
+        """
+        if isinstance(localizations, Localization):
+            return self._poses((localizations,), tool_flip)[0]
+        return self._poses(localizations, tool_flip)
+
+    def _poses(self, localizations: Iterable[Localization], flip: bool) -> list[Localization]:
+        return self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
+
+    def covariance_at(self, points: ArrayLike) -> Array:
+        """Return the covariance of mapped points that the touches' noise causes.
+
+        Args:
+            points: (K, 2), of the camera.
+
+        Returns:
+            (K, 3, 3), m^2, along the robot's axes. The noise of the camera when it sees the point
+            comes on top.
+
+        Raises:
+            CalibrationError: SHAPE or NOT_FINITE; UNVERIFIED: nothing tells the touches' sigma.
+        """
+        # J C J^T with the map's Jacobian by its parameters; C is derived in fitting.fit
+        seen = as_points(points, 2, "camera points")
+        return np.concatenate(
+            [self._joint(seen[i : i + CHUNK]) for i in range(0, len(seen), CHUNK)]
+            or [np.zeros((0, 3, 3))]
+        )
+
+    def _joint(self, seen: Array) -> Array:
+        rows = self._rows(seen)
+        joint: Array = self._variance * (rows @ self.unit_covariance @ rows.swapaxes(1, 2))
+        return joint
+
+    def _rows(self, seen: Array) -> Array:
+        """Return the derivatives of mapped points by the fit's matrix, (K, 3, 12), metres."""
+        local = (seen - self.place.camera) / self.place.camera_size
+        moved: Array = self.place.robot_size * element_derivatives(self._local, local)
+        return moved
+
+    @property
+    def _variance(self) -> float:
+        if self.touch_sigma is None:
+            raise CalibrationError(
+                "predicted error: expected touch_sigma, or more points than the "
+                f"{np.count_nonzero(self.weights)} that {self.model} has need of",
+                code=Code.UNVERIFIED,
+                expected="touch_sigma",
+            )
+        return self.touch_sigma**2
+
+    def predicted_error(self, points: ArrayLike) -> Array:
+        """Return the rms error to expect of mapped points, for touches with noise alone.
+
+        Args:
+            points: (K, 2), of the camera.
+
+        Returns:
+            (K,), metres: root of the summed variances along the three axes.
+
+        Raises:
+            CalibrationError: as :meth:`covariance_at`.
+        """
+        error: Array = np.sqrt(np.trace(self.covariance_at(points), axis1=1, axis2=2))
+        return error
+
+    def check(
+        self, camera_points: ArrayLike, robot_points: ArrayLike, *, level: float = STALE_LEVEL
+    ) -> Drift:
+        """Return whether points touched again still lie where the calibration says.
+
+        Offsets are compared with their covariance: that of the new touches, and that of the
+        calibration, which the points have in common. Of several points both all offsets are
+        tested and the one shift that fits them best, each at half the level: a camera that was
+        knocked shifts all of them, and the more are touched the surer that is noticed.
+
+        Args:
+            camera_points: (K, 2), or one point (2,).
+            robot_points: (K, 3) or (3,), where the robot touches them, metres.
+            level: how seldom a calibration that still holds may be called stale, between 0 and 1.
+
+        Raises:
+            CalibrationError: as :meth:`covariance_at`; NOT_FINITE: no such level.
+        """
+        if not 0.0 < level < 1.0:
+            raise CalibrationError(
+                f"level: expected a number between 0 and 1, got {level}",
+                code=Code.NOT_FINITE,
+                expected="a number between 0 and 1",
+                got=level,
+            )
+        seen = as_points(np.atleast_2d(camera_points), 2, "camera points")
+        touched = as_points(np.atleast_2d(robot_points), 3, "robot points")
+        if len(seen) != len(touched) or not len(seen):
+            raise CalibrationError(
+                f"expected as many robot points as camera points ({len(seen)}), one at least, "
+                f"got {len(touched)}",
+                code=Code.SHAPE,
+                expected=len(seen),
+                got=len(touched),
+            )
+        offsets = touched - self.transform(seen)
+        rows = self._rows(seen).reshape(-1, 12)
+        variance = self._variance
+        joint = rows @ self.unit_covariance @ rows.T + np.eye(len(rows))
+        squared = float(offsets.ravel() @ np.linalg.solve(joint, offsets.ravel()))
+        each = np.tile(np.eye(3), (len(seen), 1))
+        weighted = np.linalg.solve(joint, each)
+        pull = weighted.T @ offsets.ravel()
+        shifted = float(pull @ np.linalg.solve(each.T @ weighted, pull))
+        noise = Noise(
+            max(variance, (NEGLIGIBLE * self.place.robot_size) ** 2),
+            None if self.sigma_given else self.freedom,
+        )
+        chance = noise.chance(squared, len(rows))
+        if len(seen) > 1:
+            chance = min(1.0, 2.0 * min(chance, noise.chance(shifted, 3)))
+        expected = math.sqrt(variance * float(np.trace(joint)) / len(seen))
+        return Drift(offsets, expected, chance, normal_deviations(chance), chance < level)
+
+    def at_height(self, height: float, camera_position: ArrayLike) -> PlaneCalibration:
+        """Return the calibration for features that lie over the touched plane.
+
+        What is seen at height h lies where the ray from the camera passes the plane raised by h.
+
+        Args:
+            height: over the touched plane, towards the camera, metres.
+            camera_position: (3,), the camera's centre of projection in the robot's space, metres.
+
+        Raises:
+            CalibrationError: OUT_OF_FIELD: the camera is not over that plane.
+        """
+        camera = as_vector(camera_position, 3, "camera position")
+        distance = abs(float((camera - self._map.origin) @ self.normal))
+        if not (math.isfinite(height) and distance > max(height, 0.0)):
+            raise CalibrationError(
+                f"expected a height below the camera's ({distance:.6g} m), got {height:.6g} m",
+                code=Code.OUT_OF_FIELD,
+                expected=distance,
+                got=height,
+            )
+        part = height / distance
+        matrix = self.matrix.copy()
+        matrix[:3] = (1 - part) * matrix[:3] + part * np.outer(camera, matrix[3])
+        place = dataclasses.replace(
+            self.place,
+            robot=(1 - part) * self.place.robot + part * camera,
+            robot_size=(1 - part) * self.place.robot_size,
+        )
+        return dataclasses.replace(self, matrix=matrix, place=place, height=self.height + height)
+
+    def _check(self, found: Mapping[str, Any], called: str) -> None:
+        names = ("robot_points", "weights", "residuals", "leave_one_out")
+        storage.check_counts(found, names, len(self.camera_points), called)
+        if np.count_nonzero(self.weights) < 3:
+            raise storage.refused(
+                called, "weights: expected 3 that are not 0", self.weights.tolist()
+            )
+        if self.unit_covariance.shape != (12, 12):
+            raise storage.refused(called, "unit_covariance: expected rows of 12", None)
+        _ = self._map  # refused here, not with the first part
+
+
+def fit_plane(
+    camera_points: ArrayLike,
+    robot_points: ArrayLike,
+    *,
+    model: PlaneModel = "auto",
+    touch_sigma: float | None = None,
+    weights: ArrayLike | None = None,
+    nominal_scale: float | None = None,
+    tool_z: ArrayLike | None = None,
+    robust: bool = False,
+    robot_frame: str = "robot",
+    camera_frame: str | None = None,
+    y_down: bool | None = None,
+) -> PlaneCalibration:
+    """Return the map from the camera's plane to the robot, fitted to points that both have seen.
+
+    Args:
+        camera_points: (N, 2), where the camera sees them: metres, pixels or whatever it speaks.
+        robot_points: (N, 3), where the robot touches them, metres. Any order, the same in both.
+        model: ``rigid`` (3 points or more, scale as ``nominal_scale``, 1 without), ``similarity``
+            (3), ``affine`` (3), ``homography`` (4: a tilted camera whose lens is corrected for), or
+            ``auto``: the one with the smallest held-out error; a more general one must also fit
+            better than noise alone explains in 99 of 100 cases. ``rigid`` takes part where
+            ``nominal_scale`` is given.
+        touch_sigma: standard deviation of one coordinate of a touch, robot and camera together,
+            metres; None: estimated from the residuals.
+        weights: (N,), one over the relative variance of each touch.
+        nominal_scale: metres for each unit of the camera's points, as it should be.
+        tool_z: (3,) or (N, 3), direction of the tool's axis, into the plane, when it touched. Three
+            dimensions have room for a mirrored plane, so only this tells whether y points the wrong
+            way.
+        robust: leave out points that do not agree with the others (6 points or more, of which more
+            than half agree; MSAC). They keep their place among the points, with the weight 0, and
+            each is named by a warning OUTLIER. Which they are does not depend on ``model``. Give
+            ``touch_sigma``: without it fewer are found, and only such as are further off.
+        robot_frame: name of the frame that poses will be given in.
+        camera_frame: name of the frame that localizations must come in; None for any.
+        y_down: whether the camera's y axis points down and was turned up before the points came;
+            None: not known. Kept, and compared where the calibration is used; nothing is turned.
+
+    Raises:
+        CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
+            COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, SCALE_MISMATCH where
+            ``rigid`` was asked for, or with ``robust`` OUTLIER: no map agrees with more than half
+            of the points; OUT_OF_FIELD: one left out is behind the plane's horizon.
+        MissingExtraError: SciPy is not installed.
+        ValueError: no model has that name.
+    """
+    if model != "auto" and model not in MODELS:
+        raise ValueError(f"model: expected auto, {', '.join(MODELS)}, got {model!r}")
+    camera, robot, parts = read_pairs(camera_points, robot_points, weights)
+    check_positive(touch_sigma, "touch_sigma", "metres")
+    check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
+    kept = np.arange(len(camera))
+    if robust:
+        kept = np.flatnonzero(agreeing(camera, robot, parts, touch_sigma))
+    least = MODELS["similarity" if model == "auto" else model].least
+    check_samples(camera[kept], robot[kept], least, touch_sigma)
+    side = None if tool_z is None else mean_axis(tool_z, len(camera))
+    place, pairs = normalize(camera[kept], robot[kept], parts[kept])
+    sigma = None if touch_sigma is None else touch_sigma / place.robot_size
+    unit = place.camera_size / place.robot_size
+    nominal = 1.0 if nominal_scale is None and model == "rigid" else nominal_scale
+    candidates = Candidates(pairs, None if nominal is None else nominal * unit)
+    first: ModelName = candidates.simplest() if model == "auto" else model
+    preferred = candidates.choose(sigma, first)
+    fitted = candidates.require(preferred if model == "auto" else model)
+    held_out = candidates.held_out(fitted)
+    matrix = place.outward(fitted.matrix)
+    plane = PlaneMap(matrix, place.camera)
+    evidence = Evidence(
+        pairs=pairs,
+        fitted=fitted,
+        candidates=candidates,
+        preferred=preferred,
+        asked=model != "auto",
+        held_out=held_out,
+        sigma=sigma,
+        place=place,
+        nominal_scale=nominal,
+        side=None if side is None else check_side(plane.frame[:, 2], side),
+        numbers=1 + kept,
+    )
+    estimate = _estimated(fitted, pairs.weights)
+    if robust and touch_sigma is None and estimate is not None:
+        check_lever(lever(robot[kept]), place.robot_size * estimate)
+    off = np.setdiff1d(np.arange(len(camera)), kept)
+    missed = np.zeros_like(robot)
+    missed[off] = robot[off] - plane.transform(camera[off])
+    compared: list[ModelName] = [*candidates.names] if model == "auto" else [fitted.model]
+    found = PlaneCalibration(
+        model=fitted.model,
+        camera_points=camera,
+        robot_points=robot,
+        weights=_put(np.zeros(len(camera)), kept, parts[kept]),
+        matrix=matrix,
+        place=place,
+        unit_covariance=fitted.unit_covariance / place.robot_size**2,
+        residuals=_put(missed, kept, place.robot_size * fitted.residuals),
+        leave_one_out=_put(missed, kept, place.robot_size * held_out),
+        freedom=fitted.freedom,
+        touch_sigma=touch_sigma
+        if estimate is None or touch_sigma is not None
+        else place.robot_size * estimate,
+        sigma_given=touch_sigma is not None,
+        candidates={
+            name: None if math.isnan(error) else place.robot_size * error
+            for name, error in candidates.errors(compared).items()
+        },
+        nominal_scale=nominal_scale,
+        tool_z=side,
+        robot_frame=robot_frame,
+        camera_frame=camera_frame,
+        y_down=y_down,
+        warnings=findings(evidence),
+    )
+    remarks = [_left_out(found, index, parts[index]) for index in found.outliers]
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
+
+
+def _put(whole: Array, at: NDArray[np.intp], values: Array) -> Array:
+    """Return a copy of ``whole`` with ``values`` in some rows."""
+    result = whole.copy()
+    result[at] = values
+    return result
+
+
+def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
+    """Say how far off a point lies that was left out, and how far touching explains."""
+    distance = float(np.linalg.norm(found.residuals[index]))
+    variance = 3.0 / weight * (found.touch_sigma or 0.0) ** 2
+    variance += float(found.predicted_error(found.camera_points[index : index + 1])[0]) ** 2
+    return Remark(
+        Code.OUTLIER,
+        f"point {1 + index} is left out: it lies {1e3 * distance:.3g} mm from where the others "
+        f"say, where touching explains {1e3 * math.sqrt(variance):.3g} mm rms",
+    )
+
+
+def _estimated(fitted: Fit, weights: Array) -> float | None:
+    """Return the sigma that the residuals speak of, None without a degree of freedom."""
+    if not fitted.freedom:
+        return None
+    return math.sqrt(squares(fitted.residuals, weights) / fitted.freedom)
+
+
+def mean_axis(tool_z: ArrayLike, count: int) -> Array:
+    """Return the mean direction (3,) of a tool's axis, of length 1.
+
+    ``tool_z``: (3,), or (``count``, 3), of each touch. Raises SHAPE, NOT_FINITE, or COINCIDENT: it
+    has no length.
+    """
+    given = np.asarray(tool_z, dtype=np.float64)
+    if given.shape == (count, 3):
+        axes = as_points(given, 3, "tool axis")
+        given = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).mean(axis=0)
+    axis = as_vector(given, 3, "tool axis")
+    length = float(np.linalg.norm(axis))
+    if not length > LEAST_AXIS:
+        raise CalibrationError(
+            f"tool axis: expected a direction, got {axis.tolist()}",
+            code=Code.COINCIDENT,
+            expected="a direction",
+            got=axis.tolist(),
+        )
+    return axis / length

@@ -1,0 +1,238 @@
+"""What one should know of a calibration that could be made: the tests behind its warnings.
+
+Each test calls a healthy calibration suspicious in at most one of 100 cases.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code, Remark
+from smartcam.calibration._plane.model_selection import squares, touch_noise
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._plane.fitting import Fit, ModelName, Normalization, Pairs
+    from smartcam.calibration._plane.model_selection import Candidates
+
+LEVEL = 0.01
+"""How seldom noise alone may cause a warning."""
+
+SCALE_TOLERANCE = 0.005
+"""Of the nominal scale: what printers and heights of parts are allowed."""
+
+SCALE_LIMIT = 0.1
+"""Of the nominal scale: beyond it, units or sheets were mixed up."""
+
+LEAST_COSINE = 0.17
+"""Between tool and normal: closer to a right angle the tool's axis does not tell the side."""
+
+LEAST_FREEDOM = 6
+"""An estimated sigma with fewer degrees of freedom is off by 30 percent and more (derived)."""
+
+_TINY = 1e-8
+
+
+class Evidence(NamedTuple):
+    """What the tests look at; lengths in units of ``place``."""
+
+    pairs: Pairs
+    fitted: Fit  # the fit that was chosen
+    candidates: Candidates  # the fits of the other models
+    preferred: ModelName  # the model that the points ask for
+    asked: bool  # whether the user named the model
+    held_out: Array  # (N, 3), of the chosen fit
+    sigma: float | None  # of a touch; None where it was not given
+    place: Normalization  # centre and size of the points
+    nominal_scale: float | None  # metres for each unit of the camera; None where it was not given
+    # the cosine between tool and normal, None where the tool's axis was not given
+    side: float | None
+    numbers: NDArray[np.intp]  # (N,), what texts call the points
+
+
+def findings(evidence: Evidence) -> tuple[Remark, ...]:
+    """Return the warnings, the most serious first."""
+    tests = (_planarity, _fit, _model, _scale, _held_out, _touches, _side)
+    return tuple(remark for test in tests for remark in test(evidence))
+
+
+def check_side(normal: Array, tool_z: Array) -> float:
+    """Return the cosine between a tool's axis and the plane's normal (MIRRORED: the same side)."""
+    cosine = float(normal @ tool_z) / float(np.linalg.norm(tool_z))
+    if cosine > LEAST_COSINE:
+        raise CalibrationError(
+            "expected the plane's normal to point against the tool, got one along it (cosine "
+            f"{cosine:.2f}): the camera's y axis points the wrong way, or points are swapped",
+            code=Code.MIRRORED,
+            expected=-1.0,
+            got=cosine,
+        )
+    return cosine
+
+
+def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: bool) -> str | None:
+    """Return the remark on a scale that is not the nominal one, None where it is.
+
+    Scales are metres for each unit of the camera; ``uncertainty`` is the standard deviation of
+    ``measured`` over it. Raises SCALE_MISMATCH: it is off by more than a tenth, or at all where it
+    must be ``exact``.
+    """
+    off = measured / nominal - 1.0
+    if abs(off) <= max(SCALE_TOLERANCE, 3.0 * uncertainty):
+        return None
+    percent = f"{100 * off:+.2g}" if abs(off) < 0.1 else f"{100 * off:+.0f}"
+    text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
+    text += f" ({percent} %): the print, the units or the height are other than thought"
+    if exact or abs(off) > SCALE_LIMIT:
+        raise CalibrationError(text, code=Code.SCALE_MISMATCH, expected=nominal, got=measured)
+    return text
+
+
+def _planarity(evidence: Evidence) -> Iterator[Remark]:
+    """Compare what is out of the plane with the given noise, or with what is left inside it."""
+    flat, weights, count = evidence.candidates.get("affine"), evidence.pairs.weights, -3
+    count += len(weights)
+    if flat is None or not count:
+        return
+    normal = np.cross(*flat.matrix[:3, :2].T)
+    normal /= np.linalg.norm(normal)
+    out = flat.residuals @ normal
+    squared = float((weights * out**2).sum())
+    fitted = evidence.fitted.residuals
+    within = squares(fitted - np.outer(fitted @ normal, normal), weights)
+    noise = touch_noise(evidence.sigma, within, evidence.fitted.freedom - count)
+    if noise is not None and noise.chance(squared, count) < LEVEL:
+        worst, mm = int(np.argmax(weights * out**2)), 1e3 * evidence.place.robot_size
+        yield Remark(
+            Code.NOT_PLANAR,
+            f"the touched points lie {mm * math.sqrt(squared / count):.3g} mm rms out of a plane, "
+            f"where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
+            f"point {evidence.numbers[worst]} is the furthest, "
+            f"{mm * abs(float(out[worst])):.3g} mm",
+        )
+
+
+def _fit(evidence: Evidence) -> Iterator[Remark]:
+    """Look for one point that is far worse than the others, then at all of them together."""
+    fitted, weights = evidence.fitted, evidence.pairs.weights
+    total = squares(fitted.residuals, weights)
+    chances = [_chance_among(evidence, squared, total) for squared in _studentized(fitted)]
+    worst = int(np.argmin(chances))
+    if chances[worst] * len(chances) < LEVEL:
+        residual = 1e3 * evidence.place.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
+        yield Remark(
+            Code.OUTLIER,
+            f"point {evidence.numbers[worst]} fits far worse than the others: its residual of "
+            f"{residual:.3g} mm comes by chance once in {1 / max(chances[worst], 1e-12):.3g} "
+            "touches",
+        )
+        return
+    noise = touch_noise(evidence.sigma, 0.0, 0)
+    if noise is not None and fitted.freedom and noise.chance(total, fitted.freedom) < LEVEL:
+        found = evidence.place.robot_size * math.sqrt(total / fitted.freedom)
+        yield Remark(
+            Code.POOR_FIT,
+            f"the residuals speak of touches with a sigma of {1e3 * found:.3g} mm, "
+            f"where {1e3 * evidence.place.robot_size * math.sqrt(noise.variance):.3g} mm was given",
+        )
+
+
+def _chance_among(evidence: Evidence, squared: float, total: float) -> float:
+    """Return the probability of one residual's square, by the others where they are enough."""
+    freedom = evidence.fitted.freedom - 3
+    sigma = evidence.sigma if freedom < LEAST_FREEDOM else None
+    noise = touch_noise(sigma, max(total - squared, 0.0), freedom)
+    return 1.0 if noise is None else noise.chance(squared, 3)
+
+
+def _studentized(fitted: Fit) -> Array:
+    """Return each residual's square in units of its own variance (N,), 0 where it has none."""
+    values, vectors = np.linalg.eigh(fitted.blocks)
+    along = np.einsum("nij,ni->nj", vectors, fitted.residuals)
+    known = values > _TINY * values.max()
+    squared: Array = np.where(known, along**2 / np.where(known, values, 1.0), 0.0).sum(axis=1)
+    return squared
+
+
+def _model(evidence: Evidence) -> Iterator[Remark]:
+    """Say that one scale for the whole field does not do, or another model than asked for does."""
+    used, preferred = evidence.fitted.model, evidence.preferred
+    if preferred not in {"affine", "homography"} or (evidence.asked and used == preferred):
+        return
+    simple: ModelName = used if evidence.asked else "similarity"
+    errors = [
+        1e3 * evidence.place.robot_size * evidence.candidates.error(name)
+        for name in (simple, preferred)
+    ]
+    text = (
+        f"held-out error with the model {simple} {errors[0]:.3g} mm, with {preferred} "
+        f"{errors[1]:.3g} mm: the camera is tilted or its lens distorts"
+    )
+    yield Remark(Code.NOT_SIMILAR, f"{text}; {used} was asked for" if evidence.asked else text)
+
+
+def _scale(evidence: Evidence) -> Iterator[Remark]:
+    similar = evidence.candidates.get("similarity")
+    if evidence.nominal_scale is None or similar is None:
+        return
+    unit = evidence.place.robot_size / evidence.place.camera_size
+    measured = unit * float(np.linalg.norm(similar.matrix[:3, 0]))
+    total = squares(similar.residuals, evidence.pairs.weights)
+    noise = touch_noise(evidence.sigma, total, similar.freedom)
+    weight = float(evidence.pairs.weights.sum())
+    uncertainty = 0.0 if noise is None else math.sqrt(noise.variance / weight)
+    exact = evidence.fitted.model == "rigid"
+    text = check_scale(measured, evidence.nominal_scale, uncertainty, exact=exact)
+    if text is not None:
+        yield Remark(Code.SCALE_MISMATCH, text)
+
+
+def _held_out(evidence: Evidence) -> Iterator[Remark]:
+    missing = np.flatnonzero(np.isnan(evidence.held_out).any(axis=1))
+    if len(missing) == len(evidence.held_out):
+        yield Remark(
+            Code.NOT_HELD_OUT,
+            f"{len(missing)} points are no more than {evidence.fitted.model} has need of: none can "
+            "be left out to see how good the calibration is, and the residuals do not tell",
+        )
+    elif len(missing):
+        yield Remark(
+            Code.NOT_HELD_OUT,
+            f"without point {evidence.numbers[missing[0]]} the others give no calibration: "
+            "nothing checks it",
+        )
+
+
+def _touches(evidence: Evidence) -> Iterator[Remark]:
+    freedom = evidence.fitted.freedom
+    if evidence.sigma is None and freedom < LEAST_FREEDOM:
+        how = f"is estimated from {freedom} degrees of freedom only" if freedom else "is not known"
+        yield Remark(
+            Code.UNVERIFIED,
+            f"the touches' sigma {how}: give touch_sigma or touch more points",
+        )
+
+
+def _side(evidence: Evidence) -> Iterator[Remark]:
+    return remark_side(evidence.side)
+
+
+def remark_side(side: float | None) -> Iterator[Remark]:
+    """Say that the tool's axis does not tell the side of the plane.
+
+    ``side``: the cosine between tool and normal, None where the tool's axis was not given.
+    """
+    if side is None or abs(side) <= LEAST_COSINE:
+        yield Remark(
+            Code.SIDE_UNKNOWN,
+            "the tool's axis does not tell from which side the plane is touched: that the camera's "
+            "y axis points the right way is not checked",
+        )

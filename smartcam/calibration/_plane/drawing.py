@@ -1,0 +1,293 @@
+"""A picture of a plane calibration, as SVG: what was touched, how well it fits, how good it is.
+
+It shows the camera's plane as the camera sees it, x to the right and y up. Errors are far too small
+to be seen, so residuals and ellipses are drawn larger, by a factor that the picture names.
+"""
+
+from __future__ import annotations
+
+import math
+from html import escape
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.models import Localization
+
+WIDTH: Final = 900.0
+"""Of the field, pixels; the height follows from the points."""
+
+BORDER: Final = 60.0
+FOOT: Final = 130.0
+"""Pixels around the field, and for the legend below it."""
+
+MARGIN: Final = 0.15
+"""Of the extent of what is shown, around it."""
+
+COLUMNS: Final = 30
+"""Cells of the heat map across; as many down as make them square, at most twice that."""
+
+ELLIPSE: Final = math.sqrt(-2.0 * math.log(0.05))
+"""Standard deviations in which 95 % of a plane's normal distribution lie."""
+
+OUTLINE: Final = 24
+"""Points of an ellipse."""
+
+TINY: Final = 1e-9
+"""Of the field's width: errors below it are not drawn larger."""
+
+LOW, HIGH = (240, 247, 252), (246, 196, 140)
+"""Colours of the smallest and the largest predicted error."""
+
+STYLE: Final = """\
+marker { overflow: visible } text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px }
+.camera { stroke: #777; fill: none; stroke-width: 2 } .robot { stroke: #1f5fbf; fill: none; \
+stroke-width: 2 }
+.camera-name { fill: #777 } .robot-name { fill: #1f5fbf }
+.touch { fill: #333 } .residual { stroke: #c0392b; stroke-width: 1.5 }
+.left-out { stroke: #777; stroke-width: 1.5 }
+.ellipse { fill: none; stroke: #7d3c98 } .part { stroke: #0b7a4b; fill: none; stroke-width: 1.5 }
+.part-name { fill: #0b7a4b }"""
+
+HEADS: Final = "".join(
+    f'<marker id="{kind}-head" refX="8" refY="4" orient="auto" '
+    f'markerUnits="userSpaceOnUse"><path d="M0 0 L8 4 L0 8" class="{kind}"/></marker>'
+    for kind in ("camera", "robot")
+)
+"""Of the axes' arrows."""
+
+
+class _View:
+    """What is shown of the camera's plane, and how it becomes pixels of the picture.
+
+    Args:
+        shown: (N, 2), points that are in it.
+    """
+
+    def __init__(self, shown: Array) -> None:
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        margin = MARGIN * float((high - low).max())
+        self.low: Array = low - margin
+        self.high: Array = high + margin
+        width, height = (self.high - self.low).tolist()
+        self.zoom: float = WIDTH / width
+        self.height: float = height * self.zoom
+        self.foot: float = 2 * BORDER + self.height
+
+    def pixels(self, points: Array) -> Array:
+        """Return points (..., 2) in pixels."""
+        corner = np.array([BORDER, BORDER + self.height])
+        pixels: Array = corner + (points - self.low) * self.zoom * [1.0, -1.0]
+        return pixels
+
+
+def draw(
+    calibration: PlaneCalibration, parts: Iterable[Localization] = (), *, title: str = ""
+) -> str:
+    """Return a picture of a calibration.
+
+    Grey is the camera's frame, blue the directions of the robot's axes as they lie in the plane:
+    the longer, the flatter they lie. Black points were touched; from each a red line goes to where
+    the touch says that it is, its residual. The background is the predicted error, violet ellipses
+    hold 95 % of it. Where nothing tells how well points were touched, both are missing. Points that
+    a robust fit left out are grey crosses, without residual and ellipse; one that lies far beyond
+    the others is not shown.
+
+    ``parts``: localizations in the camera's frame that are shown, too, in green. ``title``: a line
+    on top. The SVG document has a size of its own and no parts elsewhere; lines end with a line
+    feed.
+    """
+    found = list(parts)
+    counted = calibration.weights > 0.0
+    points, off = calibration.camera_points[counted], calibration.camera_points[~counted]
+    places = np.array([part.pose.position[:2] for part in found]).reshape(-1, 2)
+    both = np.concatenate([points, places])
+    low, high = both.min(axis=0), both.max(axis=0)
+    near = (np.abs(off - (low + high) / 2) < high - low).all(axis=1)
+    field = _View(np.concatenate([both, off[near]]))
+    residuals = calibration.inverse(calibration.robot_points[counted]) - points
+    outlines = _outlines(calibration, both)
+    sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
+    largest = field.zoom * float(np.linalg.norm(sizes, axis=1).max())
+    larger = _round(0.06 * WIDTH / largest) if largest > TINY * WIDTH else 1.0
+    width, height = f"{WIDTH + 2 * BORDER:.0f}", f"{field.foot + FOOT:.0f}"
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+        f'viewBox="0 0 {width} {height}">',
+        f"<style>{STYLE}</style><defs>{HEADS}</defs>",
+        f'<rect width="{width}" height="{height}" fill="#fff"/>',
+        *_heat(calibration, field),
+        *_axes(calibration, field),
+        *(_polygon(field.pixels(one)) for one in both[: len(outlines), None] + larger * outlines),
+        *_touches(calibration, field, points + larger * residuals),
+        *(_part(part, place) for part, place in zip(found, field.pixels(places), strict=True)),
+        *_legend(calibration, field, larger, title),
+        "</svg>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _round(wanted: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, as large as is wanted at most."""
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
+
+
+def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
+    """Return the outlines of the 95 % ellipses about points, as the camera would see them.
+
+    They are (N, OUTLINE, 2), from each point; none where nothing tells how well points were
+    touched.
+    """
+    if calibration.touch_sigma is None:
+        return np.zeros((0, OUTLINE, 2))
+    inside = calibration.rotation[:, :2]
+    covariances = inside.T @ calibration.covariance_at(points) @ inside
+    values, vectors = np.linalg.eigh(covariances)
+    lengths = ELLIPSE * np.sqrt(np.maximum(values, 0.0))
+    # the symmetric root: axes alone may point to either side
+    half = (vectors * lengths[:, None, :]) @ vectors.swapaxes(1, 2)
+    angles = np.linspace(0.0, math.tau, OUTLINE, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)])
+    outlines = (half @ circle).swapaxes(1, 2) @ inside.T  # metres in the robot's space
+    centres = calibration.transform(points)
+    seen = calibration.inverse((centres[:, None] + outlines).reshape(-1, 3))
+    return seen.reshape(len(points), OUTLINE, 2) - points[:, None]
+
+
+def _heat(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
+    """Yield the predicted error as coloured cells."""
+    if calibration.touch_sigma is None:
+        return
+    cell = WIDTH / COLUMNS
+    rows = min(2 * COLUMNS, max(1, round(field.height / cell)))
+    tall = field.height / rows
+    corners = [[x * cell, y * tall] for y in range(rows) for x in range(COLUMNS)]
+    middles = np.array(corners) + np.array([cell / 2, tall / 2])
+    seen = field.low + np.column_stack([middles[:, 0], field.height - middles[:, 1]]) / field.zoom
+    errors = calibration.predicted_error(seen)
+    low, high = float(errors.min()), float(errors.max())
+    parts = (errors - low) / (high - low) if high > low else np.zeros_like(errors)
+    yield '<g shape-rendering="crispEdges">'
+    for (x, y), part in zip(corners, parts.tolist(), strict=True):
+        yield _cell(BORDER + x, BORDER + y, cell, tall, part)
+    yield "</g>"
+    for step in range(11):
+        yield _cell(BORDER + 20 * step, field.foot + 45, 20, 14, step / 10)
+    text = f"predicted error: {1e3 * low:.3f} mm to {1e3 * high:.3f} mm rms"
+    yield _text((BORDER + 232, field.foot + 57), text)
+
+
+def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
+    """Return a cell with a colour between the two, in steps that rounding does not change."""
+    level = round(20 * part) / 20
+    channels = (round(a + level * (b - a)) for a, b in zip(LOW, HIGH, strict=True))
+    return (
+        f'<rect x="{x:.2f}" y="{y:.2f}" width="{wide:.2f}" height="{tall:.2f}" '
+        f'fill="#{"".join(f"{channel:02x}" for channel in channels)}"/>'
+    )
+
+
+def _axes(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
+    """Yield the axes of the camera and of the robot.
+
+    The camera's are at its origin where that is shown, else at a corner; the robot's, as they lie
+    in the plane, below the field's lower right corner.
+    """
+    start = field.pixels(np.clip(np.zeros(2), field.low, field.high))
+    yield from _axis(start, np.array([70.0, 0.0]), "camera", "camera x")
+    yield from _axis(start, np.array([0.0, -70.0]), "camera", "y")
+    start = np.array([BORDER + WIDTH - 90, field.foot + 35])
+    for axis, name in zip(calibration.rotation[:, :2], ("robot x", "y", "z"), strict=True):
+        if np.linalg.norm(axis) < 0.05:  # it stands on the plane
+            yield _dot(start, 4, "robot")
+            yield _text(start, name, "robot-name", beside=(7, 15))
+        else:
+            yield from _axis(start, 60 * axis * [1, -1], "robot", name)
+
+
+def _axis(start: Array, along: Array, kind: str, name: str) -> Iterator[str]:
+    end = start + along
+    yield _line(start, end, kind, f' marker-end="url(#{kind}-head)"')
+    yield _text(end + 8 * along / np.linalg.norm(along), name, f"{kind}-name", beside=(0, 4))
+
+
+def _touches(calibration: PlaneCalibration, field: _View, ends: Array) -> Iterator[str]:
+    counted = calibration.weights > 0.0
+    places = field.pixels(calibration.camera_points)
+    numbers = np.flatnonzero(counted)
+    for number, place, end in zip(numbers, places[counted], field.pixels(ends), strict=True):
+        yield _line(place, end, "residual")
+        yield _dot(place, 4, "touch")
+        yield _text(place, str(1 + number), beside=(7, -7))
+    for index in calibration.outliers:
+        point, place = calibration.camera_points[index], places[index]
+        if (point > field.low).all() and (point < field.high).all():
+            for stroke in (np.array([5.0, 5.0]), np.array([5.0, -5.0])):
+                yield _line(place - stroke, place + stroke, "left-out")
+            yield _text(place, str(1 + index), beside=(7, -7))
+
+
+def _part(part: Localization, place: Array) -> str:
+    theta = part.pose.orientation.theta
+    along = 18 * np.array([math.cos(theta), -math.sin(theta)])
+    name = _text(place, part.feature_id, "part-name", beside=(10, 20))
+    return _dot(place, 7, "part") + _line(place, place + along, "part") + name
+
+
+def _legend(
+    calibration: PlaneCalibration, field: _View, larger: float, title: str
+) -> Iterator[str]:
+    if title:
+        yield _text((BORDER, 30), title, "title")
+    error, count = calibration.held_out_error, len(calibration.camera_points)
+    left_out = len(calibration.outliers)
+    yield _text(
+        (BORDER, field.foot),
+        f"{calibration.model}, {f'{count - left_out} of ' if left_out else ''}{count} touches; "
+        f"held-out error {'not known' if error is None else f'{1e3 * error:.3f} mm rms'}",
+    )
+    yield _text(
+        (BORDER, field.foot + 25),
+        f"residuals (red) and 95 % ellipses (violet) {larger:g} times larger than they are"
+        f"{'; crosses: left out' if left_out else ''}",
+    )
+    per_metre = field.zoom / calibration.scale
+    metres = _round(0.2 * WIDTH / per_metre)
+    end = np.array([BORDER + WIDTH - 220, field.foot])
+    start = end - [metres * per_metre, 0.0]
+    yield _line(start, end, "camera")
+    yield _text(start, f"{1e3 * metres:g} mm", beside=(0, 18))
+
+
+def _dot(place: Array, radius: int, kind: str) -> str:
+    return f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="{radius}" class="{kind}"/>'
+
+
+def _polygon(corners: Array) -> str:
+    text = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners)
+    return f'<polygon points="{text}" class="ellipse"/>'
+
+
+def _line(start: Array, end: Array, kind: str, more: str = "") -> str:
+    return (
+        f'<line x1="{start[0]:.2f}" y1="{start[1]:.2f}" x2="{end[0]:.2f}" y2="{end[1]:.2f}" '
+        f'class="{kind}"{more}/>'
+    )
+
+
+def _text(
+    place: Array | tuple[float, float],
+    text: str,
+    kind: str = "",
+    *,
+    beside: tuple[float, float] = (0.0, 0.0),
+) -> str:
+    of_kind = f' class="{kind}"' if kind else ""
+    x, y = place[0] + beside[0], place[1] + beside[1]
+    return f'<text x="{x:.2f}" y="{y:.2f}"{of_kind}>{escape(text)}</text>'

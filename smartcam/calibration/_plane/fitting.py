@@ -1,0 +1,344 @@
+"""From pairs of points to the map between them, and how well it is known; pure.
+
+A camera that looks at a plane maps it to its image by a homography. Together with where the plane
+lies in the robot's space that is one matrix: ``w (x, y, z, 1) = matrix (u, v, 1)``, with 11 degrees
+of freedom. The models are parts of that: affine (9) has ``w = 1``, similarity (7) has axes of equal
+length at right angles, rigid (6) has a scale that is known beforehand.
+
+All four are fitted by least squares in the robot's space, which for equal independent noise on each
+axis of each touch is the most likely answer; noise of the camera counts as noise of the touch.
+Points are centred and scaled first. The covariance is that of the matrix' 12 elements, whatever the
+model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._files import storage
+from smartcam.calibration._geometry.homography import apply_homography, element_derivatives
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.calibration._geometry.rotations import Array
+
+ModelName: TypeAlias = Literal["rigid", "similarity", "affine", "homography"]
+
+LEAST_CONDITION = 1e-4
+"""Smallest over largest singular value of a fit's column-scaled Jacobian.
+
+Healthy layouts have 0.03 and more; a parameter that is not determined gives rounding errors, below
+1e-10 (measured).
+"""
+
+MOST_STEPS = 50
+"""Of the homography's refinement; it takes 3 to 8."""
+
+MOST_HALVINGS = 20
+"""Of a step that makes the sum of squares larger; after them it is as small as rounding lets it."""
+
+SMALLEST_STEP = 1e-13
+"""Of the matrix' elements, which are about 1; the next step would be a thousand times smaller."""
+
+FULL_REFITS = 200
+"""Points up to which a homography is fitted anew without each of them.
+
+Above it the residuals are corrected by their leverage, which is off by the square of a leverage
+that is below 0.1 then.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normalization(storage.Stored):
+    """Where the fit takes place: centres and sizes that bring the points near to 1."""
+
+    camera: storage.Vector2  # centre of the camera's points (2,)
+    camera_size: storage.Positive  # their rms distance from it, in the camera's unit
+    robot: storage.Vector3  # centre of the robot's points (3,), metres
+    robot_size: storage.Positive  # their rms distance from it, metres
+
+    def outward(self, matrix: Array) -> Array:
+        """Return the matrix (4, 3) between the points as they are, from that of the fit."""
+        result = np.concatenate([self.robot_size * matrix[:3], matrix[3:]]) @ self._shrink()
+        result[:3] += np.outer(self.robot, result[3])
+        return result
+
+    def inward(self, matrix: Array) -> Array:
+        """Return the matrix (4, 3) between centred and scaled points; undoes ``outward``."""
+        result = matrix.copy()
+        result[:3] = (result[:3] - np.outer(self.robot, result[3])) / self.robot_size
+        return result @ np.linalg.inv(self._shrink())
+
+    def _shrink(self) -> Array:
+        shrink = np.diag([1.0 / self.camera_size, 1.0 / self.camera_size, 1.0])
+        shrink[:2, 2] = -self.camera / self.camera_size
+        return shrink
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Points of camera and robot that belong together, as the fit sees them."""
+
+    camera: Array  # (N, 2), centred, of rms length 1
+    robot: Array  # (N, 3), centred, of rms length 1
+    weights: Array  # (N,), one over the relative variance of each
+
+    def without(self, index: int) -> Pairs:
+        """Return all but one."""
+        keep = np.arange(len(self.camera)) != index
+        return Pairs(self.camera[keep], self.robot[keep], self.weights[keep])
+
+    @property
+    def homogeneous(self) -> Array:
+        """The camera's points with a third component 1, (N, 3)."""
+        return np.column_stack([self.camera, np.ones(len(self.camera))])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A fitted map."""
+
+    model: ModelName
+    matrix: Array  # (4, 3); between centred points
+    residuals: Array  # (N, 3); robot minus mapped
+    # (12, 12); of the matrix' elements row by row, for a touch variance of 1
+    unit_covariance: Array
+    blocks: Array  # (N, 3, 3); variance of each residual for a touch variance of 1
+    freedom: int  # coordinates minus parameters
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """One kind of map."""
+
+    parameters: int  # degrees of freedom
+    least: int  # points it has need of
+    # gives the matrix of pairs, scale known beforehand (used by ``rigid`` only)
+    solve: Callable[[Pairs, float], Array]
+    # gives the directions (12, parameters) in which a matrix may change
+    tangent: Callable[[Array], Array]
+
+
+def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
+    """Return the most likely map of one model; COLLINEAR: the points do not determine it.
+
+    ``pairs`` are as many as it has need of at least, in both spaces neither the same nor in a line.
+    ``scale``: robot's over camera's length, in their units; for ``rigid`` only.
+    """
+    model = MODELS[name]
+    matrix = model.solve(pairs, scale)
+    tangent = model.tangent(matrix)
+    jacobian = element_derivatives(matrix, pairs.camera) @ tangent
+    root = np.sqrt(pairs.weights)[:, None, None]
+    weighted = (root * jacobian).reshape(-1, model.parameters)
+    # A matrix moves along T: m + T d, so the Jacobian by d is J T. With W^(1/2) J T = U S V^T (its
+    # columns divided by their lengths l) the covariance of m is T (T^T J^T W J T)^-1 T^T = H H^T,
+    # H = T diag(1/l) V S^-1, and the hat matrix of the residuals is U U^T: what is left of a
+    # residual's variance is I - U_i U_i^T, over its weight.
+    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2; Cook and
+    # Weisberg, Residuals and Influence in Regression (1982), chapter 2.
+    lengths = np.linalg.norm(weighted, axis=0)
+    left, singular, right = np.linalg.svd(weighted / lengths, full_matrices=False)
+    condition = float(singular[-1] / singular[0])
+    if condition < LEAST_CONDITION:
+        raise CalibrationError(
+            f"{name}: expected points that determine all {model.parameters} parameters "
+            f"(condition at least {LEAST_CONDITION:g}), got {condition:.2g}: too many in a line",
+            code=Code.COLLINEAR,
+            expected=LEAST_CONDITION,
+            got=condition,
+        )
+    half = tangent @ (right.T / singular / lengths[:, None])
+    rows = left.reshape(-1, 3, model.parameters)
+    hat = rows @ rows.swapaxes(1, 2)
+    return Fit(
+        name,
+        matrix,
+        pairs.robot - apply_homography(matrix, pairs.camera),
+        half @ half.T,
+        (np.eye(3) - hat) / pairs.weights[:, None, None],
+        3 * len(pairs.camera) - model.parameters,
+    )
+
+
+def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
+    """Return each point minus what a fit of all the others says of it, (N, 3).
+
+    NaN where the others alone determine no map. Equal to fitting anew: affine by its leverage,
+    rigid and similarity by taking the point out of the sums, a homography by fitting anew.
+    """
+    if len(pairs.camera) <= MODELS[fitted.model].least:
+        return np.full_like(pairs.robot, np.nan)
+    if fitted.model in {"rigid", "similarity"}:
+        return _held_out_of_sums(pairs, scale if fitted.model == "rigid" else None)
+    if fitted.model == "homography" and len(pairs.camera) <= FULL_REFITS:
+        return np.stack([_held_out_anew(fitted, pairs, i) for i in range(len(pairs.camera))])
+    return _held_out_by_leverage(fitted, pairs)
+
+
+def _held_out_by_leverage(fitted: Fit, pairs: Pairs) -> Array:
+    # Without point i the residual there is (I - H_ii)^-1 e_i, exactly so for what is linear.
+    # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
+    kept = fitted.blocks * pairs.weights[:, None, None]
+    least = np.linalg.eigvalsh(kept)[:, 0]
+    result = np.full_like(pairs.robot, np.nan)
+    known = least > LEAST_CONDITION**2
+    result[known] = np.linalg.solve(kept[known], fitted.residuals[known][..., None])[..., 0]
+    return result
+
+
+def _held_out_anew(fitted: Fit, pairs: Pairs, index: int) -> Array:
+    others = pairs.without(index)
+    try:
+        matrix = fit(fitted.model, others).matrix
+    except CalibrationError:
+        return np.full(3, np.nan)
+    expected = apply_homography(matrix, pairs.camera[index : index + 1])
+    residual: Array = pairs.robot[index] - expected[0]
+    return residual
+
+
+def _held_out_of_sums(pairs: Pairs, scale: float | None) -> Array:
+    """Fit all subsets at once: sums over all minus what the point brought to them."""
+    u, p, w = pairs.camera, pairs.robot, pairs.weights[:, None]
+    # sum w (p - p') (u - u')^T = sum w p u^T - W p' u'^T, with the means p' and u' and W = sum w;
+    # of each subset these are the sums over all points less what one point brought to them.
+    total = w.sum() - w
+    mean_u, mean_p = ((w * u).sum(0) - w * u) / total, ((w * p).sum(0) - w * p) / total
+    cross = np.einsum("ni,nj->nij", w * p, u)
+    cross = cross.sum(0) - cross - np.einsum("ni,nj->nij", total * mean_p, mean_u)
+    square = np.einsum("ni,nj->nij", w * u, u)
+    square = square.sum(0) - square - np.einsum("ni,nj->nij", total * mean_u, mean_u)
+    axes = scaled_axes(cross, np.trace(square, axis1=1, axis2=2), scale)
+    residuals: Array = p - mean_p - np.einsum("nij,nj->ni", axes, u - mean_u)
+    spread = np.linalg.eigvalsh(square)
+    residuals[spread[:, 0] < (LEAST_CONDITION**2) * spread[:, 1]] = np.nan
+    return residuals
+
+
+def scaled_axes(cross: Array, square: Array, scale: float | None) -> Array:
+    """Return the scaled axes (..., 3, 2) that fit sums of products (..., 3, 2) best."""
+    # Of sum (p - p') (u - u')^T = U S V^T the best axes are R = U V^T, and the best scale is
+    # trace(S) / sum |u - u'|^2.
+    # Source: Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point
+    # Patterns (1991).
+    left, singular, right = np.linalg.svd(cross, full_matrices=False)
+    size = singular.sum(-1) / square if scale is None else np.full(square.shape, scale)
+    axes: Array = size[..., None, None] * (left @ right)
+    return axes
+
+
+def _solve_similarity(pairs: Pairs, scale: float | None) -> Array:
+    """Umeyama's solution; from two dimensions to three no reflection can come of it."""
+    u, p, w = pairs.camera, pairs.robot, pairs.weights[:, None]
+    mean_u, mean_p = (w * u).sum(0) / w.sum(), (w * p).sum(0) / w.sum()
+    centred = w * (u - mean_u)
+    cross = (p - mean_p).T @ centred
+    axes = scaled_axes(cross, (centred * (u - mean_u)).sum(), scale)
+    return _matrix(axes, mean_p - axes @ mean_u)
+
+
+def _matrix(axes: Array, offset: Array) -> Array:
+    matrix = np.zeros((4, 3))
+    matrix[:3, :2], matrix[:3, 2], matrix[3, 2] = axes, offset, 1.0
+    return matrix
+
+
+def _solve_affine(pairs: Pairs, _scale: float) -> Array:
+    root = np.sqrt(pairs.weights)[:, None]
+    left, right = root * pairs.homogeneous, root * pairs.robot
+    solution = np.asarray(np.linalg.lstsq(left, right, rcond=None)[0], dtype=np.float64)
+    return _matrix(solution[:2].T, solution[2])
+
+
+def _solve_homography(pairs: Pairs, scale: float) -> Array:
+    """Refine the linear solution until the sum of squares does not get less."""
+    matrix = _linear_homography(pairs, scale)
+    root = np.sqrt(pairs.weights)[:, None]
+    residuals = root * (pairs.robot - apply_homography(matrix, pairs.camera))
+    tangent = _homography_tangent(matrix)
+    for _ in range(MOST_STEPS):
+        moves = element_derivatives(matrix, pairs.camera) @ tangent
+        jacobian = (root[..., None] * moves).reshape(-1, 11)
+        step = tangent @ np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
+        for halving in range(MOST_HALVINGS):
+            following = matrix + 0.5**halving * step.reshape(4, 3)
+            if (pairs.homogeneous @ following[3]).min() <= 0.0:  # a point beyond the horizon
+                continue
+            after = root * (pairs.robot - apply_homography(following, pairs.camera))
+            if (after**2).sum() < (residuals**2).sum():
+                break
+        else:
+            return matrix
+        matrix, residuals = following, after
+        if np.abs(step).max() < SMALLEST_STEP:
+            return matrix
+    return matrix
+
+
+def _linear_homography(pairs: Pairs, scale: float) -> Array:
+    """Return the direct linear solution in the plane that fits the robot's points best."""
+    # In the plane through the robot's points x (h3 u) = h1 u and y (h3 u) = h2 u are linear in the
+    # nine elements; the least singular vector has the least sum of squares at length 1. Back in
+    # space, p = mean + axes (x, y), so the upper rows are axes h12 + mean h3.
+    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 4.1.
+    root = np.sqrt(pairs.weights)[:, None]
+    mean = (pairs.weights[:, None] * pairs.robot).sum(0) / pairs.weights.sum()
+    axes = np.linalg.svd(root * (pairs.robot - mean), full_matrices=False)[2][:2].T
+    inside = (pairs.robot - mean) @ axes
+    u, zero = pairs.homogeneous, np.zeros((len(inside), 3))
+    equations = np.concatenate(
+        [
+            root * np.column_stack([u, zero, -inside[:, :1] * u]),
+            root * np.column_stack([zero, u, -inside[:, 1:] * u]),
+        ]
+    )
+    solution = np.linalg.svd(equations)[2][-1].reshape(3, 3)
+    w = pairs.homogeneous @ solution[2]
+    if abs(solution[2, 2]) < LEAST_CONDITION or w.min() * w.max() <= 0:
+        return _solve_affine(pairs, scale)  # a point beyond the horizon: noise, not a view
+    solution = solution / solution[2, 2]
+    top = axes @ solution[:2] + np.outer(mean, solution[2])
+    return np.concatenate([top, solution[2:]])
+
+
+def rigid_tangent(matrix: Array) -> Array:
+    """Return derivatives of a matrix' elements by a shift and a turn about the centre, (12, 6)."""
+    # exp([w]x) a = a + w x a to first order: of the columns a, not of the centre, which only shifts
+    tangent = np.zeros((4, 3, 6))
+    for axis in range(3):
+        tangent[axis, 2, axis] = 1.0
+        turned = np.cross(np.eye(3)[axis], matrix[:3, :2].T)
+        tangent[:3, :2, 3 + axis] = turned.T
+    return tangent.reshape(12, 6)
+
+
+def _similarity_tangent(matrix: Array) -> Array:
+    growth = np.zeros((4, 3))
+    growth[:3, :2] = matrix[:3, :2]
+    return np.column_stack([rigid_tangent(matrix), growth.ravel()])
+
+
+def _affine_tangent(_matrix: Array) -> Array:
+    return np.eye(12)[:, :9]
+
+
+def _homography_tangent(_matrix: Array) -> Array:
+    return np.eye(12)[:, :11]
+
+
+MODELS: dict[ModelName, Model] = {
+    "rigid": Model(6, 3, _solve_similarity, rigid_tangent),
+    "similarity": Model(
+        7, 3, lambda pairs, _scale: _solve_similarity(pairs, None), _similarity_tangent
+    ),
+    "affine": Model(9, 3, _solve_affine, _affine_tangent),
+    "homography": Model(11, 4, _solve_homography, _homography_tangent),
+}
+"""From the simplest to the most general; each is a special case of the next."""

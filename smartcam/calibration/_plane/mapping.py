@@ -1,0 +1,287 @@
+"""A camera's plane in the robot's space: points there and back, poses there.
+
+The heading of a part is the direction in the plane that its direction in the image becomes at that
+place. For a similarity that is the frame of the plane times the turn about z; a tilted camera bends
+angles a little, which the map's derivative says.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.homography import apply_homography, derivatives, tangent_frames
+from smartcam.calibration._geometry.rotations import (
+    LARGEST,
+    as_points,
+    check_finite,
+    not_finite,
+    quaternion_from_matrix,
+)
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Header, Localization, Pose, Position, Quaternion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from smartcam.calibration._geometry.rotations import Array
+
+FEW = 512
+"""Points up to which numpy is faster than calling OpenCV, and no second library is loaded."""
+
+BLOCK = 65_536
+"""Points that are mapped at once: what is in between stays in the processor's cache, and calls are
+rare enough (16,384 take half as long again, 10^6 a quarter; measured)."""
+
+# half the time of the NamedTuples' own; the cast because a bare tuple is generic
+_new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
+
+
+class PlaneMap:
+    """The map between a camera's plane and the robot's space.
+
+    Args:
+        matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres.
+        centre: (2,), a point that the camera sees; ``w`` is positive there.
+
+    Raises:
+        CalibrationError: NOT_FINITE: the matrix maps the centre nowhere, or all points to a line.
+    """
+
+    def __init__(self, matrix: Array, centre: Array) -> None:
+        self.matrix: Array = matrix
+        """As given."""
+        self._depth: tuple[float, float, float] = tuple(matrix[3].tolist())
+        self._most = 3.0 * float(np.abs(matrix).max())
+        self.projective: bool = bool(matrix[3, :2].any())
+        """Whether parallel lines may meet: a homography."""
+        with np.errstate(all="ignore"):
+            self._prepare(matrix, centre)
+        known = [self.origin, self.frame, self._flat, self._back]
+        if not (all(np.isfinite(one).all() for one in known) and 0 < self.scale < math.inf):
+            raise not_finite("plane's matrix", matrix.tolist())
+
+    def _prepare(self, matrix: Array, centre: Array) -> None:
+        self.origin: Array = apply_homography(matrix, centre[None])[0]
+        """Where the centre lies (3,), metres."""
+        derivative = derivatives(matrix, centre[None])[0]
+        self.scale: float = math.sqrt(np.linalg.norm(np.cross(derivative[:, 0], derivative[:, 1])))
+        """Metres for each unit of the camera there."""
+        self.frame: Array = tangent_frames(derivative[None], np.array([[1.0, 0.0]]))[0]
+        """Rotation (3, 3): x as the camera's x at the centre, z the plane's normal."""
+        inside = self.frame[:, :2].T
+        self._flat = np.vstack(
+            [inside @ matrix[:3] - np.outer(inside @ self.origin, matrix[3]), matrix[3]]
+        )
+        try:
+            self._back = np.asarray(np.linalg.inv(self._flat), dtype=np.float64)
+        except np.linalg.LinAlgError as exc:
+            raise not_finite("plane's matrix", matrix.tolist()) from exc
+        self._turn = Quaternion(*quaternion_from_matrix(self.frame).tolist())
+
+    def transform(self, points: ArrayLike, out: Array | None = None) -> Array:
+        """Return camera points in the robot's space, (N, 3); see ``PlaneCalibration.transform``."""
+        given = np.asarray(points, dtype=np.float64)
+        if given.ndim != 2 or given.shape[1] not in {2, 3}:
+            given = as_points(points, 2, "camera points")
+        result = np.empty((len(given), 3)) if out is None else _checked(out, len(given))
+        if len(given) <= FEW:
+            self._check_horizon(given)
+            with np.errstate(all="ignore"):
+                mapped = given[:, :2] @ self.matrix[:, :2].T + self.matrix[:, 2]
+                np.divide(mapped[:, :3], mapped[:, 3:], out=result)
+            if not np.isfinite(result).all():
+                _check_mapped(given, result)
+            return result
+        source = _Homogeneous(given)
+        for begin in range(0, len(given), BLOCK):
+            block = given[begin : begin + BLOCK]
+            farthest = self._farthest(block)
+            least = self._least_depth(farthest)
+            if not least > 0:
+                self._check_horizon(block)
+            self._fill(source.block(begin), result[begin : begin + BLOCK])
+            if not (least > 0 and self._most * max(farthest, 1.0) / least < LARGEST):
+                _check_mapped(block, result[begin : begin + BLOCK])
+        return result
+
+    def _farthest(self, points: Array) -> float:
+        """Return the largest coordinate; NaN where there is one that must not pass for 0."""
+        if self.projective:  # OpenCV divides by NaN, and gives 0
+            return max(float(points.max()), -float(points.min()))
+        cv2 = load("cv2")
+        size: float = cv2.norm(points.reshape(-1, 1), cv2.NORM_INF)
+        return size
+
+    def _least_depth(self, farthest: float) -> float:
+        """Return the least ``w`` of points whose coordinates are no larger."""
+        u, v, one = self._depth
+        return one - (abs(u) + abs(v)) * farthest
+
+    def _fill(self, homogeneous: Array, result: Array) -> None:
+        """Map contiguous points (n, 3) whose third component is 1."""
+        cv2 = load("cv2")
+        source, target = homogeneous.reshape(-1, 1, 3), result.reshape(-1, 1, 3)
+        if self.projective:
+            matrix = np.zeros((4, 4))
+            matrix[:, :3] = self.matrix
+            cv2.perspectiveTransform(source, matrix, dst=target)
+        else:
+            cv2.transform(source, self.matrix[:3], dst=target)
+
+    def _check_horizon(self, points: Array) -> None:
+        """Raise where a point lies behind the plane's horizon; NaN passes."""
+        if not self.projective or not len(points):
+            return
+        w = points[:, :2] @ self.matrix[3, :2] + self.matrix[3, 2]
+        if (w <= 0).any():
+            raise _behind_horizon(points[int(np.argmin(w)), :2].tolist())
+
+    def inverse(self, points: ArrayLike) -> Array:
+        """Map robot points (N, 3) to the camera's (N, 2); the foot of each counts."""
+        given = as_points(points, 3, "robot points")
+        inside = (given - self.origin) @ self.frame[:, :2]
+        seen = inside @ self._back[:, :2].T + self._back[:, 2]
+        if (seen[:, 2] <= 0).any():
+            raise _behind_horizon(given[int(np.argmin(seen[:, 2]))].tolist())
+        with np.errstate(all="ignore"):
+            image: Array = seen[:, :2] / seen[:, 2:]
+        check_finite(image, "inverse")
+        return image
+
+    def poses(
+        self,
+        localizations: Iterable[Localization],
+        robot_frame: str,
+        camera_frame: str | None,
+        *,
+        flip: bool,
+    ) -> list[Localization]:
+        """Return localizations in the robot's space; see ``PlaneCalibration.to_robot``."""
+        new, atan2, sin, cos = _new_tuple, math.atan2, math.sin, math.cos
+        (a, b, c), (d, e, f), (p, q, one) = self._flat.tolist()
+        (xx, yx, _), (xy, yy, _), (xz, yz, _) = self.frame.tolist()
+        ox, oy, oz = self.origin.tolist()
+        tx, ty, tz, tw = self._turn
+        projective, isfinite = self.projective, math.isfinite
+        last: Header | None = None
+        header: Header | None = None
+        found: list[Localization] = []
+        for feature_id, quality, photo_index, pose in localizations:
+            seen, (u, v, height), (qx, qy, qz, qw) = pose
+            if height or qx or qy:
+                raise _out_of_plane(pose)
+            if seen is not last:
+                header = _header(seen, robot_frame, camera_frame)
+                last = seen
+            # in the plane, from its origin
+            x, y = a * u + b * v + c, d * u + e * v + f
+            direction_u, direction_v = qw * qw - qz * qz, 2.0 * qz * qw
+            along, across = a * direction_u + b * direction_v, d * direction_u + e * direction_v
+            if projective:
+                w = p * u + q * v + one
+                if w <= 0:
+                    raise _behind_horizon([u, v])
+                x, y = x / w, y / w
+                turned = p * direction_u + q * direction_v
+                along, across = along - x * turned, across - y * turned
+            half = 0.5 * atan2(across, along)
+            s, k = sin(half), cos(half)
+            # the plane's turn times the turn about z
+            i, j = tx * k + ty * s, ty * k - tx * s
+            m, r = tz * k + tw * s, tw * k - tz * s
+            orientation = (r, m, -j, -i) if flip else (i, j, m, r)
+            position = (ox + xx * x + yx * y, oy + xy * x + yy * y, oz + xz * x + yz * y)
+            if not isfinite(sum(position) + (i + j + m + r)):  # the sum of numbers is one
+                raise not_finite(f"pose of {feature_id!r:.60}", (*position, *orientation))
+            result = new(Pose, (header, new(Position, position), new(Quaternion, orientation)))
+            found.append(new(Localization, (feature_id, quality, photo_index, result)))
+        return found
+
+
+class _Homogeneous:
+    """Points with a third component 1, a block at a time.
+
+    A point's two coordinates are copied as one complex number, which takes a sixth of the time.
+
+    Args:
+        points: (N, 2), or (N, 3) which is used as it is.
+    """
+
+    def __init__(self, points: Array) -> None:
+        self._points = np.ascontiguousarray(points)
+        self._whole = points.shape[1] == 3
+        if not self._whole:
+            self._pairs = self._points.view(np.complex128)[:, 0]
+            self._buffer = np.ones((min(BLOCK, len(points)), 3))
+            self._places: NDArray[np.complex128] = np.ndarray(
+                (len(self._buffer),), np.complex128, self._buffer, strides=(24,)
+            )
+
+    def block(self, begin: int) -> Array:
+        """Return the next points (n, 3), contiguous, valid until the next call."""
+        if self._whole:
+            return self._points[begin : begin + BLOCK]
+        pairs = self._pairs[begin : begin + BLOCK]
+        self._places[: len(pairs)] = pairs
+        return self._buffer[: len(pairs)]
+
+
+def _check_mapped(given: Array, result: Array) -> None:
+    """Raise where a point came out as no number that was one; of NaN comes NaN."""
+    known = np.isfinite(given).all(axis=1)
+    result[~known] = np.nan
+    wrong = known & ~np.isfinite(result).all(axis=1)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise not_finite(f"point {given[row].tolist()}", result[row].tolist())
+
+
+def _checked(out: Array, count: int) -> Array:
+    fits = out.shape == (count, 3) and out.dtype == np.float64 and out.flags.c_contiguous
+    if not (fits and out.flags.writeable):
+        raise CalibrationError(
+            f"out: expected a contiguous float64 array of shape ({count}, 3), "
+            f"got {out.dtype} of shape {out.shape}",
+            code=Code.SHAPE,
+            expected=(count, 3),
+            got=out.shape,
+        )
+    return out
+
+
+def _header(seen: Header, robot_frame: str, camera_frame: str | None) -> Header:
+    if camera_frame is not None and seen.frame_id != camera_frame:
+        raise CalibrationError(
+            f"expected poses in the frame {camera_frame!r}, got one in {seen.frame_id!r}",
+            code=Code.WRONG_FRAME,
+            expected=camera_frame,
+            got=seen.frame_id,
+        )
+    header: Header = _new_tuple(Header, (seen.seq, seen.stamp, robot_frame))
+    return header
+
+
+def _out_of_plane(pose: Pose) -> CalibrationError:
+    return CalibrationError(
+        "expected a pose in the camera's plane (z = 0, turned about z only), "
+        f"got {tuple(pose.position)} turned by {tuple(pose.orientation)}",
+        code=Code.OUT_OF_PLANE,
+        expected=0.0,
+        got=pose.position.z,
+    )
+
+
+def _behind_horizon(point: list[float]) -> CalibrationError:
+    return CalibrationError(
+        f"expected points that the camera can see of the plane, got {point}: behind its horizon",
+        code=Code.OUT_OF_FIELD,
+        expected="a point before the horizon",
+        got=point,
+    )

@@ -1,0 +1,126 @@
+"""Which model the points ask for.
+
+The rule, from the simplest model upwards: a more general one is taken if its held-out error is
+smaller, and if noise alone would reduce the sum of squared residuals by as much in fewer than one
+of 100 calibrations. A general model always fits better; that it predicts better is what counts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from smartcam.calibration._plane.fitting import MODELS, fit, held_out
+from smartcam.calibration._statistics import Noise
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._plane.fitting import Fit, ModelName, Pairs
+
+LEVEL = 0.01
+"""How seldom noise alone may make a more general model the choice."""
+
+NEGLIGIBLE = 1e-9
+"""Of the points' extent: residuals below it are rounding, not noise."""
+
+
+def squares(residuals: Array, weights: Array) -> float:
+    """Return the weighted sum of squares of (N, 3)."""
+    return float((weights[:, None] * residuals**2).sum())
+
+
+def rms(residuals: Array, weights: Array) -> float:
+    """Return the weighted rms length of (N, 3); NaN where one of them is."""
+    return math.sqrt(squares(residuals, weights) / float(weights.sum()))
+
+
+def touch_noise(sigma: float | None, squared: float, freedom: int) -> Noise | None:
+    """Return the touches' noise: as given, or as a sum of squares with some freedom says.
+
+    None where neither tells it.
+    """
+    if sigma is not None:
+        return Noise(max(sigma, NEGLIGIBLE) ** 2)
+    return Noise(max(squared / freedom, NEGLIGIBLE**2), freedom) if freedom > 0 else None
+
+
+class Candidates:
+    """The fits of several models to the same points, and what they say of points left out.
+
+    Args:
+        pairs: the points.
+        scale: the nominal one in the units of ``pairs``, None where none was given: then there is
+            no ``rigid``.
+    """
+
+    def __init__(self, pairs: Pairs, scale: float | None) -> None:
+        self._pairs, self._scale = pairs, 1.0 if scale is None else scale
+        self._fits: dict[ModelName, Fit | None] = {}
+        self._held_out: dict[ModelName, Array] = {}
+        self.names: list[ModelName] = [
+            name
+            for name, model in MODELS.items()
+            if len(pairs.camera) >= model.least and (name != "rigid" or scale is not None)
+        ]
+        """The models that there are points enough for, from the simplest."""
+
+    def get(self, name: ModelName) -> Fit | None:
+        """Return a model's fit, None where the points do not determine it."""
+        if name not in self._fits:
+            try:
+                self._fits[name] = fit(name, self._pairs, self._scale)
+            except CalibrationError:
+                self._fits[name] = None
+        return self._fits[name]
+
+    def held_out(self, fitted: Fit) -> Array:
+        """Return each point minus what a fit of the others says of it, (N, 3)."""
+        if fitted.model not in self._held_out:
+            self._held_out[fitted.model] = held_out(fitted, self._pairs, self._scale)
+        return self._held_out[fitted.model]
+
+    def require(self, name: ModelName) -> Fit:
+        """Return a model's fit; COLLINEAR: the points do not determine it."""
+        return self.get(name) or fit(name, self._pairs, self._scale)
+
+    def simplest(self) -> ModelName:
+        """Return the simplest model that can be judged; a rigid one needs a held-out error."""
+        first = self.names[0]
+        return "similarity" if math.isnan(self.error(first)) else first
+
+    def error(self, name: ModelName) -> float:
+        """Return a model's held-out error; NaN where it has none."""
+        fitted = self.get(name)
+        return math.nan if fitted is None else rms(self.held_out(fitted), self._pairs.weights)
+
+    def choose(self, sigma: float | None, first: ModelName) -> ModelName:
+        """Return the model that the points ask for, ``first`` or a more general one.
+
+        ``sigma``: of a touch, in the units of ``pairs``.
+        """
+        chosen = first
+        for name in self.names[self.names.index(first) + 1 :]:
+            simple, general = self.get(chosen), self.get(name)
+            if simple is None or general is None:
+                continue
+            if better(simple, general, self._pairs.weights, sigma) and (
+                self.error(name) < self.error(chosen)
+            ):
+                chosen = name
+        return chosen
+
+    def errors(self, names: Sequence[ModelName]) -> dict[ModelName, float]:
+        """Return the held-out errors of models; NaN where there is none."""
+        return {name: self.error(name) for name in names}
+
+
+def better(simple: Fit, general: Fit, weights: Array, sigma: float | None) -> bool:
+    """Return whether noise alone would hardly make ``general`` fit that much better."""
+    before, after = squares(simple.residuals, weights), squares(general.residuals, weights)
+    noise = touch_noise(sigma, after, general.freedom)
+    if noise is None:
+        return False
+    return noise.chance(max(before - after, 0.0), simple.freedom - general.freedom) < LEVEL

@@ -1,0 +1,183 @@
+"""A camera that the robot carries: what it sees from another place than where it was calibrated.
+
+The calibration holds for the robot's pose at which it was made, ``T_cal``. At another pose,
+``T_now``, the camera and everything that it sees have moved by the rigid motion ``T_now T_cal^-1``,
+in the robot's frame: so it comes *behind* the static chain (derived). Before it, as the thesis
+3.2.5.2 has it, it would be right only with the camera's place on the robot, which a plane's
+calibration does not know.
+
+That holds as long as the plane of the parts is where the camera thinks it is: the motion must map
+the plane onto itself. Shifts within the plane and turns about its normal do; a camera that is
+raised, or tilted, sees the same pixels for other places, and is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.rotations import as_points
+from smartcam.calibration._geometry.solvers import Chain, Poses, Solver
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._geometry.rotations import Array
+
+
+@dataclass(eq=False)
+class Moved:
+    """A rigid motion of everything, in the frame that the poses are in."""
+
+    motion: Transform  # from the robot's frame into the robot's frame
+
+    def solve(self, poses: Poses) -> Poses:
+        """Return the poses after the motion."""
+        return poses.moved(self.motion.rotation, self.motion.translation)
+
+
+class MovingCamera:
+    """A calibrated camera on a robot that moves.
+
+    Args:
+        static: what leads to the robot's frame from where the camera was calibrated.
+        calibrated_at: the robot's pose then, ``T_base_flange``: of any part of the robot to which
+            the camera is fixed.
+        field: (N, 3), three points or more in the plane, in the robot's frame, metres: those that
+            were touched. The plane through them must stay, and it is looked at where they are.
+        tolerance: metres that the plane may move out of itself at any point of the field. A fifth
+            of a millimetre is what a touch by hand is good for.
+        max_lag: seconds between a pose of the robot and the image at most. At 250 mm/s the robot
+            does 5 mm in 20 ms, a quarter of a millimetre in one.
+
+    Raises:
+        CalibrationError: ``SHAPE``, ``NOT_FINITE``, ``TOO_FEW`` or ``COLLINEAR`` points of the
+            field.
+    """
+
+    def __init__(
+        self,
+        static: Solver,
+        calibrated_at: Transform,
+        *,
+        field: ArrayLike,
+        tolerance: float = 2e-4,
+        max_lag: float = 1e-3,
+    ) -> None:
+        points = as_points(field, 3, "moving camera: points of the field")
+        if len(points) < 3:
+            raise CalibrationError(
+                f"moving camera: expected 3 points of the field or more, got {len(points)}",
+                code=Code.TOO_FEW,
+                expected=3,
+                got=len(points),
+            )
+        self._static = static
+        self._calibrated_at = calibrated_at
+        self._tolerance = tolerance
+        self._max_lag = timedelta(seconds=max_lag)
+        self._centre: Array = points.mean(axis=0)
+        _, spread, axes = np.linalg.svd(points - self._centre)
+        if not spread[1] > 1e-6 * spread[0]:
+            raise CalibrationError(
+                "moving camera: expected points of the field that are not on one line, got "
+                f"{spread[1]:.3g} m across it",
+                code=Code.COLLINEAR,
+                got=float(spread[1]),
+            )
+        self._normal: Array = axes[2]
+        height = (points - self._centre) @ self._normal
+        self._field = points - np.outer(height, self._normal)  # without the noise of the touches
+
+    def now(self, pose: Transform, image_at: datetime | None = None) -> Chain:
+        """Return the chain for an image that was taken at a pose.
+
+        Args:
+            pose: the robot's pose then, of the same frames as ``calibrated_at``.
+                :meth:`~smartcam.calibration.PoseHistory.at` gives the pose at the
+                time of an image from those before and after it.
+            image_at: when the image was taken. A localization's header has the time of its arrival,
+                which is later; ``Result.triggered_at`` is nearer. None where the robot stood still
+                from the image to the pose.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: a pose of other frames; ``NOT_SIMULTANEOUS``: pose
+                and image are more than ``max_lag`` apart, or the pose has no time; ``BAD_TIME``:
+                the image's has no time zone;
+                ``PLANE_MOVED``: the plane of the parts would not be where the camera saw it.
+        """
+        self._check_frames(pose)
+        if image_at is not None:
+            self._check_time(pose, image_at)
+        motion = pose.undated() @ self._calibrated_at.undated().inverse()
+        self._check_plane(motion)
+        static = self._static if isinstance(self._static, Chain) else Chain([self._static])
+        return Chain(
+            [self._static, Moved(motion)],
+            frame=pose.target,
+            camera_frame=static.camera_frame,
+            y_down=static.y_down,
+        )
+
+    def _check_frames(self, pose: Transform) -> None:
+        wanted = self._calibrated_at
+        if (pose.target, pose.source) != (wanted.target, wanted.source):
+            raise CalibrationError(
+                f"moving camera: expected {wanted.label}, as it was calibrated, got {pose.label}",
+                code=Code.WRONG_FRAME,
+                expected=wanted.label,
+                got=pose.label,
+            )
+
+    def _check_time(self, pose: Transform, image_at: datetime) -> None:
+        if pose.at is None:
+            raise CalibrationError(
+                f"moving camera: expected the time of {pose.label}, to compare it with the "
+                "image's, got none",
+                code=Code.NOT_SIMULTANEOUS,
+                expected=image_at,
+            )
+        if image_at.tzinfo is None:
+            raise CalibrationError(
+                f"moving camera: expected an image's time with its time zone, got {image_at}",
+                code=Code.BAD_TIME,
+                expected="a time with its time zone",
+                got=image_at,
+            )
+        lag = abs(pose.at - image_at)
+        if lag > self._max_lag:
+            raise CalibrationError(
+                f"moving camera: expected a pose within {1e3 * self._max_lag.total_seconds():g} ms "
+                f"of the image, got one {1e3 * lag.total_seconds():g} ms from it",
+                code=Code.NOT_SIMULTANEOUS,
+                expected=self._max_lag,
+                got=lag,
+            )
+
+    def _check_plane(self, motion: Transform) -> None:
+        """Raise where the plane leaves itself, or comes back upside down."""
+        off = float(np.abs((motion.apply(self._field) - self._centre) @ self._normal).max())
+        cosine = float((motion.rotation @ self._normal) @ self._normal)
+        if off <= self._tolerance and cosine > 0:
+            return
+        rise = abs(float((motion.apply(self._centre) - self._centre) @ self._normal))
+        sine = float(np.linalg.norm(np.cross(motion.rotation @ self._normal, self._normal)))
+        tilt = math.degrees(math.atan2(sine, cosine))
+        raise CalibrationError(
+            f"moving camera: expected a motion that keeps the plane of the parts within "
+            f"{1e3 * self._tolerance:g} mm, got one that shifts it by {1e3 * rise:.2f} mm along "
+            f"its normal and tilts it by {tilt:.2f} deg: {1e3 * off:.2f} mm at the worst point of "
+            "the field. A camera that is raised or tilted needs a calibration of its own there",
+            code=Code.PLANE_MOVED,
+            expected=self._tolerance,
+            got=off,
+        )

@@ -1,0 +1,201 @@
+"""Black shapes on a page, written to scale as SVG and as PDF.
+
+A page's coordinates are millimetres from its lower left corner, y up. Shapes are filled, none has a
+stroke: the outline of what is printed is where its numbers say. The same shapes always give the
+same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Final, TypeAlias, assert_never
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+Point: TypeAlias = tuple[float, float]
+"""x and y, mm."""
+
+POINTS: Final = 72 / 25.4
+"""PDF's unit, of a millimetre."""
+
+ARC: Final = 4 / 3 * (math.sqrt(2) - 1)
+"""Distance from the ends of a quarter of a circle to its Bezier curve's control points, of the
+radius; the curve is at most 0.03 % of the radius off."""
+
+
+@dataclass(frozen=True, slots=True)
+class Polygon:
+    """A filled polygon; one that runs clockwise is a hole in what is around it."""
+
+    points: tuple[Point, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """A filled circle."""
+
+    centre: Point
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A line of text from its lower left corner, as high as ``size``; ``turned``: upwards."""
+
+    place: Point
+    text: str
+    size: float
+    turned: bool = False
+
+
+Shape: TypeAlias = Polygon | Disc | Label
+"""A polygon, a disc or a label."""
+
+
+@dataclass(frozen=True, slots=True)
+class PrintedPage:
+    """The content of one sheet of paper."""
+
+    width: float  # mm
+    height: float  # mm
+    title: str  # of the document
+    description: str  # ASCII text that the document carries and does not show
+    shapes: tuple[Shape, ...]  # what it shows
+
+
+def rectangle(left: float, low: float, width: float, height: float) -> Polygon:
+    """Return a rectangle from its lower left corner."""
+    right, high = left + width, low + height
+    return Polygon(((left, low), (right, low), (right, high), (left, high)))
+
+
+def svg(page: PrintedPage) -> str:
+    """Return an SVG document; a unit of its coordinates is a millimetre."""
+    width, height = _number(page.width), _number(page.height)
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
+        f'viewBox="0 0 {width} {height}" shape-rendering="geometricPrecision">',
+        f"<title>{escape(page.title)}</title>",
+        f"<metadata>{escape(page.description, quote=False)}</metadata>",
+        f'<rect width="{width}" height="{height}" fill="#fff"/>',
+        '<path fill="#000" d="',
+        *_svg_paths(page.shapes, page.height),
+        '"/>',
+        '<g fill="#000" font-family="Helvetica, Arial, sans-serif">',
+        *_svg_texts(page.shapes, page.height),
+        "</g>",
+        "</svg>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _svg_paths(shapes: Sequence[Shape], height: float) -> Iterator[str]:
+    for shape in shapes:
+        match shape:
+            case Polygon(points):
+                corners = " ".join(_pair(x, height - y) for x, y in points)
+                yield f"M{corners}Z"
+            case Disc((x, y), radius):
+                r = _number(radius)
+                left, right = (_pair(x + side * radius, height - y) for side in (-1, 1))
+                yield f"M{left}A{r} {r} 0 0 0 {right}A{r} {r} 0 0 0 {left}Z"
+            case Label():
+                pass
+            case _:
+                assert_never(shape)
+
+
+def _svg_texts(shapes: Iterable[Shape], height: float) -> Iterator[str]:
+    for shape in shapes:
+        if isinstance(shape, Label):
+            x, y = _number(shape.place[0]), _number(height - shape.place[1])
+            turn = f' transform="rotate(-90 {x} {y})"' if shape.turned else ""
+            yield (
+                f'<text x="{x}" y="{y}" font-size="{_number(shape.size)}"{turn}>'
+                f"{escape(shape.text)}</text>"
+            )
+
+
+def pdf(page: PrintedPage) -> bytes:
+    """Return a PDF document of one page, which asks its viewer to print it as large as it is."""
+    scale = f"{POINTS:.9f} 0 0 {POINTS:.9f} 0 0 cm"
+    lines = [scale, *_pdf_paths(page.shapes), "f", *_pdf_texts(page.shapes)]
+    content = "\n".join(lines).encode("latin-1", "replace")
+    size = " ".join(_number(POINTS * side) for side in (page.width, page.height))
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {size}] /Contents 4 0 R "
+        "/Resources << /Font << /F 5 0 R >> >> >>".encode(),
+        b"<< /Length %d >>\nstream\n%b\nendstream" % (len(content), content),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
+        f"<< /Title {_literal(page.title)} /Subject {_literal(page.description)} >>".encode(),
+    ]
+    written = bytearray(b"%PDF-1.6\n%\xe2\xe3\xcf\xd3\n")
+    places = []
+    for number, body in enumerate(objects, 1):
+        places.append(len(written))
+        written += b"%d 0 obj\n%b\nendobj\n" % (number, body)
+    table = "".join(f"{place:010d} 00000 n \n" for place in places)
+    start = len(written)
+    written += (
+        f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}"
+        f"trailer\n<< /Size {len(objects) + 1} /Root 1 0 R /Info 6 0 R >>\n"
+        f"startxref\n{start}\n%%EOF\n"
+    ).encode()
+    return bytes(written)
+
+
+def _pdf_paths(shapes: Iterable[Shape]) -> Iterator[str]:
+    for shape in shapes:
+        match shape:
+            case Polygon(points):
+                first, *rest = (_pair(x, y) for x, y in points)
+                yield " ".join([f"{first} m", *(f"{one} l" for one in rest), "h"])
+            case Disc((x, y), radius):
+                yield _pdf_circle(x, y, radius)
+            case Label():
+                pass
+            case _:
+                assert_never(shape)
+
+
+def _pdf_circle(x: float, y: float, radius: float) -> str:
+    parts = [f"{_pair(x + radius, y)} m"]
+    for along, up in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+        before, behind, end = (
+            _pair(x + radius * (along * a - up * b), y + radius * (up * a + along * b))
+            for a, b in ((1, ARC), (ARC, 1), (0, 1))
+        )
+        parts.append(f"{before} {behind} {end} c")
+    return " ".join([*parts, "h"])
+
+
+def _pdf_texts(shapes: Iterable[Shape]) -> list[str]:
+    return [
+        f"BT /F {_number(one.size)} Tf {'0 1 -1 0' if one.turned else '1 0 0 1'} "
+        f"{_pair(*one.place)} Tm {_literal(one.text)} Tj ET"
+        for one in shapes
+        if isinstance(one, Label)
+    ]
+
+
+def _literal(text: str) -> str:
+    """Return a text as a string of a PDF."""
+    for sign in "\\()":
+        text = text.replace(sign, f"\\{sign}")
+    return f"({text})"
+
+
+def _pair(x: float, y: float) -> str:
+    return f"{_number(x)} {_number(y)}"
+
+
+def _number(value: float) -> str:
+    """Return a length to a tenth of a micrometre."""
+    text = f"{value:.4f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text

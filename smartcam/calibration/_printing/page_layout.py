@@ -1,0 +1,193 @@
+"""Where a target, its rays, rulers and texts stand on a page; all lengths are millimetres.
+
+The target stands at the lower left, so the rays A and B are as long as the page allows. Rulers
+stand left of it and below it, texts above it, right of the ray B.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING, Final
+
+from smartcam.calibration._printing.page import Label, Polygon, rectangle
+from smartcam.calibration._targets import AREA_DIAMETER, AREA_DISTANCE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from smartcam.calibration._printing.page import Point, Shape
+    from smartcam.calibration._printing.shapes import Box
+
+RULER: Final = 100.0
+"""Length of each of the two rulers."""
+
+BORDER: Final = 5.0
+"""Border of the page: many printers leave it white."""
+
+MOVE: Final = 5.0
+"""Distance of a target from the border where there is space; the rest is left to the rays."""
+
+QUIET: Final = 0.2
+"""White around a target, of a square's side or of the distance of two dots."""
+LEAST_QUIET, MOST_QUIET = 2.0, 6.0
+"""Its bounds."""
+
+SHORTEST_RAY: Final = 8.0
+RAY_WIDTH: Final = 0.4
+HEAD: Final = (4.0, 1.5)
+"""Length of a ray's head and half its width."""
+NOTCH: Final = 0.65
+"""Depth of the notch in a head's back, of its length: a search takes a solid head for a dot."""
+LETTER: Final = 4.0
+"""Size of the letters of the rays."""
+
+TICK: Final = (0.3, 3.0)
+"""Width and height of a ruler's ticks."""
+RULER_SPAN: Final = RULER + 12.0
+"""Length of a ruler with its label."""
+
+TEXT, LINE = 2.6, 3.4
+"""Size of a text and distance of its lines."""
+RULE: Final = 0.2
+"""Thickness of the line that a text stands on: letters that hang together are no dots either."""
+TEXT_LEFT: Final = HEAD[1] + LETTER + 2
+"""From the ray B to the texts right of its letter."""
+FEWEST_LETTERS: Final = 20
+"""Letters of a line at least, on however small a page."""
+GLYPH: Final = 0.6
+"""Width of a letter, of its size: more than a line of Helvetica or Arial has on the average."""
+
+AREA_REACH: Final = AREA_DISTANCE + AREA_DIAMETER / 2
+"""Reach of the areas outside of a checkerboard's outer corners, sides of a square."""
+
+AREA_GAP: Final = 1.0
+"""Between such an area and what stands beyond it."""
+
+
+class PageLayout:
+    """Where things stand on a page.
+
+    Args:
+        box: what the target's pattern takes.
+        pitch: a square's side, or the distance of two dots.
+        areas: how far areas that are to stay white reach outside of the pattern's corners, an
+            origin mark among them.
+        texts: what is said.
+        width: of the page.
+        height: of the page.
+
+    Attributes:
+        origin: the target's origin from the page's lower left corner.
+        needed_width: of a page on which all of it fits.
+        needed_height: the same.
+    """
+
+    def __init__(
+        self,
+        box: Box,
+        *,
+        pitch: float,
+        areas: float,
+        texts: Sequence[str],
+        width: float,
+        height: float,
+    ) -> None:
+        self._box = box
+        self.width = width
+        self.height = height
+        self._quiet = min(max(QUIET * pitch, LEAST_QUIET), MOST_QUIET)
+        self._areas = areas
+        ray = max(self._quiet + SHORTEST_RAY, self._areas)
+        x, needed_width = _along((box.left, box.right), (self._ruler_band(box.high), ray), width)
+        letters = max(int((width - BORDER - x - TEXT_LEFT) / (GLYPH * TEXT)), FEWEST_LETTERS)
+        self._lines = [line for text in texts for line in textwrap.wrap(text, letters)]
+        self._longest = max(map(len, self._lines)) * GLYPH * TEXT
+        text = self._clear(TEXT_LEFT + self._longest, box.right) + LINE * len(self._lines)
+        y, needed_height = _along(
+            (box.low, box.high), (self._ruler_band(box.right), max(ray, text)), height
+        )
+        self.origin: Point = (x, y)
+        self.needed_width: float = needed_width
+        self.needed_height: float = needed_height
+
+    def _ruler_band(self, edge: float) -> float:
+        """Return the width of a ruler beside a target that reaches from its origin to ``edge``."""
+        return max(self._clear(RULER_SPAN, edge) + TICK[1], self._areas)
+
+    def _clear(self, end: float, edge: float) -> float:
+        """Return the distance from the target of something that reaches from its origin to ``end``.
+
+        It stands between the areas at the corners, or beyond them where it does not fit.
+        """
+        return self._quiet if end <= edge else max(self._quiet, self._areas + AREA_GAP)
+
+    @property
+    def excess(self) -> float:
+        """By how much it does not fit: zero where it does."""
+        return max(self.needed_width - self.width, 0.0) + max(self.needed_height - self.height, 0.0)
+
+    def furniture(self) -> Iterator[Shape]:
+        """Yield rays, rulers and texts."""
+        x, y = self.origin
+        box = self._box
+        end = self.width - BORDER - (x + box.right + self._quiet)
+        yield from _ray(x + box.right + self._quiet, y, end, "A")
+        top = self.height - BORDER
+        upward = top - (y + box.high + self._quiet)
+        yield from map(_upright, _ray(y + box.high + self._quiet, x, upward, "B"))
+        yield from _ruler(x, y + box.low - self._clear(RULER_SPAN, box.right) - TICK[1])
+        beside = x + box.left - self._clear(RULER_SPAN, box.high) - TICK[1]
+        yield from map(_upright, _ruler(y, beside))
+        for number, line in enumerate(self._lines):
+            low = top - TEXT - LINE * number
+            yield rectangle(x + TEXT_LEFT, low, self._longest, RULE)
+            yield Label((x + TEXT_LEFT, low), line, TEXT)
+
+
+def _along(
+    pattern: tuple[float, float], bands: tuple[float, float], side: float
+) -> tuple[float, float]:
+    """Return the origin's place along a side of the page, and the length which that side needs.
+
+    ``pattern``: from where to where it reaches, from its origin. ``bands``: what is needed before
+    and behind it.
+    """
+    low, high = pattern
+    needed = 2 * BORDER + bands[0] + max(high - low + bands[1], RULER_SPAN - low)
+    spare = min(max(side - needed, 0.0) / 2, MOVE)
+    return BORDER + spare + bands[0] - low, needed
+
+
+def _ray(start: float, across: float, length: float, letter: str) -> Iterator[Polygon | Label]:
+    """Yield a ray along x."""
+    tip = start + length
+    neck, notch = tip - HEAD[0], tip - (1 - NOTCH) * HEAD[0]
+    yield rectangle(start, across - RAY_WIDTH / 2, notch - start, RAY_WIDTH)
+    yield Polygon(
+        ((neck, across - HEAD[1]), (tip, across), (neck, across + HEAD[1]), (notch, across))
+    )
+    yield Label((neck, across + HEAD[1] + 1), letter, LETTER)
+
+
+def _ruler(start: float, low: float) -> Iterator[Polygon | Label]:
+    """Yield a ruler along x; it reaches from the outer side of its first tick to the last one's."""
+    thick, high = TICK
+    yield rectangle(start, low, RULER, thick)
+    for tick in range(11):
+        middle = min(max(RULER / 10 * tick, thick / 2), RULER - thick / 2)
+        yield rectangle(start + middle - thick / 2, low + thick, thick, high - thick)
+    yield rectangle(start + RULER + 1, low, RULER_SPAN - RULER - 1, RULE)
+    yield Label((start + RULER + 1, low), f"{RULER:g} mm", TEXT)
+
+
+def _upright(shape: Polygon | Label) -> Shape:
+    """Return a shape along x as one along y: mirrored, but for its letters.
+
+    A single letter stays upright, a longer text runs upwards.
+    """
+    if isinstance(shape, Polygon):
+        return Polygon(tuple((y, x) for x, y in reversed(shape.points)))
+    x, y = shape.place
+    if len(shape.text) == 1:
+        return Label((y, x), shape.text, shape.size)
+    return Label((y + shape.size, x), shape.text, shape.size, turned=True)

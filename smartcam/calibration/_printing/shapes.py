@@ -1,0 +1,174 @@
+"""Black shapes of a target, in millimetres from its origin, x right and y up."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._detection.charucos import charuco_board
+from smartcam.calibration._optional_imports import load
+from smartcam.calibration._printing.page import Disc, Polygon, rectangle
+from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._printing.page import Point
+    from smartcam.calibration._targets import Target
+
+MM = 1e3
+"""Millimetres of a metre."""
+
+
+class Box(NamedTuple):
+    """Bounds of a target's own pattern, its origin mark aside, mm from its origin."""
+
+    left: float
+    low: float
+    right: float
+    high: float
+
+
+def ink(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
+    """Return the shapes of a target and what they take; those of an origin mark are the last.
+
+    Raises SHAPE: its dictionary is none of OpenCV's, or has too few markers; MissingExtraError:
+    a marker's pattern needs OpenCV.
+    """
+    match target:
+        case Checkerboard():
+            return tuple(_checkerboard(target)), _board(target.columns, target.rows, target.square)
+        case Charuco():
+            box = _board(target.columns - 1, target.rows - 1, target.square)
+            return tuple(_charuco(target, box)), box
+        case CircleGrid():
+            return _dots(target)
+
+
+def _board(columns: int, rows: int, square: float) -> Box:
+    side = MM * square
+    return Box(-side, -side, columns * side, rows * side)
+
+
+def _checkerboard(target: Checkerboard) -> Iterator[Polygon | Disc]:
+    side = MM * target.square
+    for row in range(target.rows + 1):
+        for column in range(row % 2, target.columns + 1, 2):
+            yield rectangle((column - 1) * side, (row - 1) * side, side, side)
+    if target.origin_mark:
+        x, y = (MM * target.corner_areas[0]).tolist()
+        yield Disc((x, y), MM * target.corner_area_diameter / 2)
+
+
+def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
+    """Yield squares and markers; OpenCV counts both from the upper left."""
+    side, marker = MM * target.square, MM * target.marker
+    first_black = 1 if target.legacy_pattern and target.rows % 2 == 0 else 0
+    cells = [
+        (column, row, box.left + column * side, box.high - (row + 1) * side)
+        for row in range(target.rows)
+        for column in range(target.columns)
+    ]
+    inset = (side - marker) / 2
+    patterns = _patterns(target)
+    for column, row, left, low in cells:
+        if (column + row) % 2 == first_black:
+            yield rectangle(left, low, side, side)
+            continue
+        pattern = next(patterns)
+        module = marker / len(pattern)
+        for loop in outlines(pattern):
+            yield Polygon(
+                tuple((left + inset + x * module, low + inset + y * module) for x, y in loop)
+            )
+
+
+def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:
+    """Yield each marker's black modules, its border with them, by id."""
+    cv2 = load("cv2")
+    dictionary: Any = charuco_board(target).getDictionary()
+    modules = dictionary.markerSize + 2
+    for identity in range(target.columns * target.rows // 2):
+        yield np.asarray(cv2.aruco.generateImageMarker(dictionary, identity, modules)) == 0
+
+
+def outlines(cells: NDArray[np.bool_]) -> list[list[tuple[int, int]]]:
+    """Return the outlines of what is black among cells (rows, columns), the upper row first.
+
+    Corners are x to the right and y up, counted in cells from the lower left one's; outer outlines
+    counter-clockwise, those of holes clockwise.
+    """
+    black = {(int(x), int(y)) for y, x in np.argwhere(cells[::-1])}
+    ahead: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for x, y in sorted(black):
+        around = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
+        beside = [(x, y - 1), (x + 1, y), (x, y + 1), (x - 1, y)]
+        for side, other in enumerate(beside):
+            if other not in black:
+                ahead.setdefault(around[side], []).append(around[(side + 1) % 4])
+    loops = []
+    while ahead:
+        start = place = next(iter(ahead))
+        loop = []
+        while True:
+            ends = ahead[place]
+            following = ends.pop()
+            if not ends:
+                del ahead[place]
+            loop.append(place)
+            place = following
+            if place == start:
+                break
+        loops.append(_corners(loop))
+    return loops
+
+
+def _corners(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the points of a loop at which it turns."""
+    around = zip([loop[-1], *loop[:-1]], loop, [*loop[1:], loop[0]], strict=True)
+    return [
+        at for before, at, behind in around if behind[0] != before[0] and behind[1] != before[1]
+    ]
+
+
+def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
+    centres = MM * target.points[:, :2]
+    radii = np.full(len(centres), MM * target.diameter / 2)
+    if target.origin_diameter is not None:
+        radii[0] = MM * target.origin_diameter / 2
+    dots = tuple(
+        Disc((x, y), radius)
+        for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True)
+    )
+    low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
+    return dots, Box(*low.tolist(), *high.tolist())
+
+
+def quartered(radius: float) -> tuple[tuple[Polygon | Disc, ...], Box]:
+    """Return a disc about the origin with two black quarters, the first one with a white dot.
+
+    The quarters meet in the point to touch; the dot tells the sheet from one that is turned.
+    """
+    hole = 0.18 * radius
+    at = 0.6 * radius * math.sqrt(0.5)
+    shapes = (_pie(radius, 0), _pie(radius, 180), _circle((at, at), hole, clockwise=True))
+    return shapes, Box(-radius, -radius, radius, radius)
+
+
+def _pie(radius: float, start: int) -> Polygon:
+    turns = [math.radians(start + degrees) for degrees in range(91)]
+    return Polygon(
+        ((0.0, 0.0), *((radius * math.cos(turn), radius * math.sin(turn)) for turn in turns))
+    )
+
+
+def _circle(centre: Point, radius: float, *, clockwise: bool) -> Polygon:
+    turns = [math.radians(-degrees if clockwise else degrees) for degrees in range(0, 360, 3)]
+    x, y = centre
+    return Polygon(
+        tuple((x + radius * math.cos(turn), y + radius * math.sin(turn)) for turn in turns)
+    )

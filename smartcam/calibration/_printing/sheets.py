@@ -1,0 +1,356 @@
+"""Sheets to print: a target, the thesis' rays A and B from its origin, and rulers.
+
+::
+
+    sheet = make_sheet(Checkerboard(columns=9, rows=6, square=0.025), page="A4")
+    Path("sheet.svg").write_text(sheet.svg())
+    Path("sheet.pdf").write_bytes(sheet.pdf())
+    ...
+    target = scaled(sheet.target, (99.2, 99.3))  # how long the printed rulers are, mm
+
+A sheet says on itself what it is; both files carry the target's description, as
+:func:`~smartcam.calibration.target_from_data` reads it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._printing.page import (
+    Disc,
+    Polygon,
+    PrintedPage,
+    pdf,
+    svg,
+)
+from smartcam.calibration._printing.page_layout import AREA_REACH, BORDER, RULER, PageLayout
+from smartcam.calibration._printing.shapes import MM, Box, ink, quartered
+from smartcam.calibration._targets import (
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    target_from_data,
+)
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.calibration._printing.page import Shape
+    from smartcam.calibration._targets import Target
+
+PAGES: Final[Mapping[str, tuple[float, float]]] = {
+    "A5": (148.0, 210.0),
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+    "Letter": (215.9, 279.4),
+    "Legal": (215.9, 355.6),
+    "Tabloid": (279.4, 431.8),
+}
+"""Width and height of pages, mm; a sheet takes them upright or lying, as it fits."""
+
+MAX_PAGE: Final = 3000.0
+"""Longest side of a page, mm."""
+
+LARGEST_CHANGE: Final = 0.05
+"""Largest deviation of a printer's scale."""
+
+UNEQUAL: Final = 0.005
+"""Largest difference of the scales along x and y: about that of a ruler that is read twice."""
+
+DIGITS: Final = 9
+"""Digits of a length in metres: nanometres."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rays:
+    """Rays and an origin mark alone: for a camera that localizes the mark by itself.
+
+    Attributes:
+        diameter: of the origin mark, metres; it has two black quarters, which meet in the origin,
+            and a white dot in the one between the rays.
+    """
+
+    kind: ClassVar[str] = "rays"
+
+    diameter: float = 0.02
+
+    def __post_init__(self) -> None:
+        number = isinstance(self.diameter, int | float) and not isinstance(self.diameter, bool)
+        if not (number and math.isfinite(self.diameter) and self.diameter > 0):
+            raise CalibrationError(
+                f"rays: expected diameter to be a length in metres, got {self.diameter!r}",
+                code=Code.SHAPE,
+                expected="metres",
+                got=self.diameter,
+            )
+
+
+T = TypeVar("T", bound=Checkerboard | Charuco | CircleGrid | Rays)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheet:
+    """A target on a page.
+
+    Attributes:
+        target: what is on it.
+        width: of the page, mm.
+        height: of the page, mm.
+        origin: the target's origin from the page's lower left corner, mm; x and y are those of the
+            page.
+        shapes: what is printed.
+    """
+
+    target: Target | Rays
+    width: float
+    height: float
+    origin: tuple[float, float]
+    shapes: tuple[Shape, ...]
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """The target's description, JSON-able."""
+        return _data(self.target)
+
+    @property
+    def id(self) -> str:
+        """Eight hexadecimal digits, printed on the sheet; the same for every page and format."""
+        return _identity(self.target)
+
+    @property
+    def title(self) -> str:
+        """Id, kind, counts and lengths in a line, as it is printed."""
+        return _title(self.target)
+
+    def svg(self) -> str:
+        """Return the sheet as an SVG document to scale; its ``metadata`` is the description."""
+        return svg(self._page)
+
+    def pdf(self) -> bytes:
+        """Return the sheet as a PDF document to scale; its subject is the description."""
+        return pdf(self._page)
+
+    @property
+    def _page(self) -> PrintedPage:
+        description = json.dumps(self.data)
+        return PrintedPage(self.width, self.height, self.title, description, self.shapes)
+
+
+def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
+    """Lay out a sheet.
+
+    Args:
+        target: what is on it; lengths are printed as they are.
+        page: one of ``PAGES``, upright or lying as the target fits, or width and height in mm,
+            such as ``300x200``, which is not turned.
+
+    Raises:
+        CalibrationError: PAGE_TOO_SMALL; SHAPE: no such page, no such dictionary of markers, or one
+            with too few.
+        MissingExtraError: a ChArUco target needs OpenCV.
+    """
+    pattern, box = _pattern(target)
+    width, height = page_size(page)
+    turns = [(width, height), (height, width)] if page in PAGES else [(width, height)]
+    marked = isinstance(target, Checkerboard) and target.origin_mark
+    pitch = _pitch(target)
+    layouts = [
+        PageLayout(
+            box,
+            pitch=pitch,
+            areas=AREA_REACH * pitch if marked else 0.0,
+            texts=(_title(target), ADVICE.format(origin=ORIGINS[type(target)], ruler=RULER)),
+            width=wide,
+            height=high,
+        )
+        for wide, high in turns
+    ]
+    layout = min(layouts, key=lambda one: one.excess)
+    if layout.excess > 0:
+        raise _too_small(target, page, layout)
+    moved = (_moved(shape, *layout.origin) for shape in pattern)
+    return Sheet(
+        target=target,
+        width=layout.width,
+        height=layout.height,
+        origin=layout.origin,
+        shapes=(*moved, *layout.furniture()),
+    )
+
+
+def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> CalibrationError:
+    needed = (layout.needed_width, layout.needed_height)
+    size = (layout.width, layout.height)
+    over = [
+        f"{need - there:.1f} mm too {way}"
+        for need, there, way in zip(needed, size, ("wide", "high"), strict=True)
+        if need > there
+    ]
+    text = f"{size[0]:g} x {size[1]:g} mm"
+    named = f"{page} ({text})" if page in PAGES else text
+    return CalibrationError(
+        f"{_title(target).partition(': ')[2]}: does not fit on {named}: with rays, rulers and a "
+        f"border of {BORDER:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
+        f"{' and '.join(over)}",
+        code=Code.PAGE_TOO_SMALL,
+        expected=needed,
+        got=size,
+    )
+
+
+def on_paper(data: Mapping[str, Any]) -> Target | Rays:
+    """Return the target, or the rays, that a sheet's ``data`` describes (SHAPE: it does not)."""
+    if data.get("kind") != Rays.kind or set(data) != {"kind", "diameter"}:
+        return target_from_data(data)
+    return Rays(diameter=data["diameter"])
+
+
+def page_size(page: str) -> tuple[float, float]:
+    """Return a page's width and height, mm; SHAPE where it has none."""
+    if page in PAGES:
+        return PAGES[page]
+    sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
+    size = (float(sides[1]), float(sides[2])) if sides else (0.0, 0.0)
+    if not 0 < min(size) <= max(size) <= MAX_PAGE:
+        raise CalibrationError(
+            f"page: expected one of {', '.join(PAGES)}, or width and height in mm up to "
+            f"{MAX_PAGE:g}, such as 300x200, got {page[:64]!r}",
+            code=Code.SHAPE,
+            expected=list(PAGES),
+            got=page[:64],
+        )
+    return size
+
+
+def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
+    """Return a target with the lengths that it has on paper.
+
+    Args:
+        target: as it was to be printed.
+        measured_ruler: how long the printed rulers along x and along y are, mm. A target has one
+            scale, the mean of both: what makes them differ by more than half a percent is no
+            scale, but a printer that pulls the paper unevenly.
+
+    Raises:
+        CalibrationError: SCALE_MISMATCH: a ruler is more than 5 % off 100 mm, or the rulers differ
+            by more than 0.5 %.
+    """
+    factors = [length / RULER for length in measured_ruler]
+    for axis, factor in zip("xy", factors, strict=True):
+        if not abs(factor - 1) <= LARGEST_CHANGE:
+            raise CalibrationError(
+                f"ruler along {axis}: expected {RULER:g} mm within {LARGEST_CHANGE:.0%}, "
+                f"got {RULER * factor:g} mm; print at 100 %, not fitted to the page",
+                code=Code.SCALE_MISMATCH,
+                expected=RULER,
+                got=RULER * factor,
+            )
+    if abs(factors[0] - factors[1]) > UNEQUAL:
+        raise CalibrationError(
+            f"rulers: expected the same length along x and y within {UNEQUAL:.1%}, "
+            f"got {measured_ruler[0]:g} and {measured_ruler[1]:g} mm; measure again, or print "
+            "with another printer",
+            code=Code.SCALE_MISMATCH,
+            expected=UNEQUAL,
+            got=tuple(measured_ruler),
+        )
+    scale = sum(factors) / 2
+    lengths = {
+        one.name: round(scale * value, DIGITS)
+        for one in dataclasses.fields(target)
+        if one.name not in {"columns", "rows"}
+        and not isinstance(value := getattr(target, one.name), bool | str | None)
+    }
+    return dataclasses.replace(target, **lengths)
+
+
+# ---------------------------------------------------------------------- what is said
+
+
+def _data(target: Target | Rays) -> dict[str, Any]:
+    return {"kind": target.kind, **dataclasses.asdict(target)}
+
+
+def _identity(target: Target | Rays) -> str:
+    text = json.dumps(_data(target), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _title(target: Target | Rays) -> str:
+    match target:
+        case Checkerboard():
+            marked = ", marked origin" if target.origin_mark else ""
+            about = (
+                f"checkerboard, {target.columns} x {target.rows} corners, "
+                f"squares of {_mm(target.square)}{marked}"
+            )
+        case Charuco():
+            legacy = ", legacy pattern" if target.legacy_pattern else ""
+            about = (
+                f"ChArUco, {target.columns} x {target.rows} squares of {_mm(target.square)}, "
+                f"markers of {_mm(target.marker)}, {target.dictionary}{legacy}"
+            )
+        case CircleGrid():
+            kind = "asymmetric circles" if target.asymmetric else "circles"
+            origin = target.origin_diameter
+            larger = "" if origin is None else f", origin {_mm(origin)}"
+            about = (
+                f"{kind}, {target.columns} x {target.rows}, {_mm(target.spacing)} apart, "
+                f"diameter {_mm(target.diameter)}{larger}"
+            )
+        case Rays():
+            about = f"rays A and B, origin mark of {_mm(target.diameter)}"
+    return f"smartcam sheet {_identity(target)}: {about}"
+
+
+ORIGINS: Final[Mapping[type[Target | Rays], str]] = {
+    Checkerboard: "the corner of four squares",
+    Charuco: "the corner of four squares",
+    CircleGrid: "the middle of the dot",
+    Rays: "the point",
+}
+ADVICE: Final = (
+    "Origin: {origin} where the lines of A and B meet. "
+    "Print at 100 % and measure both rulers: {ruler:g} mm."
+)
+
+
+def _mm(metres: float) -> str:
+    return f"{MM * metres:.6g} mm"
+
+
+# ---------------------------------------------------------------------- what is drawn
+
+
+def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
+    if isinstance(target, Rays):
+        return quartered(MM * target.diameter / 2)
+    return ink(target)
+
+
+def _pitch(target: Target | Rays) -> float:
+    """Return the distance of two neighbouring points, mm."""
+    match target:
+        case Checkerboard() | Charuco():
+            return MM * target.square
+        case CircleGrid():
+            return MM * target.spacing
+        case Rays():
+            return MM * target.diameter
+
+
+def _moved(shape: Polygon | Disc, x: float, y: float) -> Shape:
+    if isinstance(shape, Polygon):
+        return Polygon(tuple((x + one, y + other) for one, other in shape.points))
+    return Disc((x + shape.centre[0], y + shape.centre[1]), shape.radius)

@@ -1,0 +1,325 @@
+"""From what a camera finds in its pixels to the robot, by one picture of a printed sheet.
+
+::
+
+    view = find_target(image, target)
+    plane = fit_corners(target, [0, 8, 45, 53], touches, touch_sigma=0.0002, tool_z=(0, 0, -1))
+    calibration = calibrate_sheet(view, plane, camera=camera)
+    calibration.transform([[412.5, 300.0]])         # pixels, v down: metres of the robot
+
+The robot touches corners of the sheet, or its rays; the camera need not find what is touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, overload
+
+import numpy as np
+
+from smartcam.calibration._codes import Code, Remark
+from smartcam.calibration._files import storage
+from smartcam.calibration._geometry.homography import derivatives
+from smartcam.calibration._geometry.rotations import Array
+from smartcam.calibration._geometry.solvers import Chain, Poses, chain_of, check_frames
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
+from smartcam.calibration._views import TargetView
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Localization
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._targets import Target
+
+KIND = "sheet"
+"""What the files of these calibrations are called in the store."""
+
+UNEXPLAINED = {True: 0.3, False: 0.1}
+"""Pixels beside the points' noise from which on it is told, with a lens and without: what print,
+edges and a lens' own errors add, and a tenth of what a lens of usual distortion would."""
+
+ONE_SCALE = frozenset({"rigid", "similarity", "touches"})
+"""Models of a plane that leave a sheet the shape that it has."""
+
+
+PLANE = storage.Form(
+    dict[str, Any],
+    read=lambda data, _: PlaneCalibration.from_data(data),
+    write=lambda plane: plane.to_data(),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SheetCalibration(storage.SavedCalibration):
+    """What :func:`calibrate_sheet` finds; immutable.
+
+    It takes localizations in pixels whose y axis was turned up (y is -v), as
+    :func:`smartcam.connect` gives them with ``y_down=True``, and refuses to be used otherwise:
+    ``y_down`` says so. Pixels as such, in :meth:`transform` and the like, count v down.
+
+    Attributes:
+        view: the target as the camera saw it.
+        sheet: from pixels to the sheet.
+        plane: from the sheet's metres to the robot.
+        rms: standard deviation of a coordinate of the view's points about where the sheet has them,
+            pixels.
+        camera_frame: name of the frame that localizations must come in; None for any.
+        remarks: what one should know of the view.
+    """
+
+    y_down: ClassVar[bool] = True
+    kind: ClassVar[str] = KIND
+    _called: ClassVar[str] = "sheet's calibration"
+    _keys: ClassVar[storage.Keys] = {"sheet": "", "remarks": "warnings"}
+    _others: ClassVar[storage.Others] = {
+        "target": (storage.StoredTarget, lambda one: one.view.target),
+        "camera": (CameraModel | None, lambda one: one.sheet.camera),
+        "matrix": (storage.Matrix3, lambda one: one.sheet.matrix),
+        "covariance": (Annotated[Array, storage.matrix(9)], lambda one: one.sheet.covariance),
+    }
+
+    view: TargetView
+    sheet: SheetPlane
+    plane: Annotated[PlaneCalibration, PLANE]
+    rms: storage.NonNegative
+    camera_frame: str | None = None
+    remarks: storage.Remarks = ()
+
+    @classmethod
+    def _read(cls, found: dict[str, Any], context: storage.Context) -> SheetCalibration:
+        matrix, covariance = found["matrix"], found["covariance"]
+        if covariance.shape != (9, 9):
+            raise storage.refused(
+                context["called"], "covariance: expected 9 rows of 9", len(covariance)
+            )
+        if abs(np.linalg.det(matrix)) == 0.0:
+            text = "matrix: expected one that can be inverted"
+            raise storage.refused(context["called"], text, matrix.tolist())
+        found["sheet"] = SheetPlane(found["view"].size, matrix, covariance, found["camera"])
+        return super()._read(found, context)
+
+    @property
+    def camera(self) -> CameraModel | None:
+        """The lens; None: pixels are taken as they are."""
+        return self.sheet.camera
+
+    @property
+    def robot_frame(self) -> str:
+        """Name of the frame that poses are given in."""
+        return self.plane.robot_frame
+
+    @property
+    def model(self) -> str:
+        """Of the way from the sheet to the robot."""
+        return self.plane.model
+
+    @property
+    def warnings(self) -> tuple[Remark, ...]:
+        """What one should know before using it: of the view, then of the touches."""
+        return (*self.remarks, *self.plane.warnings)
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The same as solvers; it takes localizations with y turned up."""
+        chain = Chain(
+            [self.sheet],
+            frame=self.robot_frame,
+            camera_frame=self.camera_frame,
+            y_down=self.y_down,
+        )
+        return chain.then(chain_of(self.plane))
+
+    def transform(self, pixels: ArrayLike) -> Array:
+        """Map pixels to the points of the plane that they show, in the robot's space.
+
+        Args:
+            pixels: (N, 2), u to the right and v down from the middle of the upper left pixel.
+
+        Returns:
+            (N, 3), metres.
+
+        Raises:
+            CalibrationError: SHAPE or NOT_FINITE; OUT_OF_FIELD: outside of the image, or behind the
+                plane's horizon.
+        """
+        return self.plane.transform(self.sheet.on_sheet(pixels))
+
+    def inverse(self, points: ArrayLike) -> Array:
+        """Map points of the robot's space to the camera's.
+
+        Args:
+            points: (N, 3), metres; of a point beside the plane its foot counts.
+
+        Returns:
+            (N, 2), pixels, v down; NaN for what lies behind the camera.
+
+        Raises:
+            CalibrationError: SHAPE or NOT_FINITE.
+        """
+        return self.sheet.in_image(self.plane.inverse(points))
+
+    @overload
+    def to_robot(self, localizations: Localization, *, tool_flip: bool = False) -> Localization: ...
+    @overload
+    def to_robot(
+        self, localizations: Iterable[Localization], *, tool_flip: bool = False
+    ) -> list[Localization]: ...
+    def to_robot(
+        self, localizations: Localization | Iterable[Localization], *, tool_flip: bool = False
+    ) -> Localization | list[Localization]:
+        """Return localizations with their poses in the robot's space.
+
+        Args:
+            localizations: of the camera, one or many: pixels, with y turned up.
+            tool_flip: as of :meth:`PlaneCalibration.to_robot`.
+
+        Raises:
+            CalibrationError: WRONG_FRAME, OUT_OF_PLANE, OUT_OF_FIELD.
+        """
+        if isinstance(localizations, Localization):
+            return self._found([localizations], tool_flip)[0]
+        return self._found(list(localizations), tool_flip)
+
+    def _found(self, parts: list[Localization], flip: bool) -> list[Localization]:
+        check_frames(parts, self.camera_frame)
+        return self.plane.to_robot(self.sheet.solve(Poses.of(parts)).put(parts), tool_flip=flip)
+
+    def covariance_at(self, pixels: ArrayLike) -> Array:
+        """Return the covariance of mapped pixels that the noise of view and touches causes.
+
+        Args:
+            pixels: (K, 2), v down.
+
+        Returns:
+            (K, 3, 3), m^2, along the robot's axes. Errors of the lens are not in it, and the noise
+            of the camera when it sees the point comes on top.
+
+        Raises:
+            CalibrationError: as :meth:`transform`; UNVERIFIED: nothing tells the touches' sigma.
+        """
+        flat = self.sheet.on_sheet(pixels)
+        # to first order: D C D^T with the map's derivative D
+        slopes = derivatives(self.plane.matrix, flat)
+        seen = slopes @ self.sheet.covariance_at(pixels) @ slopes.swapaxes(1, 2)
+        covariance: Array = self.plane.covariance_at(flat) + seen
+        return covariance
+
+    def predicted_error(self, pixels: ArrayLike) -> Array:
+        """Return the rms error (K,) to expect of mapped pixels (K, 2), metres.
+
+        Raises:
+            CalibrationError: as :meth:`covariance_at`.
+        """
+        error: Array = np.sqrt(np.trace(self.covariance_at(pixels), axis1=1, axis2=2))
+        return error
+
+
+def calibrate_sheet(
+    view: TargetView,
+    plane: PlaneCalibration,
+    *,
+    camera: CameraModel | None = None,
+    camera_frame: str | None = None,
+) -> SheetCalibration:
+    """Return the way from pixels to the robot.
+
+    Args:
+        view: the target, as the camera sees it while the sheet lies where it is touched.
+        plane: from the sheet's metres to the robot: of :func:`fit_corners`, or of
+            :func:`~smartcam.calibration.fit_touches` with the origin at (0, 0).
+        camera: the lens, for images of the same size; None: a homography of the view's points.
+        camera_frame: name of the frame that localizations must come in; None for any.
+
+    Raises:
+        CalibrationError: TOO_FEW, COLLINEAR, WRONG_SIZE, NOT_FINITE, POOR_FIT, MIRRORED: see
+            :func:`~smartcam.calibration._sheet.plane.look_at_sheet`.
+    """
+    found = look_at_sheet(view, camera)
+    remarks: list[Remark] = []
+    if camera is None:
+        remarks.append(
+            Remark(
+                Code.LENS_UNKNOWN,
+                "no lens was given: the tilt of the camera is corrected, the distortion of its "
+                "lens is not, and grows outside of the target's points",
+            )
+        )
+    if found.unexplained > UNEXPLAINED[camera is not None]:
+        whose = "the lens distorts" if camera is None else "the lens is another one"
+        remarks.append(
+            Remark(
+                Code.POOR_FIT,
+                f"the target's points lie {found.rms:.2g} px beside a plane, of which noise does "
+                f"not explain {found.unexplained:.2g} px: {whose}, or the sheet is not flat",
+            )
+        )
+    return SheetCalibration(
+        view=view,
+        sheet=found.plane,
+        plane=plane,
+        rms=found.rms,
+        camera_frame=camera_frame,
+        remarks=tuple(remarks),
+    )
+
+
+def fit_corners(
+    target: Target,
+    ids: Sequence[int],
+    touches: ArrayLike,
+    *,
+    touch_sigma: float | None = None,
+    tool_z: ArrayLike | None = None,
+    robust: bool = False,
+    robot_frame: str = "robot",
+) -> PlaneCalibration:
+    """Return the way from a sheet's metres to the robot, by touches of points of its target.
+
+    A sheet that lies flat has its own shape: where touches ask for more than a scale, it is told
+    by a warning (NOT_SIMILAR) and not followed. So is a scale that is not the target's
+    (SCALE_MISMATCH), which is followed: rulers that were measured wrong, or not at all.
+
+    Args:
+        target: with the lengths that it has on paper.
+        ids: (N,), numbers of its points that were touched, three at least.
+        touches: (N, 3), where the robot's tip was, metres.
+        touch_sigma: as of :func:`~smartcam.calibration.fit_plane`.
+        tool_z: the same.
+        robust: the same.
+        robot_frame: the same.
+
+    Raises:
+        CalibrationError: SHAPE: a number that the target does not have; SCALE_MISMATCH: more than
+            a tenth off; and as :func:`~smartcam.calibration.fit_plane`.
+    """
+    points = target.points[:, :2]
+    wrong = [one for one in ids if not 0 <= one < len(points)]
+    if wrong:
+        raise CalibrationError(
+            f"touched points: expected numbers from 0 to {len(points) - 1}, got {wrong[0]}",
+            code=Code.SHAPE,
+            expected=len(points) - 1,
+            got=wrong[0],
+        )
+    seen = points[np.asarray(ids, dtype=np.intp)]
+
+    def fitted(model: Any) -> PlaneCalibration:
+        return fit_plane(
+            seen,
+            touches,
+            model=model,
+            touch_sigma=touch_sigma,
+            nominal_scale=1.0,
+            tool_z=tool_z,
+            robust=robust,
+            robot_frame=robot_frame,
+        )
+
+    found = fitted("auto")
+    return found if found.model in ONE_SCALE else fitted("similarity")

@@ -1,0 +1,522 @@
+"""Two cameras that look at the same place: where the one is in the other's frame."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code, Remark
+from smartcam.calibration._files import storage
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rotations import Array, as_points
+from smartcam.calibration._lens.bundle import (
+    Bundle,
+    Sight,
+    adjust_weighted,
+)
+from smartcam.calibration._lens.intrinsics import (
+    BAD,
+    LEAST_VIEWS,
+    MOST_BAD,
+    POOR,
+    label,
+    remark_sheet,
+    worst_view,
+)
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.poses import TARGET, check_view
+from smartcam.calibration._lens.sheet_shape import choose_shape, held_out_residuals, leave_out
+from smartcam.calibration._stereo import triangulation
+from smartcam.calibration._stereo.checks import check_fit, remark_sides
+from smartcam.calibration._stereo.errors import PairErrors, pair_errors
+from smartcam.calibration._stereo.rectification import Rectification, rectify
+from smartcam.calibration._stereo.start import (
+    LEFT,
+    RIGHT,
+    SIDES,
+    Lenses,
+    Moment,
+    as_moments,
+    half_turned,
+    start,
+)
+from smartcam.calibration._stereo.triangulation import CameraPair
+from smartcam.calibration._views import TargetView
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._lens.bundle import AdjustedBundle
+    from smartcam.calibration._lens.model import DistortionModel
+    from smartcam.calibration._lens.sheet_shape import Sheet
+    from smartcam.calibration._targets import Target
+
+PoseInLeft = Annotated[Transform, storage.motion(lambda _: (LEFT, TARGET))]
+LeftInRight = Annotated[Transform, storage.motion(lambda _: (RIGHT, LEFT))]
+
+LEAST_PAIRS: Final = 2
+"""For lenses that are known; one tells the transform, another that it is right."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairFit(storage.Stored):
+    """What one pair of views has to do with two cameras.
+
+    Attributes:
+        left: as it was given.
+        right: the same; numbered from the other end where the target looks the same when turned.
+        used: of each side, whether the cameras are fitted to it; False for a bad or missing view.
+        transform: ``T_left_target``; None where neither view is used.
+        rms: of each side's residuals, a coordinate, pixels; NaN where it is not used.
+        held_out: of cameras that were fitted without this pair: rms of the distances between
+            neighbouring points as both see them, less the true ones, metres; NaN where one view is
+            missing or bad, or where there are too few pairs.
+        epipolar: of the same cameras, rms distance from the epipolar lines, pixels; NaN likewise.
+    """
+
+    _keys: ClassVar[storage.Keys] = {"transform": "pose"}
+
+    left: TargetView | None
+    right: TargetView | None
+    used: Annotated[tuple[bool, bool], storage.row(tuple[bool, bool])]
+    transform: PoseInLeft | None
+    rms: storage.OpenPair
+    held_out: storage.Open
+    epipolar: storage.Open
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StereoCalibration(storage.SavedCalibration):
+    """What :func:`calibrate_stereo` finds.
+
+    Attributes:
+        left: its lens.
+        right: its lens.
+        transform: ``T_right_left``.
+        covariance: (6, 6), of a small turn (rad) and shift (m) of the left camera in the right
+            one's frame, the sheet taken as exact.
+        pairs: one for each given pair, in their order.
+        rms: of the residuals of all used views, their freedom taken off: the standard deviation of
+            a coordinate, pixels. It is no accuracy: see ``held_out``.
+        sigma: what the residuals show beside the points' covariance, pixels.
+        epipolar: rms distance of the used points from their epipolar lines, pixels.
+        held_out: held-out error by leaving one pair out: rms over all pairs of the distances
+            between neighbouring points of the target, as triangulated, less those that were meant,
+            metres. NaN where there were too few pairs.
+        held_out_epipolar: rms distance from epipolar lines of cameras that never saw the pair,
+            pixels.
+        sheet: (T, 3), how far the target's points are from where they were meant to be, metres;
+            None where they are taken as meant.
+        warnings: what one should know.
+    """
+
+    kind: ClassVar[str] = "stereo"
+    _called: ClassVar[str] = "calibration of cameras"
+    _others: ClassVar[storage.Others] = {"target": (storage.StoredTarget, lambda one: _target(one))}
+
+    left: CameraModel
+    right: CameraModel
+    transform: LeftInRight
+    covariance: Annotated[Array, storage.matrix(6)]
+    pairs: Annotated[tuple[PairFit, ...], storage.AsList(1)]
+    rms: storage.NonNegative
+    sigma: storage.NonNegative
+    epipolar: storage.NonNegative
+    held_out: storage.Open
+    held_out_epipolar: storage.Open
+    sheet: storage.SheetOffsets | None
+    warnings: storage.Remarks
+
+    @property
+    def bad_views(self) -> tuple[str, ...]:
+        """Names of the views that were left out."""
+        return tuple(
+            label(view, number)
+            for number, pair in enumerate(self.pairs)
+            for view, used in zip((pair.left, pair.right), pair.used, strict=True)
+            if view is not None and not used
+        )
+
+    def triangulate(
+        self,
+        left_pixels: ArrayLike,
+        right_pixels: ArrayLike,
+        *,
+        left_covariance: ArrayLike | None = None,
+        right_covariance: ArrayLike | None = None,
+    ) -> Array:
+        """Return the points that both cameras see, where their projections fit best.
+
+        Args:
+            left_pixels: (N, 2), as the left image has them: the lens is corrected for.
+            right_pixels: (N, 2), of the same points.
+            left_covariance: (N, 2, 2), pixels^2; None: all the same.
+            right_covariance: the same for the right image.
+
+        Returns:
+            (N, 3), left camera's frame, metres; NaN where the rays do not meet before both cameras.
+
+        Raises:
+            CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
+        """
+        pixels = self._pixels(left_pixels, right_pixels)
+        covariance = tuple(
+            _covariances(given, len(pixels[0]), side)
+            for given, side in zip((left_covariance, right_covariance), SIDES, strict=True)
+        )
+        both = covariance[0], covariance[1]
+        return triangulation.triangulate(self._cameras, pixels, both).points
+
+    def point_covariance(self, points: ArrayLike, pixel_sigma: float | None = None) -> Array:
+        """Return the covariance of triangulated points, the calibration taken as exact.
+
+        Args:
+            points: (N, 3), left camera's frame, metres.
+            pixel_sigma: standard deviation of a coordinate in an image, pixels; None: as the
+                residuals of the calibration have it.
+
+        Returns:
+            (N, 3, 3), m^2; NaN for what is not before both cameras.
+
+        Raises:
+            CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
+        """
+        given = as_points(points, 3, "points before the cameras")
+        sigma = self.rms if pixel_sigma is None else pixel_sigma
+        seen = self.left.project(given), self.right.project(self.transform.apply(given))
+        known = np.isfinite(seen[0]).all(axis=1) & np.isfinite(seen[1]).all(axis=1)
+        each = np.tile(sigma**2 * np.eye(2), (int(known.sum()), 1, 1))
+        found = np.full((len(given), 3, 3), np.nan)
+        pixels = seen[0][known], seen[1][known]
+        found[known] = triangulation.triangulate(self._cameras, pixels, (each, each)).covariance
+        return found
+
+    def epipolar_distances(self, left_pixels: ArrayLike, right_pixels: ArrayLike) -> Array:
+        """Return the distances of points from the epipolar lines of their partners.
+
+        Args:
+            left_pixels: (N, 2).
+            right_pixels: (N, 2).
+
+        Returns:
+            (N, 2): in the left image and in the right one, pixels without distortion.
+
+        Raises:
+            CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
+        """
+        pixels = self._pixels(left_pixels, right_pixels)
+        return triangulation.epipolar_distances(self._cameras, pixels)
+
+    def point_errors(
+        self,
+        left_views: Sequence[TargetView | None],
+        right_views: Sequence[TargetView | None],
+    ) -> tuple[PairErrors, ...]:
+        """Return by how much the cameras are off at any pairs of views.
+
+        Pairs that they were not fitted to tell how good they are. The target does not have to be
+        the same.
+
+        Args:
+            left_views: one for each moment; None where the left camera does not see the target.
+            right_views: of the right camera at the same moments. Of a target that looks the same
+                when turned they are numbered as they fit the left ones.
+
+        Returns:
+            One for each moment, without any errors where a view is missing.
+
+        Raises:
+            CalibrationError: ``SHAPE``: lists of different lengths; ``WRONG_SIZE``; ``TOO_FEW``,
+                ``COLLINEAR``, ``NOT_FINITE``: a view that is of no use; ``DIFFERENT_TARGETS``.
+        """
+        moments = as_moments(left_views, right_views)
+        for side, camera in enumerate((self.left, self.right)):
+            for moment in moments:
+                if (view := moment[side]) is not None:
+                    check_view(view, camera.size)
+        return tuple(self._errors(*moment) for moment in moments)
+
+    def _errors(self, left: TargetView | None, right: TargetView | None) -> PairErrors:
+        if left is None or right is None:
+            return PairErrors(np.zeros(0), np.zeros((0, 2)))
+        ways = [right]
+        if right.target.turned_alike:
+            ways.append(half_turned(right))
+        found = [pair_errors(self._cameras, left, one) for one in ways]
+        return min(found, key=lambda one: _rms([one.epipolar]))
+
+    def rectify(self, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Rectification:
+        """Return the maps after which the rows of both images show the same points.
+
+        Args:
+            alpha: 0 to 1, from no invalid pixels in the output to no lost ones of the source.
+            size: of the output, width and height in pixels; None: the source's.
+
+        Raises:
+            CalibrationError: ``SHAPE``, ``WRONG_SIZE``: as
+                :func:`~smartcam.calibration._stereo.rectification.rectify` says.
+        """
+        return rectify(self.left, self.right, self.transform, alpha=alpha, size=size)
+
+    @property
+    def _cameras(self) -> CameraPair:
+        return CameraPair(self.left, self.right, self.transform)
+
+    def _pixels(self, left: ArrayLike, right: ArrayLike) -> tuple[Array, Array]:
+        first, second = as_points(left, 2, "left pixels"), as_points(right, 2, "right pixels")
+        if len(first) != len(second):
+            raise CalibrationError(
+                f"pixels: expected as many on both sides, got {len(first)} and {len(second)}",
+                code=Code.SHAPE,
+                expected=len(first),
+                got=len(second),
+            )
+        return first, second
+
+    def _check(self, found: Mapping[str, Any], called: str) -> None:
+        storage.check_shape(self.covariance, (6, 6), called, "covariance")
+        if self.sheet is not None:
+            storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
+
+
+def _target(calibration: StereoCalibration) -> Target:
+    pairs = calibration.pairs
+    return next(view.target for one in pairs for view in (one.left, one.right) if view)
+
+
+def calibrate_stereo(
+    left_views: Sequence[TargetView | None],
+    right_views: Sequence[TargetView | None],
+    *,
+    left: CameraModel | None = None,
+    right: CameraModel | None = None,
+    distortion_model: DistortionModel = "plumb_bob",
+    fixed: Iterable[str] = (),
+    sheet: Sheet = "auto",
+    drop_bad: bool = True,
+) -> StereoCalibration:
+    """Return both lenses and where the left camera is in the right one's frame.
+
+    Lenses, transform and poses are adjusted together to the least reprojection error in both
+    images, each point weighted by its covariance and by what the residuals show beside it. The
+    order of the pairs does not matter.
+
+    Args:
+        left_views: of one target, one for each moment; None where the left camera does not see it.
+        right_views: of the right camera at the same moments.
+        left: its lens where that is known and is to stay; None: it is found together with the rest.
+        right: the same for the right camera.
+        distortion_model: of lenses that are to be found.
+        fixed: coefficients of those that stay 0, such as ``k3``; ``aspect``: fx and fy are one.
+        sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
+            adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
+            ``auto``: what has the smaller held-out reprojection error, where it is clearly smaller.
+        drop_bad: whether views that fit far worse than the others are left out (and named), at
+            most a third of them; else they are only named. Of a pair whose views do not belong
+            together it is the right one.
+
+    Raises:
+        CalibrationError: ``TOO_FEW``: less than 3 pairs, 2 where both lenses are known;
+            ``SHAPE``: lists of different lengths, or a coefficient that is none; ``WRONG_SIZE``,
+            ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``; ``POOR_FIT``: no lens or no
+            transform shows the views, as where those of many pairs are of different moments;
+            ``INSUFFICIENT_ROTATION``: the target was not tilted.
+    """
+    moments = as_moments(left_views, right_views)
+    least = LEAST_PAIRS if left and right else LEAST_VIEWS
+    both = [number for number, one in enumerate(moments) if None not in one]
+    if len(both) < least:
+        raise CalibrationError(
+            f"stereo: expected {least} pairs or more in which both cameras see the target, got "
+            f"{len(both)}",
+            code=Code.TOO_FEW,
+            expected=least,
+            got=len(both),
+        )
+    lenses = Lenses((left, right), distortion_model, tuple(fixed))
+    moments, bundle, apart = start(moments, lenses)
+    sights = [
+        Sight(side, number, view)
+        for number, moment in enumerate(moments)
+        for side, view in enumerate(moment)
+        if view is not None
+    ]
+    most, bad = MOST_BAD * len(sights), list[Sight]()
+    bad += [one for one in sights if one.camera == 1 and one.pose in apart]
+    rest = [one for one in sights if one not in bad]
+    if drop_bad and len(bad) <= MOST_BAD * len(both) and len(_pairs(rest)) >= least:
+        sights = rest
+    while True:
+        adjusted = adjust_weighted(bundle, sights)
+        if not math.isfinite(adjusted.weighted):
+            raise CalibrationError(
+                "stereo: expected cameras that show the pairs as they are, got points behind one",
+                code=Code.POOR_FIT,
+            )
+        worst, ratio = worst_view([one.view for one in sights], adjusted)
+        if ratio <= BAD:
+            break
+        if sights[worst] not in bad:
+            bad.append(sights[worst])
+        rest = sights[:worst] + sights[worst + 1 :]
+        if not drop_bad or len(bad) > most or len(_pairs(rest)) < least:
+            break
+        sights, bundle = rest, adjusted.bundle
+    return _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
+
+
+def _pairs(sights: Sequence[Sight]) -> list[int]:
+    """Return the moments that both cameras see."""
+    sides = [{one.pose for one in sights if one.camera == side} for side in range(2)]
+    return sorted(sides[0] & sides[1])
+
+
+class _Found(NamedTuple):
+    """What a summary is made of."""
+
+    moments: list[Moment]  # all views, the right ones numbered as the left ones
+    sights: list[Sight]  # the used ones
+    bad: list[Sight]  # those that fit badly, whether used or not
+    adjusted: AdjustedBundle  # the cameras
+    least: int  # pairs that are needed
+    apart: Mapping[int, float]  # as :class:`~smartcam.calibration._stereo.start.FirstGuess` has it
+
+    def pair(self, number: int) -> tuple[TargetView, TargetView]:
+        """Return the views of a moment that both cameras see."""
+        left, right = self.moments[number]
+        if left is None or right is None:
+            raise KeyError(number)
+        return left, right
+
+
+class _HeldOut(NamedTuple):
+    """Errors of one pair under cameras that never saw it."""
+
+    errors: PairErrors
+    residuals: Array
+
+
+def _held_out(found: _Found) -> dict[int, _HeldOut]:
+    pairs = _pairs(found.sights)
+    errors: dict[int, _HeldOut] = {}
+    if len(pairs) <= found.least:
+        return errors
+    for number in pairs:
+        bundle = leave_out(found.adjusted, found.sights, number)
+        residuals = held_out_residuals(bundle, found.sights, number, found.adjusted.more)
+        errors[number] = _HeldOut(
+            pair_errors(_cameras(bundle), *found.pair(number)), np.concatenate(residuals)
+        )
+    return errors
+
+
+def _cameras(bundle: Bundle) -> CameraPair:
+    left, right = bundle.cameras
+    return CameraPair(left, right, Transform(RIGHT, LEFT, *bundle.rig.taken(0)))
+
+
+def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
+    adjusted, held_out = choose_shape(
+        found.adjusted,
+        found.sights,
+        sheet,
+        lambda fitted: _held_out(found._replace(adjusted=fitted)),
+        lambda errors: _rms([one.residuals for one in errors.values()]),
+    )
+    found = found._replace(adjusted=adjusted)
+    points = adjusted.bundle.points
+    cameras = _cameras(adjusted.bundle)
+    epipolar = [pair_errors(cameras, *found.pair(n)).epipolar for n in _pairs(found.sights)]
+    squares = sum(float((one**2).sum()) for one in adjusted.residuals)
+    calibration = StereoCalibration(
+        **cameras._asdict(),
+        covariance=adjusted.covariance[-6:, -6:],
+        pairs=tuple(_pair(found, number, held_out) for number in range(len(found.moments))),
+        rms=math.sqrt(squares / adjusted.freedom),
+        sigma=math.sqrt(adjusted.more),
+        epipolar=_rms(epipolar),
+        held_out=_rms([one.errors.spacing for one in held_out.values()]),
+        held_out_epipolar=_rms([one.errors.epipolar for one in held_out.values()]),
+        sheet=None if points is None else points - found.sights[0].view.target.points,
+        warnings=(),
+    )
+    check_fit(calibration.rms, found.sights, found.bad)
+    return dataclasses.replace(calibration, warnings=tuple(_remarks(calibration, found)))
+
+
+def _rms(parts: Sequence[Array]) -> float:
+    values = np.concatenate([one.ravel() for one in parts]) if parts else np.zeros(0)
+    return math.sqrt(float((values**2).mean())) if len(values) else math.nan
+
+
+def _pair(found: _Found, number: int, held_out: Mapping[int, _HeldOut]) -> PairFit:
+    rms = {
+        one.camera: _rms([residuals])
+        for one, residuals in zip(found.sights, found.adjusted.residuals, strict=True)
+        if one.pose == number
+    }
+    pose = Transform(LEFT, TARGET, *found.adjusted.bundle.poses.taken(number))
+    left, right = found.moments[number]
+    held = held_out.get(number)
+    return PairFit(
+        left=left,
+        right=right,
+        used=(0 in rms, 1 in rms),
+        transform=pose if rms else None,
+        rms=(rms.get(0, math.nan), rms.get(1, math.nan)),
+        held_out=_rms([held.errors.spacing]) if held else math.nan,
+        epipolar=_rms([held.errors.epipolar]) if held else math.nan,
+    )
+
+
+def _remarks(calibration: StereoCalibration, found: _Found) -> Iterator[Remark]:
+    for one in found.bad:
+        used = any(one is sight for sight in found.sights)
+        done = "is used all the same" if used else "was not used"
+        off = f"fits more than {BAD:g} times worse than the others"
+        if one.camera == 1 and one.pose in found.apart:
+            pixels = found.apart[one.pose]
+            far = f"{pixels:.3g} pixels off" if math.isfinite(pixels) else "nowhere near"
+            off = (
+                f"is {far} where the left view and the other pairs have it: the two are of "
+                "different moments, or swapped"
+            )
+        name = f"{label(one.view, one.pose)}, {SIDES[one.camera]}"
+        yield Remark(Code.BAD_VIEW, f"{name}: {off}; it {done}")
+    if calibration.rms > POOR:
+        yield Remark(
+            Code.POOR_FIT,
+            f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR:g} at most: a lens is "
+            "not of its model, the sheet is not flat, or the pairs were not taken at the same "
+            "moments",
+        )
+    yield from remark_sides(calibration.transform)
+    yield from remark_sheet(calibration.sheet)
+    if math.isnan(calibration.held_out):
+        yield Remark(
+            Code.NOT_HELD_OUT,
+            f"{len(_pairs(found.sights))} pairs are no more than the cameras have need of: none "
+            "can be left out to see how good they are",
+        )
+
+
+def _covariances(given: ArrayLike | None, count: int, side: str) -> Array:
+    if given is None:
+        return np.tile(np.eye(2), (count, 1, 1))
+    values = np.asarray(given, dtype=np.float64)
+    if values.shape != (count, 2, 2):
+        raise CalibrationError(
+            f"{side} covariance: expected shape ({count}, 2, 2), got {values.shape}",
+            code=Code.SHAPE,
+            expected=(count, 2, 2),
+            got=values.shape,
+        )
+    as_points(values.reshape(-1, 4), 4, f"{side} covariance")
+    return values

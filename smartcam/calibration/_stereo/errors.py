@@ -1,0 +1,67 @@
+"""By how much two cameras are off at a pair of views."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+from smartcam.calibration._stereo import triangulation
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.bundle import Indices
+    from smartcam.calibration._stereo.triangulation import CameraPair
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration._views import TargetView
+
+NEAREST: Final = 1.01
+"""Points that are no farther apart than this many times the least distance are neighbours."""
+
+
+class PairErrors(NamedTuple):
+    """By how much two cameras are off at one pair of views.
+
+    Attributes:
+        spacing: (M,), distances between neighbouring points of the target, as triangulated, less
+            those that were meant, metres.
+        epipolar: (N, 2), distances of the points from the epipolar lines of their partners, in the
+            left image and in the right one, pixels without distortion.
+    """
+
+    spacing: Array
+    epipolar: Array
+
+
+def pair_errors(cameras: CameraPair, left: TargetView, right: TargetView) -> PairErrors:
+    """Return by how much two cameras are off at one pair of views of a target.
+
+    The points of both are numbered alike.
+    """
+    ids, first, second = np.intersect1d(left.ids, right.ids, return_indices=True)
+    pixels = left.points[first], right.points[second]
+    covariance = left.covariance[first], right.covariance[second]
+    points = triangulation.triangulate(cameras, pixels, covariance).points
+    return PairErrors(
+        spacing_errors(left.target, np.asarray(ids, dtype=np.intp), points),
+        triangulation.epipolar_distances(cameras, pixels),
+    )
+
+
+def spacing_errors(target: Target, ids: Indices, points: Array) -> Array:
+    """Return the distances between neighbours on a target less the true ones (M,), metres.
+
+    ``ids`` (N,): numbers of points on it. ``points`` (N, 3): where they are in space, metres; those
+    that are NaN have no neighbours.
+    """
+    seen = np.isfinite(points).all(axis=1)
+    flat, points = target.points[ids[seen]], points[seen]
+    if len(flat) < 2:
+        return np.zeros(0)
+    apart = np.linalg.norm(target.points - target.points[0], axis=1)[1:].min()
+    tree = load("scipy.spatial").cKDTree(flat)
+    one, two = tree.query_pairs(NEAREST * apart, output_type="ndarray").T
+    true = np.linalg.norm(flat[one] - flat[two], axis=1)
+    errors: Array = np.linalg.norm(points[one] - points[two], axis=1) - true
+    return errors

@@ -1,0 +1,237 @@
+"""Both images of a pair as two parallel cameras would see them: rows show the same points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel
+
+Image: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]"
+
+ACROSS: Final = 0.1
+"""Cosine of the angle by which a camera's viewing direction is turned, at least.
+
+With less, a camera looks along the line to the other one: rows would meet inside of its image.
+"""
+
+MAX_PIXELS: Final = 100_000_000
+"""Of a rectified image; its two maps have 8 bytes for each."""
+
+SAMPLES: Final = 50_000
+"""Source pixels at most, evenly spread, of which it is counted how many are kept."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rectification:
+    """What :meth:`StereoCalibration.rectify` finds.
+
+    Where an image's half stands in a pair, the left one comes first.
+
+    Attributes:
+        size: width and height of the rectified images, pixels.
+        alpha: 0: all pixels of the output are valid; 1: all source pixels are kept.
+        rotations: (3, 3) each, from each camera's frame into its rectified one.
+        projections: (3, 4) each, from the left rectified frame into each rectified image; metres
+            become pixels.
+        depth: (4, 4), Q: (u, v, disparity, 1) becomes the point in the left rectified frame,
+            homogeneous, metres.
+        maps: (H, W, 2) each, float32: where each output pixel is in the source, for
+            ``cv2.remap``.
+        masks: (H, W) each: which pixels of the output have a source.
+        kept: part of the source pixels that are in the output, of each.
+        invalid: part of the output pixels that have no source, of each.
+    """
+
+    size: tuple[int, int]
+    alpha: float
+    rotations: tuple[Array, Array]
+    projections: tuple[Array, Array]
+    depth: Array
+    maps: tuple[NDArray[np.float32], NDArray[np.float32]]
+    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+    kept: tuple[float, float]
+    invalid: tuple[float, float]
+
+    @property
+    def lost(self) -> tuple[float, float]:
+        """Part of the source pixels that are not in the output, of each."""
+        return 1.0 - self.kept[0], 1.0 - self.kept[1]
+
+    def apply(self, left: Image, right: Image) -> tuple[Image, Image]:
+        """Return both images (H, W) or (H, W, C) rectified; 0 where there is no source."""
+        cv2 = load("cv2")
+        first, second = (
+            np.asarray(cv2.remap(image, chart, None, cv2.INTER_LINEAR), dtype=np.uint8)
+            for image, chart in zip((left, right), self.maps, strict=True)
+        )
+        return first, second
+
+
+def rectify(
+    left: CameraModel,
+    right: CameraModel,
+    transform: Transform,
+    *,
+    alpha: float = 0.0,
+    size: tuple[int, int] | None = None,
+) -> Rectification:
+    """Return the maps after which the rows of two images show the same points.
+
+    Args:
+        left: its lens.
+        right: its lens, of the same model and image size.
+        transform: ``T_right_left``.
+        alpha: 0 to 1, from no invalid pixels to no lost ones.
+        size: of the output, width and height in pixels; None: the source's.
+
+    Raises:
+        CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is none or too large,
+            lenses of different models; ``WRONG_SIZE``: images of different sizes;
+            ``OUT_OF_FIELD``: the images would have nothing in them, as of cameras behind each
+            other, or of which one stands on its head.
+    """
+    output = _checked(left, right, alpha, size)
+    turns, projections, depth = _parallel(left, right, transform, alpha, output)
+    cameras = (left, right)
+    maps = tuple(
+        _map(camera, turn, projection, output)
+        for camera, turn, projection in zip(cameras, turns, projections, strict=True)
+    )
+    masks = tuple(_inside(chart, camera.size) for chart, camera in zip(maps, cameras, strict=True))
+    across = min(float(turn[2, 2]) for turn in turns)
+    upright = min(float(projection[0, 0]) for projection in projections) > 0
+    if not (upright and across > ACROSS and all(mask.any() for mask in masks)):
+        raise CalibrationError(
+            f"rectify with alpha {alpha:g}: expected two cameras beside each other that see the "
+            "same place the same way up, got parallel images with nothing in them, or upside down "
+            f"(cosine between old and new viewing direction: {across:.2f})",
+            code=Code.OUT_OF_FIELD,
+            expected=ACROSS,
+            got=across,
+        )
+    kept = tuple(
+        _kept(camera, turn, projection, output)
+        for camera, turn, projection in zip(cameras, turns, projections, strict=True)
+    )
+    return Rectification(
+        size=output,
+        alpha=alpha,
+        rotations=turns,
+        projections=projections,
+        depth=depth,
+        maps=(maps[0], maps[1]),
+        masks=(masks[0], masks[1]),
+        kept=(kept[0], kept[1]),
+        invalid=(1.0 - float(masks[0].mean()), 1.0 - float(masks[1].mean())),
+    )
+
+
+def _checked(
+    left: CameraModel, right: CameraModel, alpha: float, size: tuple[int, int] | None
+) -> tuple[int, int]:
+    """Return the size of the output."""
+    if not (math.isfinite(alpha) and 0.0 <= alpha <= 1.0):
+        raise _shape("alpha", "0 to 1", alpha)
+    if left.distortion_model != right.distortion_model:
+        raise _shape("lenses", f"two of {left.distortion_model}", right.distortion_model)
+    if tuple(left.size) != tuple(right.size):
+        raise CalibrationError(
+            f"rectify: expected images of one size, {left.size[0]} x {left.size[1]}, got "
+            f"{right.size[0]} x {right.size[1]} on the right",
+            code=Code.WRONG_SIZE,
+            expected=left.size,
+            got=right.size,
+        )
+    width, height = size or left.size
+    if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
+        raise _shape("size", f"1 to {MAX_PIXELS} pixels", (width, height))
+    return int(width), int(height)
+
+
+def _shape(what: str, expected: str, got: object) -> CalibrationError:
+    return CalibrationError(
+        f"rectify: {what}: expected {expected}, got {got}",
+        code=Code.SHAPE,
+        expected=expected,
+        got=got,
+    )
+
+
+def _parallel(
+    left: CameraModel,
+    right: CameraModel,
+    transform: Transform,
+    alpha: float,
+    output: tuple[int, int],
+) -> tuple[tuple[Array, Array], tuple[Array, Array], Array]:
+    """Return rotations, projections and Q."""
+    # Each camera is turned by half of the rotation between them, in opposite senses, so that both
+    # look the same way and neither image changes more than it must; then both are turned until the
+    # baseline is along x. A point at depth Z has the disparity d = f B / Z then, and Q takes
+    # (u, v, d, 1) to (u - cx, v - cy, f, -d / Tx), which is (X, Y, Z, 1) times d / B.
+    # Source: Bouguet's algorithm, as in Bradski and Kaehler, Learning OpenCV (2008), chapter 12.
+    cv2 = load("cv2")
+    given = (
+        left.matrix,
+        left.distortion,
+        right.matrix,
+        right.distortion,
+        left.size,
+        transform.rotation,
+        transform.translation,
+    )
+    if left.distortion_model == "equidistant":
+        found: Any = cv2.fisheye.stereoRectify(
+            *given, cv2.CALIB_ZERO_DISPARITY, newImageSize=output, balance=alpha
+        )
+    else:
+        found = cv2.stereoRectify(
+            *given, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output
+        )
+    first, second, one, two, depth = (np.array(each, dtype=np.float64) for each in found[:5])
+    return (first, second), (one, two), depth
+
+
+def _map(
+    camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]
+) -> NDArray[np.float32]:
+    cv2 = load("cv2")
+    of_model = cv2.fisheye if camera.distortion_model == "equidistant" else cv2
+    both = of_model.initUndistortRectifyMap(
+        camera.matrix, camera.distortion, turn, projection[:, :3], output, cv2.CV_32FC1
+    )
+    return np.stack(both, axis=-1).astype(np.float32)
+
+
+def _inside(places: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return whether places (..., 2) are in an image."""
+    with np.errstate(invalid="ignore"):
+        u, v = places[..., 0], places[..., 1]
+        return np.asarray((u >= 0) & (v >= 0) & (u <= size[0] - 1) & (v <= size[1] - 1))
+
+
+def _kept(camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]) -> float:
+    """Return the part of the source pixels that are in the output."""
+    width, height = camera.size
+    apart = max(1, math.ceil(math.sqrt(width * height / SAMPLES)))
+    u, v = np.meshgrid(np.arange(apart // 2, width, apart), np.arange(apart // 2, height, apart))
+    rays = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
+    # from pixel to ray to the rectified camera's ray to its pixel: P (R K^-1 u)
+    turned = np.column_stack([rays, np.ones(len(rays))]) @ turn.T
+    seen = turned @ projection[:, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = seen[:, :2] / seen[:, 2:]
+    return float((_inside(places, output) & (turned[:, 2] > 0)).mean())

@@ -1,0 +1,197 @@
+"""Where the calibration of two cameras starts from: lenses, poses, and the likeliest transform."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.rigid import IDENTITY, Rigid
+from smartcam.calibration._lens.bundle import Bundle, known_lens
+from smartcam.calibration._lens.intrinsics import check_tilts, check_views
+from smartcam.calibration._lens.poses import locate
+from smartcam.calibration._lens.start import fit_lens, lens_basis
+from smartcam.calibration._targets import Charuco
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel, DistortionModel
+    from smartcam.calibration._views import TargetView
+
+LEFT: Final = "left"
+"""Name of the left camera's frame."""
+
+RIGHT: Final = "right"
+"""Name of the right camera's frame."""
+
+SIDES: Final = (LEFT, RIGHT)
+"""Their names by number."""
+
+GUESSES: Final = 20
+"""Pairs at most that are tried for a first guess of the transform."""
+
+GROSS: Final = 10.0
+"""A pair that is more times the median off does not belong together, if it is far off, too."""
+
+FAR: Final = 0.01
+"""Of the longer side of the image: as far off is no noise, nor a lens that is not yet adjusted."""
+
+
+class Lenses(NamedTuple):
+    """What is known and wanted of the lenses."""
+
+    # left and right; None for one that is to be found
+    known: tuple[CameraModel | None, CameraModel | None]
+    model: DistortionModel  # of those that are to be found
+    # of these, coefficients that stay 0, as :func:`~smartcam.calibration._lens.start.lens_basis`
+    # takes them
+    fixed: tuple[str, ...]
+
+    def basis(self, side: int) -> Array:
+        """Return the unknowns of a side's lens (4 + K, F)."""
+        known = self.known[side]
+        return lens_basis(self.model, self.fixed) if known is None else known_lens(known)
+
+
+Moment: TypeAlias = tuple["TargetView | None", "TargetView | None"]
+"""What both cameras see of the target at one time."""
+
+
+def as_moments(
+    left_views: Sequence[TargetView | None], right_views: Sequence[TargetView | None]
+) -> list[Moment]:
+    """Return the views as pairs.
+
+    Raises ``SHAPE``: lists of different lengths; ``DIFFERENT_TARGETS``, ``WRONG_SIZE``,
+    ``TOO_FEW``, ``COLLINEAR``, ``NOT_FINITE``: views that do not belong together, or one that is of
+    no use.
+    """
+    if len(left_views) != len(right_views):
+        raise CalibrationError(
+            f"stereo: expected as many left views as right ones, got {len(left_views)} and "
+            f"{len(right_views)}",
+            code=Code.SHAPE,
+            expected=len(left_views),
+            got=len(right_views),
+        )
+    for side, views in zip(SIDES, (left_views, right_views), strict=True):
+        check_views([one for one in views if one is not None], f"{side} camera", 1)
+    moments = list(zip(left_views, right_views, strict=True))
+    for one, two in moments:
+        if one is not None and two is not None and one.target != two.target:
+            raise CalibrationError(
+                f"stereo: expected views of one target, {one.target}, got {two.target} on the "
+                "right",
+                code=Code.DIFFERENT_TARGETS,
+                expected=one.target,
+                got=two.target,
+            )
+    return moments
+
+
+class FirstGuess(NamedTuple):
+    """A first guess of everything."""
+
+    moments: list[Moment]  # the right views numbered as the left ones are
+    bundle: Bundle  # lenses, transform and poses
+    # moments whose views do not belong together, and how far the right one is off where the left
+    # one and the other pairs have it, pixels; infinite where that is behind it
+    apart: dict[int, float]
+
+
+def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
+    """Return a first guess of everything.
+
+    Raises ``POOR_FIT``: no lens or no transform shows the views; ``INSUFFICIENT_ROTATION``;
+    ``WRONG_SIZE``: views of another camera than the known one.
+    """
+    cameras = _lens(moments, 0, lenses), _lens(moments, 1, lenses)
+    poses = [_poses(moment, cameras) for moment in moments]
+    views = [view for moment in moments for view in moment if view is not None]
+    if not isinstance(views[0].target, Charuco) and views[0].target.turned_alike:
+        for number, ((one, two), (first, second)) in enumerate(zip(poses, moments, strict=True)):
+            if one is not None and two is not None and second is not None:
+                other = half_turned(second)
+                turned = locate(other, cameras[1]).transform
+                if one.rigid.angle_to(turned.rigid) < one.rigid.angle_to(two.rigid):
+                    moments[number], poses[number] = (first, other), (one, turned)
+    rig, apart = _rig(moments, poses, cameras[1])
+    firsts = Rigid.stacked(
+        one.rigid if one else rig.inverse() @ two.rigid if two else IDENTITY for one, two in poses
+    )
+    basis = lenses.basis(0), lenses.basis(1)
+    return FirstGuess(moments, Bundle(cameras, Rigid.stacked([rig]), firsts, basis), apart)
+
+
+def _lens(moments: list[Moment], side: int, lenses: Lenses) -> CameraModel:
+    known = lenses.known[side]
+    views = [moment[side] for moment in moments]
+    seen = [view for view in views if view is not None]
+    if known is None:
+        found = fit_lens(seen, lenses.model, lenses.fixed)
+        check_tilts(found, f"{SIDES[side]} camera")
+        return found.bundle.cameras[0]
+    check_views(seen, f"{SIDES[side]} camera", 1, known.size)
+    return known
+
+
+Poses: TypeAlias = tuple["Transform | None", "Transform | None"]
+
+
+def _poses(moment: Moment, cameras: tuple[CameraModel, CameraModel]) -> Poses:
+    one, two = moment
+    return (
+        None if one is None else locate(one, cameras[0]).transform,
+        None if two is None else locate(two, cameras[1]).transform,
+    )
+
+
+def half_turned(view: TargetView) -> TargetView:
+    """Return a view whose points are numbered from the target's other end."""
+    ids = len(view.target.points) - 1 - view.ids[::-1]
+    return dataclasses.replace(
+        view, ids=ids, points=view.points[::-1], covariance=view.covariance[::-1]
+    )
+
+
+def _rig(
+    moments: list[Moment], poses: list[Poses], right: CameraModel
+) -> tuple[Rigid, dict[int, float]]:
+    """Return the pair's transform that fits most of the pairs best, and the pairs that do not fit.
+
+    Raises ``POOR_FIT``.
+    """
+    pairs = [
+        (number, one, two, moment[1])
+        for number, ((one, two), moment) in enumerate(zip(poses, moments, strict=True))
+        if one is not None and two is not None and moment[1] is not None
+    ]
+    best, least, apart = IDENTITY, math.inf, dict[int, float]()
+    for _, one, two, _ in pairs[:: math.ceil(len(pairs) / GUESSES)]:
+        # T_right_left = T_right_target T_target_left; that with the least median counts, which half
+        # of the pairs may not spoil: Rousseeuw, Least Median of Squares Regression (1984).
+        guess = two.rigid @ one.rigid.inverse()
+        off = []
+        for _, pose, _, view in pairs:
+            near = (guess @ pose.rigid).apply(view.object_points)
+            distances = np.linalg.norm(right.project(near) - view.points, axis=1)
+            off.append(float(np.nan_to_num(distances, nan=math.inf).mean()))
+        middle = float(np.median(off))
+        if middle < least:
+            best, least = guess, middle
+            apart = {number: value for (number, *_), value in zip(pairs, off, strict=True)}
+    if not math.isfinite(least):
+        raise CalibrationError(
+            f"stereo: expected one transform from left to right that fits most of the "
+            f"{len(pairs)} pairs, got none: were the views taken at the same moments?",
+            code=Code.POOR_FIT,
+        )
+    far = max(GROSS * least, FAR * max(right.size))
+    return best, {number: off for number, off in apart.items() if off > far}

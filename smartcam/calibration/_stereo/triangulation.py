@@ -1,0 +1,132 @@
+"""Points that two cameras see, in space."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._geometry.rigid import cross_matrix
+from smartcam.calibration._lens.projection import linearize, whitening
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel
+
+STEPS = 10
+"""From the linear solution to the least reprojection error; two or three are enough."""
+
+SETTLED = 1e-9
+"""Part of its depth that a point still moves in the last step."""
+
+
+class CameraPair(NamedTuple):
+    """Two cameras."""
+
+    left: CameraModel  # its lens
+    right: CameraModel  # its lens
+    transform: Transform  # ``T_right_left``
+
+
+class Triangulated(NamedTuple):
+    """Points and how sure they are."""
+
+    # (N, 3), left camera's frame, metres; NaN where the rays do not meet before both cameras
+    points: Array
+    covariance: Array  # (N, 3, 3), m^2
+
+
+def triangulate(
+    pair: CameraPair, pixels: tuple[Array, Array], covariance: tuple[Array, Array]
+) -> Triangulated:
+    """Return the points whose projections are nearest to what both cameras see.
+
+    Nearest is the least sum of squares in both images, weighted by the covariance of the pixels:
+    for normal noise no unbiased estimate has a smaller variance.
+
+    ``pixels`` (N, 2) and ``covariance`` (N, 2, 2) are left and right.
+    """
+    points = _linear(pair, pixels)
+    points[~(points[:, 2] > 0)] = np.nan
+    white = [whitening(one, 0.0) for one in covariance]
+    normal = np.full((len(points), 3, 3), np.nan)
+    for _ in range(STEPS):
+        normal, step = _step(pair, pixels, white, points)
+        points = points + step
+        with np.errstate(invalid="ignore"):
+            moved = np.linalg.norm(step, axis=1) > SETTLED * np.abs(points[:, 2])
+        if not moved.any():
+            break
+    behind = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
+    points[behind] = np.nan
+    points[~np.isfinite(points).all(axis=1)] = np.nan  # none of them is infinite
+    # The covariance of least squares with residuals of variance 1 is (J^T J)^-1.
+    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2.
+    inverse = np.full_like(normal, np.nan)
+    inverse[~behind] = np.linalg.pinv(normal[~behind], hermitian=True)
+    return Triangulated(points, inverse)
+
+
+def _linear(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
+    """Return the points by the direct linear transform of the rays (N, 3)."""
+    if not len(pixels[0]):
+        return np.zeros((0, 3))
+    # A ray (x, y) of the plane z = 1 gives two linear equations of the homogeneous point X with the
+    # rows P_i of its camera's matrix: (x P_3 - P_1) X = 0 and (y P_3 - P_2) X = 0. Both cameras
+    # give four, whose least singular vector is X. Left P = (I 0), right P = (R t).
+    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 12.2.
+    first, second = pair.left.directions(pixels[0]), pair.right.directions(pixels[1])
+    matrix = np.column_stack([pair.transform.rotation, pair.transform.translation])
+    found = load("cv2").triangulatePoints(np.eye(3, 4), matrix, first.T, second.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points: Array = np.asarray(found[:3] / found[3], dtype=np.float64).T
+    points[~np.isfinite(points).all(axis=1)] = np.nan
+    return points
+
+
+def _step(
+    pair: CameraPair, pixels: tuple[Array, Array], white: list[Array], points: Array
+) -> tuple[Array, Array]:
+    """Return the normal matrices (N, 3, 3) and Gauss and Newton's step (N, 3)."""
+    # (J^T J) d = J^T r, where the right camera's rows of J have the chain rule's R of R X + t. All
+    # points at once, which no solver of single problems does; a thousand take a few milliseconds.
+    one = linearize(points, pair.left)
+    two = linearize(pair.transform.apply(points), pair.right)
+    rows = [white[0] @ one.by_point, white[1] @ two.by_point @ pair.transform.rotation]
+    off = [
+        white[0] @ (pixels[0] - one.pixels)[..., None],
+        white[1] @ (pixels[1] - two.pixels)[..., None],
+    ]
+    jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(off, axis=1)
+    normal = jacobian.swapaxes(1, 2) @ jacobian
+    right_side = jacobian.swapaxes(1, 2) @ residuals
+    known = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right_side).all(axis=(1, 2))
+    step = np.full((len(points), 3), np.nan)
+    inverse = np.linalg.pinv(normal[known], hermitian=True)
+    step[known] = (inverse @ right_side[known])[..., 0]
+    return normal, step
+
+
+def epipolar_distances(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
+    """Return the distances of undistorted pixels from the other camera's rays of their partners.
+
+    ``pixels`` (N, 2) are left and right; (N, 2): in the left image and in the right one, pixels.
+    """
+    # A point's two rays and the baseline lie in one plane: x2^T E x1 = 0 with E = [t]x R. In pixels
+    # without distortion it is F = K2^-T E K1^-1; F x1 is the line of x1's partner in the right
+    # image, F^T x2 that in the left one, and a point's distance from a line (a, b, c) is
+    # |a u + b v + c| / sqrt(a^2 + b^2).
+    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, sections 9.2 and 9.6.
+    left, right, transform = pair
+    essential = cross_matrix(transform.translation) @ transform.rotation
+    seen = [
+        np.column_stack([camera.undistort(some), np.ones(len(some))])
+        for camera, some in zip((left, right), pixels, strict=True)
+    ]
+    matrix = np.linalg.inv(right.matrix).T @ essential @ np.linalg.inv(left.matrix)
+    lines = [seen[1] @ matrix, seen[0] @ matrix.T]
+    products = np.abs((seen[1] * lines[1]).sum(axis=1))
+    distances = [products / np.linalg.norm(one[:, :2], axis=1) for one in lines]
+    return np.column_stack(distances)

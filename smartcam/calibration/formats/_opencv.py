@@ -1,0 +1,140 @@
+"""YAML that ``cv2.FileStorage`` and PyYAML read: a plane's matrix, or a transform.
+
+Source: OpenCV, ``modules/core/src/persistence_yml.cpp`` (published): the first line begins with
+``%YAML``, a number with a point is a real, ``!!opencv-matrix`` has rows, cols, dt and data.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration.formats._plain import (
+    Plain,
+    frame_name,
+    load_yaml,
+    malformed,
+    mapping,
+    matrix_rows,
+    number,
+    quoted,
+    real,
+    rigid,
+    sequence,
+)
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+
+HEAD = "%YAML:1.0\n---\n"
+"""Beginning of OpenCV's files; its readers want ``%YAML`` there."""
+
+
+class PlaneMatrix(NamedTuple):
+    """The part of a plane calibration that other programs need.
+
+    Attributes:
+        matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres. A
+            :class:`~smartcam.calibration.PlaneProjection` of it maps poses.
+        model: how it was fitted.
+        robot_frame: where x, y and z are.
+        camera_frame: where u and v are; empty where it was not said.
+    """
+
+    matrix: Array
+    model: str
+    robot_frame: str
+    camera_frame: str
+
+    @classmethod
+    def of(cls, calibration: PlaneCalibration) -> PlaneMatrix:
+        """Return the matrix of any plane calibration."""
+        return cls(
+            calibration.matrix,
+            calibration.model,
+            calibration.robot_frame,
+            calibration.camera_frame or "",
+        )
+
+
+def compose_matrix(plane: PlaneMatrix, unit: str = "unit") -> str:
+    """Return the matrix of any plane calibration, as little YAML as both readers have in common.
+
+    ``unit``: of the camera's coordinates, in words.
+    """
+    rows = plane.matrix.tolist()
+    values = ",\n    ".join(", ".join(real(value) for value in row) for row in rows)
+    about = f"w (x, y, z, 1) = matrix (u, v, 1), metres; {unit} in"
+    return (
+        "%YAML 1.1\n---\n"
+        f"about: {quoted(about)}\n"
+        f"model: {quoted(plane.model)}\n"
+        f"robot_frame: {quoted(plane.robot_frame)}\n"
+        f"camera_frame: {quoted(plane.camera_frame)}\n"
+        f"rows: {len(rows)}\ncols: {len(rows[0])}\n"
+        f"data: [\n    {values} ]\n"
+    )
+
+
+def parse_matrix(text: str) -> PlaneMatrix:
+    """Return the matrix of a calibration that :func:`compose_matrix` wrote, bit by bit."""
+    names = ["model", "robot_frame", "camera_frame"]
+    data = mapping(load_yaml(text), "file", [*names, "rows", "cols", "data"])
+    for name in names:
+        if not isinstance(data[name], str):
+            raise malformed(name, "a text", data[name])
+    matrix = _matrix(data, "matrix", (4, 3))
+    if np.linalg.matrix_rank(matrix) < 3:
+        raise CalibrationError(
+            f"matrix: expected one of rank 3, got {matrix.tolist()}",
+            code=Code.COLLINEAR,
+            got=matrix.tolist(),
+        )
+    return PlaneMatrix(matrix, *(data[name] for name in names))
+
+
+def _matrix(value: Plain, where: str, shape: tuple[int, int]) -> Array:
+    data = mapping(value, where, ["rows", "cols", "data"])
+    said = data["rows"], data["cols"]
+    if said != (str(shape[0]), str(shape[1])):
+        raise malformed(where, f"{shape[0]} rows and {shape[1]} cols", " ".join(map(str, said)))
+    read = [number(one, where) for one in sequence(data["data"], where, shape[0] * shape[1])]
+    return np.array(read).reshape(shape)
+
+
+def compose_transform(transform: Transform) -> str:
+    """Return a transform as a (4, 4) ``!!opencv-matrix``, without :data:`HEAD`."""
+    rows = matrix_rows(transform)
+    values = ",\n       ".join(", ".join(real(value) for value in row) for row in rows)
+    return (
+        f"target: {quoted(frame_name(transform.target, 'target'))}\n"
+        f"source: {quoted(frame_name(transform.source, 'source'))}\n"
+        "transform: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n"
+        f"   data: [ {values} ]\n"
+    )
+
+
+def parse_transform(text: str, target: str, source: str) -> Transform:
+    """Return the one (4, 4) matrix of a file of OpenCV, of any name.
+
+    ``target`` and ``source`` are the frames where the file does not say them.
+    """
+    data = mapping(load_yaml(text), "file")
+    names = [
+        name
+        for name, one in data.items()
+        if isinstance(one, dict) and (one.get("rows"), one.get("cols")) == ("4", "4")
+    ]
+    if len(names) != 1:
+        raise malformed("file", "one matrix of 4 rows and 4 cols", ", ".join(names) or "none")
+    rows = _matrix(data[names[0]], names[0], (4, 4)).tolist()
+    frames = [
+        frame_name(data.get(key, given), key)
+        for key, given in (("target", target), ("source", source))
+    ]
+    return rigid(frames[0], frames[1], rows, names[0])

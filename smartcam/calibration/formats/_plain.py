@@ -1,0 +1,252 @@
+"""Text of other programs as plain data: bounded, and no scalar taken for what it may not be.
+
+Scalars stay the texts that stand in the file. YAML has many ideas of what a text may mean (a time,
+a number to the base 60, ``1e-05`` as a string), and programs differ in which of them they have;
+:func:`number` and :func:`flag` read what all have in common. What is not as it should be raises a
+CalibrationError, ``MALFORMED`` where no other code is named.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.exceptions import CalibrationError
+from smartcam.layout._yamls import BadYamlError, compose
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from smartcam.calibration._geometry.rotations import Array
+
+T = TypeVar("T")
+
+Plain: TypeAlias = Any
+"""A text, a list of them or a mapping to them, to any depth; checked where it is used."""
+
+POSE: tuple[str, ...] = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""Names of the numbers of :func:`row` in most formats."""
+
+MAX_DEPTH = 16
+"""Lists in lists of a file at most; poses have five."""
+
+MAX_NUMBER = 1e9
+"""Largest number of a pose, metres or what it is in: farther off is no robot, and its square is
+still a number."""
+
+_MAX_NAME = 255
+_MAX_SHOWN = 64
+_NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,4})?")
+_NOT_FINITE = re.compile(r"[-+]?\.?(?:nan|inf|infinity)", re.IGNORECASE)
+_NAME = re.compile(r"[\w/][\w./+-]*")
+_FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_PRINTED = 1e-4
+"""Largest deviation from a rotation of a matrix that was printed with few digits."""
+_EXACT = 1e-6
+"""Largest deviation of a matrix that is taken as it is; :class:`Transform` has the same bound."""
+
+
+def malformed(what: str, expected: str, got: object = None) -> CalibrationError:
+    """Return the error for a text that is not what its format says; ``got`` is shown cut."""
+    shown = None if got is None else _cut(got)
+    text = f"{what}: expected {expected}" + ("" if shown is None else f", got {shown}")
+    return CalibrationError(text, code=Code.MALFORMED, expected=expected, got=shown)
+
+
+def known(table: Mapping[str, T], name: str, what: str = "format") -> T:
+    """Return a table's value for a name (``UNKNOWN_FORMAT``)."""
+    if name not in table:
+        raise CalibrationError(
+            f"no {what} is called {name!r}; expected one of {', '.join(table)}",
+            code=Code.UNKNOWN_FORMAT,
+            expected=list(table),
+            got=name,
+        )
+    return table[name]
+
+
+def _cut(value: object) -> str:
+    """Return a short text of a file's value, however large it is."""
+    if isinstance(value, (dict, list)):
+        kind = "mapping" if isinstance(value, dict) else "list"
+        return f"a {kind} of {len(cast('Sequence[object]', value))}"
+    text = repr(value[: _MAX_SHOWN + 1] if isinstance(value, str) else value)
+    return text if len(text) <= _MAX_SHOWN + 2 else f"{text[:_MAX_SHOWN]}..."
+
+
+# ---------------------------------------------------------------------- reading
+
+
+def load_json(text: str) -> Plain:
+    """Return a JSON document; its numbers are texts (``MALFORMED``: it is none, or too deep)."""
+    try:
+        return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
+    except (ValueError, RecursionError) as exc:
+        raise malformed("file", f"JSON ({exc})") from exc
+
+
+def load_yaml(text: str) -> Plain:
+    """Return a YAML document, that of OpenCV too; its scalars are texts, its tags are dropped.
+
+    Raises ``MALFORMED``: it is none, it has aliases or a key twice, or is too deep;
+    MissingExtraError: PyYAML is not installed.
+    """
+    if text.startswith("%YAML:"):  # OpenCV's spelling of a directive
+        text = text.partition("\n")[2]
+    try:
+        root = compose(text, what="reading YAML")
+        return None if root is None else _plain(root, set(), 0)
+    except BadYamlError as exc:
+        raise malformed("file", f"YAML ({_cut(str(exc))})") from exc
+
+
+def _plain(node: Any, seen: set[int], depth: int) -> Plain:
+    line = f"line {node.start_mark.line + 1}"
+    if node.id == "scalar":
+        return str(node.value)
+    if id(node) in seen or depth >= MAX_DEPTH:
+        raise malformed(line, f"no alias, and at most {MAX_DEPTH} lists in lists")
+    seen.add(id(node))
+    if node.id == "sequence":
+        return [_plain(one, seen, depth + 1) for one in node.value]
+    found: dict[str, Plain] = {}
+    for key, value in node.value:
+        name = str(key.value) if key.id == "scalar" else ""
+        if not name or name in found:
+            raise malformed(line, "keys that are texts, each once", name)
+        found[name] = _plain(value, seen, depth + 1)
+    return found
+
+
+def mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Plain]:
+    """Return a value that must be a mapping with these keys; others may be there."""
+    if not isinstance(value, dict):
+        raise malformed(where, "a mapping", value)
+    found = cast("dict[str, Plain]", value)
+    missing = [key for key in keys if key not in found]
+    if missing:
+        raise malformed(where, f"the keys {', '.join(keys)}", ", ".join(found) or "none")
+    return found
+
+
+def sequence(value: Plain, where: str, count: int | None = None) -> list[Plain]:
+    """Return a value that must be a list, of ``count`` items if that is given."""
+    found: list[Plain] | None = value if isinstance(value, list) else None
+    if found is None or count not in {None, len(found)}:
+        raise malformed(where, "a list" if count is None else f"a list of {count}", value)
+    return found
+
+
+def number(value: Plain, where: str) -> float:
+    """Return a number of at most :data:`MAX_NUMBER`.
+
+    Raises ``MALFORMED``, or ``NOT_FINITE`` for NaN, infinity and larger ones.
+    """
+    text = value if isinstance(value, str) else ""
+    read = math.nan if _NOT_FINITE.fullmatch(text) else None
+    if len(text) <= _MAX_SHOWN and _NUMBER.fullmatch(text):
+        read = float(text)
+    if read is None:
+        raise malformed(where, "a number", value)
+    if not abs(read) <= MAX_NUMBER:
+        raise CalibrationError(
+            f"{where}: expected a number of at most {MAX_NUMBER:g}, got {_cut(text)}",
+            code=Code.NOT_FINITE,
+            expected=MAX_NUMBER,
+            got=text,
+        )
+    return read
+
+
+def numbers(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
+    """Return the numbers under ``keys``, in that order, of a mapping that has no others.
+
+    ``where``: what the mapping is, for the error.
+    """
+    found = mapping(value, where, keys)
+    if len(found) != len(keys):
+        raise malformed(where, f"the keys {', '.join(keys)} alone", ", ".join(found))
+    return [number(found[key], f"{where}.{key}") for key in keys]
+
+
+def flag(value: Plain, where: str) -> bool:
+    """Return a truth value."""
+    found = _FLAGS.get(value.lower()) if isinstance(value, str) else None
+    if found is None:
+        raise malformed(where, "true or false", value)
+    return found
+
+
+def frame_name(value: Plain, where: str) -> str:
+    """Return a frame's name that every format can hold.
+
+    Raises ``BAD_NAME``: it is none, too long, or has letters that mean something in a file or on a
+    command line.
+    """
+    if not (isinstance(value, str) and len(value) <= _MAX_NAME and _NAME.fullmatch(value)):
+        raise CalibrationError(
+            f"{where}: expected a frame's name of letters, digits and _ . / + -, got {_cut(value)}",
+            code=Code.BAD_NAME,
+            expected=_NAME.pattern,
+            got=_cut(value),
+        )
+    return value
+
+
+def rigid(target: str, source: str, rows: Sequence[Sequence[float]], where: str) -> Transform:
+    """Return the transform of a (4, 4) matrix; its rotation may be printed with few decimals.
+
+    Raises ``MALFORMED``: its last row; ``NOT_RIGID``: it is no rotation.
+    """
+    matrix = np.array(rows, dtype=np.float64)
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_EXACT):
+        raise malformed(where, "a last row 0 0 0 1", " ".join(f"{value:g}" for value in matrix[3]))
+    rotation = matrix[:3, :3]
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if _EXACT <= off < _PRINTED:
+        rotation = _nearest_rotation(rotation)
+    return Transform(target, source, rotation, matrix[:3, 3])
+
+
+def _nearest_rotation(matrix: Array) -> Array:
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right, dtype=np.float64)  # a reflection stays one, and is refused
+
+
+def row(transform: Transform) -> list[float]:
+    """Return the numbers of :data:`POSE`, metres."""
+    return [*transform.translation.tolist(), *transform.quaternion.tolist()]
+
+
+def matrix_rows(transform: Transform) -> list[list[float]]:
+    """Return the (4, 4) matrix of a transform, metres, row by row."""
+    rows = np.column_stack([transform.rotation, transform.translation]).tolist()
+    return [*rows, [0.0, 0.0, 0.0, 1.0]]
+
+
+# ---------------------------------------------------------------------- writing
+
+
+def quoted(text: str) -> str:
+    """Return a text as YAML and JSON write it."""
+    return '"{}"'.format(text.replace("\\", "\\\\").replace('"', '\\"'))
+
+
+def real(value: float) -> str:
+    """Return a number as YAML 1.1 knows a real: with a point, also before an exponent."""
+    mantissa, e, exponent = repr(float(value)).partition("e")
+    if not e:
+        return mantissa
+    sign = "" if exponent.startswith("-") else "+"
+    return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}e{sign}{exponent.lstrip('+')}"
+
+
+def block(values: Mapping[str, float], indent: str = "") -> str:
+    """Return a YAML mapping of numbers, one in a line."""
+    return "".join(f"{indent}{name}: {real(value)}\n" for name, value in values.items())

@@ -1,0 +1,62 @@
+"""A plane calibration as a rigid frame and a scale, for programs that know frames alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+
+_SIMILAR = 1e-9
+"""Largest deviation of two axes from equal length and a right angle, by rounding."""
+
+
+class PlaneFrame(NamedTuple):
+    """A frame in the camera's plane.
+
+    Attributes:
+        transform: ``T_robot_plane``: the plane's origin is the camera's (0, 0), its x and y are the
+            camera's, its z is the plane's normal.
+        scale: metres for each unit of the camera's coordinates. They are multiplied by it before
+            the transform is applied: ``transform.apply(scale * (u, v, 0))``.
+    """
+
+    transform: Transform
+    scale: float
+
+
+def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneFrame:
+    """Return the frame of a calibration's plane, and its scale.
+
+    Args:
+        calibration: a rigid one, a similarity, or one of touches.
+        name: of the frame, where the calibration has no ``camera_frame``.
+
+    Raises:
+        CalibrationError: ``NOT_SIMILAR``: an affine map or a homography, which is no frame: its
+            axes differ in scale, or it has another scale at each point.
+    """
+    matrix = calibration.matrix / calibration.matrix[3, 2]
+    axes = matrix[:3, :2]
+    inner = axes.T @ axes
+    square = 0.5 * float(np.trace(inner))
+    shear = float(np.abs(inner - square * np.eye(2)).max()) / square
+    bend = float(np.abs(matrix[3, :2]).max()) * calibration.place.camera_size
+    if max(shear, bend) > _SIMILAR:
+        raise CalibrationError(
+            f"{calibration.model}: expected one scale for the whole plane, got axes that differ by "
+            f"{shear:.2g} and a scale that changes by {bend:.2g} over the points: no rigid frame "
+            "says this; export the matrix, or fit a similarity",
+            code=Code.NOT_SIMILAR,
+            expected="similarity",
+            got=calibration.model,
+        )
+    source = calibration.camera_frame or name
+    transform = Transform(calibration.robot_frame, source, calibration.rotation, calibration.origin)
+    return PlaneFrame(transform, calibration.scale)

@@ -1,0 +1,223 @@
+"""Poses as robots' controllers write them.
+
+::
+
+    pose_from("kuka", [400, 120, 35.5, 90, 0, 180])    # T_base_tool
+    pose_to("ur", pose)                                # [x, y, z, rx, ry, rz]
+
+Each convention is a row of :data:`ROBOTS`: its numbers in their order, its unit of length, and how
+it writes an orientation. Angles are right-handed turns.
+
+Source: Universal Robots, Script Manual, module motion (m, axis-angle); Roboception, rc_visard
+manual, appendix "Pose formats", for ABB, FANUC, KUKA (published: ``r_z(R) r_y(P) r_x(W)``,
+``r_z(A) r_y(B) r_x(C)``, ``w = Q1``); Mecademic, Meca500 Programming Manual for firmware 9.2,
+section 1.1.4 (mobile XYZ, mm, degrees).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rotations import as_vector, matrix_from_quaternion
+from smartcam.calibration.formats._plain import MAX_NUMBER, known
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._geometry.rotations import Array
+
+_UNIT: Final = 0.01
+"""Largest deviation of a quaternion's length from one; it is made one."""
+
+
+def rotation_zyx(z: float, y: float, x: float) -> Array:
+    """Return ``Rz(z) Ry(y) Rx(x)``, (3, 3): turned about x, y, z of the fixed frame, radians."""
+    cz, sz, cy, sy, cx, sx = (f(a) for a in (z, y, x) for f in (math.cos, math.sin))
+    return np.array(
+        [
+            [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+            [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+            [-sy, cy * sx, cy * cx],
+        ]
+    )
+
+
+def angles_zyx(rotation: Array) -> tuple[float, float, float]:
+    """Return z, y, x of :func:`rotation_zyx`, radians; y is within a quarter turn.
+
+    At a quarter turn about y only one of the other two is determined; then z is 0. Close to it z
+    is what rounding leaves, and x goes with it: the three together are the rotation all the same.
+    """
+    r = rotation.tolist()
+    z = math.atan2(r[1][0], r[0][0]) if math.hypot(r[1][0], r[0][0]) > 1e-15 else 0.0
+    cz, sz = math.cos(z), math.sin(z)
+    x = math.atan2(sz * r[0][2] - cz * r[1][2], cz * r[1][1] - sz * r[0][1])
+    return z, math.atan2(-r[2][0], cz * r[0][0] + sz * r[1][0]), x
+
+
+def _from_zyx(angles: Array) -> Array:
+    return rotation_zyx(*np.radians(angles).tolist())
+
+
+def _to_zyx(pose: Transform) -> list[float]:
+    return [math.degrees(angle) for angle in angles_zyx(pose.rotation)]
+
+
+def _from_wpr(angles: Array) -> Array:
+    return _from_zyx(angles[::-1])
+
+
+def _to_wpr(pose: Transform) -> list[float]:
+    return _to_zyx(pose)[::-1]
+
+
+def _from_mobile_xyz(angles: Array) -> Array:
+    # Rx(a) Ry(b) Rz(c) undoes Rz(-c) Ry(-b) Rx(-a)
+    return rotation_zyx(*np.radians(-angles[::-1]).tolist()).T
+
+
+def _to_mobile_xyz(pose: Transform) -> list[float]:
+    return [-math.degrees(angle) for angle in reversed(angles_zyx(pose.rotation.T))]
+
+
+def _from_vector(vector: Array) -> Array:
+    angle = float(np.linalg.norm(vector))
+    share = math.sin(0.5 * angle) / angle if angle > 0 else 0.5
+    return matrix_from_quaternion([*(share * vector), math.cos(0.5 * angle)])
+
+
+def _to_vector(pose: Transform) -> list[float]:
+    x, y, z, w = (pose.quaternion * math.copysign(1.0, pose.quaternion[3])).tolist()
+    sine = math.hypot(x, y, z)
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0 else 2.0
+    return [factor * x, factor * y, factor * z]
+
+
+def _from_xyzw(quaternion: Array) -> Array:
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1.0) < _UNIT:
+        raise CalibrationError(
+            f"expected a quaternion of length 1, got {quaternion.tolist()} of length {length:.6g}",
+            code=Code.NOT_RIGID,
+            expected=1.0,
+            got=length,
+        )
+    return matrix_from_quaternion(quaternion / length)
+
+
+def _to_xyzw(pose: Transform) -> list[float]:
+    quaternion: list[float] = pose.quaternion.tolist()
+    return quaternion
+
+
+def _from_wxyz(quaternion: Array) -> Array:
+    return _from_xyzw(np.roll(quaternion, -1))
+
+
+def _to_wxyz(pose: Transform) -> list[float]:
+    quaternion: list[float] = np.roll(pose.quaternion, 1).tolist()
+    return quaternion
+
+
+class PoseConvention(NamedTuple):
+    """How poses are written."""
+
+    numbers: tuple[str, ...]  # names of the numbers, in order
+    metre: float  # how many of its units of length a metre has
+    rotation: Callable[[Array], Array]  # makes a rotation (3, 3) of the numbers behind the position
+    orientation: Callable[[Transform], list[float]]  # makes those numbers of a pose
+    title: str  # what the orientation is, in words
+
+
+ROBOTS: Mapping[str, PoseConvention] = {
+    "ur": PoseConvention(
+        ("x", "y", "z", "rx", "ry", "rz"), 1.0, _from_vector, _to_vector,
+        "rotation vector, rad: along the axis, as long as the angle",
+    ),
+    "abb": PoseConvention(
+        ("x", "y", "z", "q1", "q2", "q3", "q4"), 1000.0, _from_wxyz, _to_wxyz,
+        "quaternion, its real part q1 first",
+    ),
+    "kuka": PoseConvention(
+        ("x", "y", "z", "a", "b", "c"), 1000.0, _from_zyx, _to_zyx,
+        "degrees: Rz(a) Ry(b) Rx(c)",
+    ),
+    "fanuc": PoseConvention(
+        ("x", "y", "z", "w", "p", "r"), 1000.0, _from_wpr, _to_wpr,
+        "degrees: Rz(r) Ry(p) Rx(w)",
+    ),
+    "meca500": PoseConvention(
+        ("x", "y", "z", "alpha", "beta", "gamma"), 1000.0, _from_mobile_xyz, _to_mobile_xyz,
+        "degrees, mobile XYZ: Rx(alpha) Ry(beta) Rz(gamma)",
+    ),
+    "xyzw": PoseConvention(
+        ("x", "y", "z", "qx", "qy", "qz", "qw"), 1.0, _from_xyzw, _to_xyzw,
+        "quaternion, its real part last",
+    ),
+    "wxyz": PoseConvention(
+        ("x", "y", "z", "qw", "qx", "qy", "qz"), 1.0, _from_wxyz, _to_wxyz,
+        "quaternion, its real part first",
+    ),
+}  # fmt: skip
+"""The conventions by their names. A metre is 1 of the unit of ``ur``, ``xyzw`` and ``wxyz``, and
+1000 millimetres for the others."""
+
+
+def pose_from(
+    robot: str, values: ArrayLike, *, target: str = "base", source: str = "tool"
+) -> Transform:
+    """Return a pose that a robot's controller shows.
+
+    Args:
+        robot: the convention, a key of :data:`ROBOTS`.
+        values: its numbers in their order, in its units.
+        target: name of the frame in which the pose is given.
+        source: name of the frame whose pose it is.
+
+    Returns:
+        ``T_target_source``, metres.
+
+    Raises:
+        CalibrationError: ``UNKNOWN_FORMAT``: no such convention; ``SHAPE``: not as many numbers;
+            ``NOT_FINITE``: NaN, infinity or beyond 1e9; ``NOT_RIGID``: a quaternion whose length is
+            more than 1 % off.
+    """
+    convention = known(ROBOTS, robot, "robot's convention")
+    what = f"pose of {robot} ({', '.join(convention.numbers)})"
+    given = as_vector(values, len(convention.numbers), what)
+    if not np.abs(given).max() <= MAX_NUMBER:
+        raise CalibrationError(
+            f"{what}: expected numbers of at most {MAX_NUMBER:g}, got {given.tolist()}",
+            code=Code.NOT_FINITE,
+            expected=MAX_NUMBER,
+            got=given.tolist(),
+        )
+    return Transform(target, source, convention.rotation(given[3:]), given[:3] / convention.metre)
+
+
+def pose_to(robot: str, pose: Transform) -> list[float]:
+    """Return a pose as a robot's controller takes it.
+
+    Args:
+        robot: the convention, a key of :data:`ROBOTS`.
+        pose: ``T_base_tool``, metres.
+
+    Returns:
+        The convention's numbers, in its units. Angles are within half a turn, those about y of
+        ``kuka``, ``fanuc`` and ``meca500`` within a quarter turn; a rotation vector is at most pi
+        long; a quaternion has the sign that makes its largest element positive.
+
+    Raises:
+        CalibrationError: ``UNKNOWN_FORMAT``.
+    """
+    convention = known(ROBOTS, robot, "robot's convention")
+    position: list[float] = (convention.metre * pose.translation).tolist()
+    return position + convention.orientation(pose)

@@ -1,0 +1,193 @@
+"""Arguments of ROS' ``static_transform_publisher``, and poses as ROS-Industrial keeps them.
+
+Three programs have that name. That of ROS 1's ``tf`` ends with a period in milliseconds, that of
+``tf2_ros`` does not, that of ROS 2 takes options. Each knows quaternions, and yaw, pitch and roll:
+``Rz(yaw) Ry(pitch) Rx(roll)``, radians.
+
+Source: wiki.ros.org/tf, section 6.3; github.com/ros2/geometry2,
+``static_transform_broadcaster_program.cpp``; github.com/moveit/moveit_calibration,
+``handeye_control_widget.cpp``, for the launch file; github.com/Jmeyer1292/robot_cal_tools,
+``rct_examples``, for poses (all published).
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration.formats._plain import (
+    POSE,
+    block,
+    frame_name,
+    load_yaml,
+    malformed,
+    mapping,
+    number,
+    numbers,
+    row,
+)
+from smartcam.calibration.formats._robots import angles_zyx, rotation_zyx
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+PERIOD_MS = 100
+"""Period with which ``tf`` sends it; its documents call that a good value."""
+
+_COMMAND = "static_transform_publisher"
+# each stops where the next may begin, so none goes over a text more than once
+_REMARK = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
+_NODE = re.compile(r"<node\b[^<>]*>")
+_ATTRIBUTE = re.compile(r'\b([a-z]+)="([^"<>]*)"')
+_QUATERNION = {"--qx": 0.0, "--qy": 0.0, "--qz": 0.0, "--qw": 1.0}
+_ANGLES = {"--yaw": 0.0, "--pitch": 0.0, "--roll": 0.0}
+_POSITION = {"--x": 0.0, "--y": 0.0, "--z": 0.0}
+_FRAMES = ("--frame-id", "--child-frame-id")
+
+
+def parse_arguments(text: str) -> Transform:
+    """Return the transform that ``static_transform_publisher`` would send.
+
+    ``text``: its arguments, with the command in front of them or without; ``#`` begins a comment.
+    Or a launch file with one such node, as MoveIt's hand-eye calibration writes it. Raises
+    ``MALFORMED``: another number of arguments, options that are none of its own, or arguments that
+    can be meant in two ways.
+    """
+    if text.lstrip().startswith("<"):
+        text = _from_launch(text)
+    try:
+        words = shlex.split(text, comments=True)
+    except ValueError as exc:
+        raise malformed("arguments", f"words as on a command line ({exc})") from exc
+    if _COMMAND in words:
+        words = words[words.index(_COMMAND) + 1 :]
+    if any(word.startswith("--") for word in words):
+        return _from_options(words)
+    return _from_positions(words)
+
+
+def _from_launch(text: str) -> str:
+    """Return the arguments of the one publisher in a launch file."""
+    nodes = [dict(_ATTRIBUTE.findall(one)) for one in _NODE.findall(_REMARK.sub("", text))]
+    found = [one["args"] for one in nodes if one.get("type") == _COMMAND and "args" in one]
+    if len(found) != 1:
+        raise malformed("launch file", f"one node of type {_COMMAND}", str(len(found)))
+    return str(found[0])
+
+
+def _from_options(words: Sequence[str]) -> Transform:
+    known = [*_POSITION, *_QUATERNION, *_ANGLES, *_FRAMES]
+    given: dict[str, str] = {}
+    for option, value in zip(words[::2], [*words[1::2], None], strict=False):
+        if option not in known or option in given or value is None:
+            raise malformed("arguments", f"options {', '.join(known)}, each once", option)
+        given[option] = value
+    missing = [one for one in _FRAMES if one not in given]
+    if missing or (given.keys() & _QUATERNION and given.keys() & _ANGLES):
+        raise malformed(
+            "arguments",
+            f"{' and '.join(_FRAMES)}, and a quaternion or angles, not both",
+            " ".join(given),
+        )
+    return _transform(
+        _values(_POSITION, given),
+        _values(_ANGLES if given.keys() & _ANGLES else _QUATERNION, given),
+        [given[one] for one in _FRAMES],
+    )
+
+
+def _values(defaults: dict[str, float], given: dict[str, str]) -> list[float]:
+    return [
+        number(given[one], one) if one in given else default for one, default in defaults.items()
+    ]
+
+
+def _from_positions(words: Sequence[str]) -> Transform:
+    count = len(words)
+    if count not in {8, 9, 10}:
+        raise malformed(
+            "arguments",
+            "x y z, qx qy qz qw or yaw pitch roll, frame, child, and perhaps a period",
+            f"{count} words",
+        )
+    angles = count == 8
+    if count == 9:  # a quaternion, or angles with a period: what is a number tells
+        angles = not _is_number(words[6])
+        if angles != _is_number(words[8]):
+            raise malformed(
+                "arguments",
+                "a quaternion and two frames, or three angles, two frames and a period",
+                " ".join(words[6:]),
+            )
+    turn = 6 if angles else 7
+    for period in words[turn + 2 :]:
+        number(period, "period")
+    read = [number(word, f"argument {place + 1}") for place, word in enumerate(words[:turn])]
+    return _transform(read[:3], read[3:], words[turn : turn + 2])
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _transform(
+    position: Sequence[float], turn: Sequence[float], frames: Sequence[str]
+) -> Transform:
+    frame, child = (frame_name(one, "frame") for one in frames)
+    if len(turn) == 4:
+        return Transform.from_quaternion(frame, child, position, turn)
+    return Transform(frame, child, rotation_zyx(*turn), np.array(position))
+
+
+def compose_positions(transform: Transform, *, angles: bool = False, period: bool = False) -> str:
+    """Return the arguments of ``tf`` (with a period) and ``tf2_ros`` (without), one line.
+
+    ``angles``: yaw, pitch and roll instead of a quaternion. ``period``: with :data:`PERIOD_MS` at
+    the end.
+    """
+    frames = frame_name(transform.target, "target"), frame_name(transform.source, "source")
+    values = row(transform)
+    if angles:
+        values = [*values[:3], *angles_zyx(transform.rotation)]
+    words = [*map(repr, values), *frames, *([str(PERIOD_MS)] if period else [])]
+    return f"{_COMMAND} {' '.join(words)}\n"
+
+
+def compose_options(transform: Transform, *, angles: bool = False) -> str:
+    """Return the arguments of ROS 2's, one line; arguments as above."""
+    values = dict(zip([*_POSITION, *_QUATERNION], row(transform), strict=True))
+    if angles:
+        turned = zip(_ANGLES, angles_zyx(transform.rotation), strict=True)
+        values = dict([*list(values.items())[:3], *turned])
+    words = [f"{option} {value!r}" for option, value in values.items()]
+    frames = frame_name(transform.target, "target"), frame_name(transform.source, "source")
+    words += [f"{option} {name}" for option, name in zip(_FRAMES, frames, strict=True)]
+    return f"{_COMMAND} {' '.join(words)}\n"
+
+
+def parse_pose(text: str, target: str, source: str) -> Transform:
+    """Return the pose of a ROS-Industrial file: ``x y z qx qy qz qw``, perhaps under one name.
+
+    The file has no names of frames: it is ``source``'s pose in ``target``.
+    """
+    data = mapping(load_yaml(text), "file")
+    where = "pose"
+    if not data.keys() & set(POSE):
+        if len(data) != 1:
+            raise malformed("file", "one pose", ", ".join(data) or "none")
+        ((where, data),) = data.items()
+    pose = numbers(data, where, POSE)
+    return Transform.from_quaternion(target, source, pose[:3], pose[3:])
+
+
+def compose_pose(transform: Transform) -> str:
+    """Return a pose as ROS-Industrial keeps it; it has no place for the frames' names."""
+    return block(dict(zip(POSE, row(transform), strict=True)))

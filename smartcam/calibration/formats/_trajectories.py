@@ -1,0 +1,170 @@
+"""Poses over time as CSV: the plain columns of ASL's tools, and those of the EuRoC data sets.
+
+The header decides: it names the columns, and with them the quaternion's order and the unit of time.
+EuRoC has nanoseconds and the real part first, others seconds and the real part last. A file without
+a header is refused: both are eight numbers in a row.
+
+Source: github.com/ethz-asl/hand_eye_calibration (published) for ``t, x, y, z, qx, qy, qz, qw``; the
+files ``state_groundtruth_estimate0/data.csv`` and ``vicon0/data.csv`` of EuRoC MAV (published).
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration.formats._plain import POSE, malformed, number, row
+from smartcam.calibration.formats._samples import same_frames
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+MAX_LINE = 4096
+"""Characters of a line at most; EuRoC's have some 200."""
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_LAST = Decimal(253_402_300_799)  # the year 9999
+_COLUMN = re.compile(r"\s*([A-Za-z_]+)\s*(?:\[([^\]]*)\])?\s*")
+_TIME = re.compile(r"[0-9]{1,21}(?:\.[0-9]{0,20})?(?:[eE][-+]?[0-9]{1,2})?")
+
+
+class _Columns(NamedTuple):
+    """The columns that a header names."""
+
+    places: tuple[int, ...]  # of the columns of time, then of x, y, z, qx, qy, qz, qw
+    width: int  # how many columns there are
+    seconds: Decimal  # the unit of time
+
+
+_COLUMNS = (
+    (("timestamp", *(f"p_rs_r_{a}" for a in "xyz"), *(f"q_rs_{a}" for a in "xyzw")), "ns"),
+    (("t", *POSE), "s"),
+    (("t", "x", "y", "z", *(f"q_{a}" for a in "xyzw")), "s"),
+    (("t", *(f"p_{a}" for a in "xyz"), *(f"q_{a}" for a in "xyzw")), "s"),
+    (("timestamp", *POSE), ""),
+    (("time", *POSE), ""),
+)
+"""Names of the columns of time and of the pose in lower case, and the unit of time where the header
+has none: EuRoC's ground truth leaves it out. Without one a time may be anything."""
+_SECONDS: Mapping[str, Decimal] = {
+    "s": Decimal(1),
+    "ms": Decimal("1e-3"),
+    "us": Decimal("1e-6"),
+    "ns": Decimal("1e-9"),
+}
+_ASL_HEAD = "#t [s],x [m],y [m],z [m],qx [],qy [],qz [],qw []\n"
+_EUROC_HEAD = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],"
+    "q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
+)
+
+
+def parse_csv(text: str, target: str, source: str) -> list[Transform]:
+    """Return the poses of a file with a header, in its order; further columns are left out.
+
+    Lines that begin with ``#`` are remarks, one of them may be the header. The poses are
+    ``source``'s in ``target``, with their times to the nearest microsecond. Raises ``MALFORMED``:
+    no header that is known, or a row that is not as long; ``NOT_FINITE``, ``NOT_RIGID``;
+    ``BAD_TIME``: a time outside of 1970 to 9999.
+    """
+    header: _Columns | None = None
+    found: list[Transform] = []
+    for index, line in enumerate(map(str.strip, text.splitlines()), 1):
+        if len(line) > MAX_LINE:
+            raise malformed(f"line {index}", f"{MAX_LINE} characters at most", len(line))
+        if not line or (header is not None and line.startswith("#")):
+            continue
+        if header is not None:
+            found.append(_pose(line, header, f"line {index}", target, source))
+            continue
+        header = _header(line)
+        if header is None and not line.startswith("#"):
+            raise _no_header(line)
+    if header is None:
+        raise _no_header("")
+    return found
+
+
+def _no_header(line: str) -> CalibrationError:
+    known = f"{_ASL_HEAD.strip()} or {_EUROC_HEAD.strip()}"
+    return malformed("header", f"{known}, the unit of time among them", line)
+
+
+def _header(line: str) -> _Columns | None:
+    cells = line.lstrip(" #").rstrip(" ,").split(",")
+    matches = [_COLUMN.fullmatch(cell) for cell in cells]
+    names = [match[1].lower() if match else "" for match in matches]
+    units = [match[2] if match else None for match in matches]
+    for columns, unit in _COLUMNS:
+        if all(names.count(name) == 1 for name in columns):
+            places = tuple(names.index(name) for name in columns)
+            seconds = _SECONDS.get(units[places[0]] or unit)
+            if seconds is not None:
+                return _Columns(places, len(cells), seconds)
+    return None
+
+
+def _pose(line: str, header: _Columns, where: str, target: str, source: str) -> Transform:
+    cells = line.rstrip(" ,").split(",")
+    if len(cells) != header.width:
+        raise malformed(where, f"{header.width} columns as in the header", f"{len(cells)}")
+    time, *pose = (cells[place].strip() for place in header.places)
+    values = [number(cell, where) for cell in pose]
+    at = _EPOCH + timedelta(microseconds=_microseconds(time, header.seconds, where))
+    try:
+        return Transform.from_quaternion(target, source, values[:3], values[3:], at)
+    except CalibrationError as exc:
+        raise CalibrationError(
+            f"{where}: {exc}", code=exc.code, expected=exc.expected, got=exc.got
+        ) from exc
+
+
+def _microseconds(text: str, unit: Decimal, where: str) -> int:
+    seconds = Decimal(text) * unit if _TIME.fullmatch(text) else None
+    if seconds is None or not seconds <= _LAST:
+        raise CalibrationError(
+            f"{where}: expected a time since 1970, before the year 10000, got {text[:64]!r}",
+            code=Code.BAD_TIME,
+            got=text,
+        )
+    return int((seconds * 1_000_000).to_integral_value())
+
+
+def compose_asl(transforms: Sequence[Transform]) -> str:
+    """Return poses as ``t, x, y, z, qx, qy, qz, qw``, seconds since 1970 and metres.
+
+    Raises ``WRONG_FRAME``: not all between the same frames; ``BAD_TIME``: one without a time, or
+    before 1970.
+    """
+    return _ASL_HEAD + "".join(
+        f"{time // 1_000_000}.{time % 1_000_000:06d},{','.join(map(repr, row(one)))}\n"
+        for time, one in _timed(transforms)
+    )
+
+
+def compose_euroc(transforms: Sequence[Transform]) -> str:
+    """Return poses in EuRoC's columns: nanoseconds, the real part first; errors as above."""
+    rows = [(time, *row(one)) for time, one in _timed(transforms)]
+    return _EUROC_HEAD + "".join(
+        f"{time}000,{x!r},{y!r},{z!r},{qw!r},{qx!r},{qy!r},{qz!r}\n"
+        for time, x, y, z, qx, qy, qz, qw in rows
+    )
+
+
+def _timed(transforms: Sequence[Transform]) -> list[tuple[int, Transform]]:
+    same_frames(transforms)
+    found: list[tuple[int, Transform]] = []
+    for index, one in enumerate(transforms):
+        if one.at is None or one.at < _EPOCH:
+            raise CalibrationError(
+                f"number {index}: expected a time since 1970, got {one.at}",
+                code=Code.BAD_TIME,
+                got=one.at,
+            )
+        found.append(((one.at - _EPOCH) // timedelta(microseconds=1), one))
+    return found

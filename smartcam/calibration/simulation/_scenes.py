@@ -1,0 +1,272 @@
+"""Cameras on robots whose truth is known: views with noise, poses with noise, and the bound.
+
+Nothing is drawn: the points of a target are projected. What a calibration finds of it is compared
+with the truth, and its error with the Cramer-Rao bound, below which no unbiased one can be.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
+from smartcam.calibration._hand_eye.equations import (
+    PixelObservations,
+    RobotNoise,
+    RobotPoses,
+    RobotSigmas,
+    Solution,
+    information,
+)
+from smartcam.calibration._views import TargetView
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.calibration._hand_eye.equations import Setup
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._targets import Target
+
+LEAST_VISIBLE = 4
+"""Points that a view must have in the image."""
+
+GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
+"""Angle between neighbours of a spiral that covers a disc evenly, radians."""
+
+EXACT = 1e-9
+"""Pixels: standard deviation that views without noise are given."""
+
+
+def view(
+    target: Target,
+    camera: CameraModel,
+    transform: Transform,
+    *,
+    sigma: float,
+    random: np.random.Generator,
+    name: str = "",
+) -> TargetView:
+    """Return a camera's view of a target.
+
+    Args:
+        target: what is on the sheet.
+        camera: the camera.
+        transform: ``T_camera_target``.
+        sigma: of a coordinate of a point, pixels.
+        random: where the noise comes from.
+        name: of the view, for messages.
+
+    Returns:
+        The points inside of the image.
+
+    Raises:
+        CalibrationError: ``OUT_OF_FIELD``: fewer than 4 points are.
+    """
+    pixels = camera.project(transform.apply(target.points))
+    pixels = pixels + sigma * random.normal(size=pixels.shape)
+    inside = ((pixels >= -0.5) & (pixels < np.array(camera.size) - 0.5)).all(axis=1)
+    ids = np.flatnonzero(inside)
+    if len(ids) < LEAST_VISIBLE:
+        raise CalibrationError(
+            f"view: expected at least {LEAST_VISIBLE} points of the target in the image, got "
+            f"{len(ids)} of {len(pixels)}",
+            code=Code.OUT_OF_FIELD,
+            expected=LEAST_VISIBLE,
+            got=len(ids),
+        )
+    variance = max(sigma, EXACT) ** 2
+    covariance = np.broadcast_to(variance * np.eye(2), (len(ids), 2, 2)).copy()
+    return TargetView(
+        target=target,
+        size=camera.size,
+        ids=ids,
+        points=pixels[ids],
+        covariance=covariance,
+        name=name,
+    )
+
+
+def around(
+    target: Target, count: int, *, tilt: float, distance: float, random: np.random.Generator
+) -> list[Transform]:
+    """Return poses of a camera that looks at a target's centre from a cone over it.
+
+    Args:
+        target: what is looked at.
+        count: of poses.
+        tilt: of the outermost ones against the target's normal, radians.
+        distance: from the target's centre, metres; it varies by a fifth to both sides.
+        random: of the distances, and of the turns about the optical axis, up to 90 degrees.
+
+    Returns:
+        ``T_target_camera``, one for each pose.
+    """
+    centre = (target.points.min(axis=0) + target.points.max(axis=0)) / 2.0
+    poses = []
+    for number in range(count):
+        polar = tilt * math.sqrt((number + 0.5) / count)
+        azimuth = number * GOLDEN
+        out = np.array(
+            [
+                math.sin(polar) * math.cos(azimuth),
+                math.sin(polar) * math.sin(azimuth),
+                math.cos(polar),
+            ]
+        )
+        side = np.cross([0.0, 1.0, 0.0], -out)
+        side /= np.linalg.norm(side)
+        looking = np.column_stack([side, np.cross(-out, side), -out])
+        roll = random.uniform(-math.pi / 2, math.pi / 2)
+        rotation = looking @ exp_rotation(np.array([0.0, 0.0, roll]))
+        far = distance * random.uniform(0.8, 1.2)
+        poses.append(Transform("target", "camera", rotation, centre + far * out))
+    return poses
+
+
+class Bound(NamedTuple):
+    """The least rms error that an unbiased calibration can have.
+
+    Attributes:
+        rotation: of the camera's orientation, all axes together, radians.
+        translation: of the camera's position, all axes together, metres.
+    """
+
+    rotation: float
+    translation: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandEyeScene:
+    """A robot, a camera and a target, as they really are.
+
+    Attributes:
+        setup: where the camera is.
+        camera: the camera.
+        target: the target.
+        camera_pose: ``T_flange_camera``; ``T_base_camera`` for a camera beside the robot.
+        target_pose: ``T_base_target``; ``T_flange_target`` there.
+        robot_poses: ``T_base_flange`` of each view.
+    """
+
+    setup: Setup
+    camera: CameraModel
+    target: Target
+    camera_pose: Transform
+    target_pose: Transform
+    robot_poses: Sequence[Transform]
+
+    def seen(self, robot_pose: Transform) -> Transform:
+        """Return ``T_camera_target`` at a pose of the robot."""
+        between = robot_pose.inverse() if self.setup == "eye-in-hand" else robot_pose
+        return self.camera_pose.inverse() @ between @ self.target_pose
+
+    def measured(
+        self, *, pixel_sigma: float, robot_sigmas: RobotSigmas, random: np.random.Generator
+    ) -> tuple[list[Transform], list[TargetView]]:
+        """Return the robot's poses as its controller says them, and the views.
+
+        Args:
+            pixel_sigma: of a coordinate, pixels.
+            robot_sigmas: of each axis of the robot's poses.
+            random: where the noise comes from.
+
+        Raises:
+            CalibrationError: ``OUT_OF_FIELD``: the target is outside of an image.
+        """
+        views = [
+            view(
+                self.target,
+                self.camera,
+                self.seen(pose),
+                sigma=pixel_sigma,
+                random=random,
+                name=f"view {number}",
+            )
+            for number, pose in enumerate(self.robot_poses)
+        ]
+        said = [self._disturbed(pose, robot_sigmas, random) for pose in self.robot_poses]
+        return said, views
+
+    def bound(self, *, pixel_sigma: float, robot_sigmas: RobotSigmas) -> Bound:
+        """Return the Cramer-Rao bound of the camera's pose.
+
+        The target's pose and the robot's true poses are unknown besides. A sigma of 0 means that it
+        is known to be.
+        """
+        # No unbiased estimate has a covariance below the inverse of Fisher's information, J^T C^-1
+        # J of what is seen; the robot's true poses are eliminated from it.
+        # Source: Kay, Fundamentals of Statistical Signal Processing: Estimation Theory (1993),
+        # chapter 3.
+        points = [self.target.points] * len(self.robot_poses)
+        count = len(self.target.points)
+        whitening = np.broadcast_to(np.eye(2) / pixel_sigma, (len(points), count, 2, 2))
+        transforms = [self.seen(pose) for pose in self.robot_poses]
+        pixels = [self.camera.project(one.apply(self.target.points)) for one in transforms]
+        seen = PixelObservations(whitening, self.camera, np.stack(points), np.stack(pixels))
+        poses = Rigid.stacked(pose.rigid for pose in self.robot_poses)
+        noise = RobotNoise(robot_sigmas) if max(robot_sigmas) > 0 else None
+        truth = Solution(self.camera_pose.rigid, self.target_pose.rigid, noise=noise)
+        found = information(RobotPoses(poses, self.setup == "eye-in-hand"), seen, truth)
+        variances = np.diag(np.linalg.inv(found))
+        return Bound(math.sqrt(variances[:3].sum()), math.sqrt(variances[3:6].sum()))
+
+    def errors(self, camera_pose: Transform) -> tuple[float, float]:
+        """Return by how much a pose of the camera is off: radians and metres."""
+        turn = float(self.camera_pose.rigid.angle_to(camera_pose.rigid))
+        return turn, float(np.linalg.norm(camera_pose.translation - self.camera_pose.translation))
+
+    def _disturbed(
+        self, pose: Transform, sigmas: RobotSigmas, random: np.random.Generator
+    ) -> Transform:
+        step = np.repeat(sigmas, 3) * random.normal(size=6)
+        return Transform(pose.target, pose.source, *pose.rigid.turned_before(step))
+
+
+def hand_eye_scene(
+    target: Target,
+    camera: CameraModel,
+    *,
+    setup: Setup,
+    poses: int,
+    tilt: float,
+    distance: float,
+    random: np.random.Generator,
+) -> HandEyeScene:
+    """Return a scene with a camera that looks at a target from a cone.
+
+    Args:
+        target: what is looked at.
+        camera: the camera.
+        setup: where the camera is. Beside the robot it stands still, and the target moves.
+        poses: of the robot.
+        tilt: of the outermost views against the target's normal, radians.
+        distance: of camera and target, metres; it varies by a fifth to both sides.
+        random: where the poses come from, and where camera and target are.
+    """
+    looks = around(target, poses, tilt=tilt, distance=distance, random=random)
+    turn = exp_rotation(random.uniform(-1.5, 1.5, size=3))
+    hand, hand_source = random.uniform(-0.1, 0.1, size=3), "camera"
+    world = exp_rotation(random.uniform(-1.5, 1.5, size=3))
+    place = random.uniform(-0.6, 0.6, size=3)
+    if setup == "eye-in-hand":
+        camera_pose = Transform("flange", hand_source, turn, hand)
+        target_pose = Transform("base", "target", world, place)
+        robot = [target_pose @ look @ camera_pose.inverse() for look in looks]
+    else:
+        camera_pose = Transform("base", "camera", world, place)
+        target_pose = Transform("flange", "target", turn, hand)
+        robot = [camera_pose @ look.inverse() @ target_pose.inverse() for look in looks]
+    return HandEyeScene(
+        setup=setup,
+        camera=camera,
+        target=target,
+        camera_pose=camera_pose,
+        target_pose=target_pose,
+        robot_poses=robot,
+    )

@@ -1,0 +1,334 @@
+"""The wizard that finds where a camera is on a robot, or beside it.
+
+It suggests from where to look, takes a picture, finds the target in it and reads the robot, as many
+times as one likes; it shows the error of poses that were left out, and names the worst pose.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._detection.find import find_target
+from smartcam.calibration._files.storage import motion_from_data, motion_to_data
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
+from smartcam.calibration._hand_eye.closed_forms import LEAST_POSES
+from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
+from smartcam.calibration._views import TargetView
+from smartcam.calibration.formats._robots import ROBOTS, pose_from
+from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT
+from smartcam.calibration.wizards._points import Calibrated, ask_to_save, review_step
+from smartcam.calibration.wizards._sequence import Wizard, ask
+from smartcam.calibration.wizards._steps import Number, Option, Step, pick
+from smartcam.calibration.wizards._target_drawing import draw
+from smartcam.calibration.wizards._target_steps import ask_target
+from smartcam.calibration.wizards._view_suggestions import LOOKS, outline
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from smartcam.calibration._hand_eye.equations import Setup
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration.wizards._pictures import TakePicture
+    from smartcam.calibration.wizards._steps import Answers
+
+ReadFlange = Callable[[], Awaitable[Transform | Pose]]
+"""Returns ``T_base_flange``, the flange's pose in the robot's base."""
+
+MOST_VIEWS = 40
+"""Largest number of views of one run: far more than it takes."""
+
+ADVISED_VIEWS = 10
+"""From which on the wizard offers to calculate first."""
+
+CALCULATION = 120.0
+"""Seconds that it may take; of 15 views it takes a few."""
+
+_MOVES: Mapping[str, str] = {
+    "eye-in-hand": "Bring the camera to where it looks at the sheet",
+    "eye-to-hand": "Bring the sheet before the camera, and hold it",
+}
+
+SUGGESTIONS = tuple(look.text for look in LOOKS)
+"""From where to look, one view after the other; then from the beginning, a bit beside it."""
+
+
+def hand_eye_wizard(
+    *,
+    take_picture: TakePicture,
+    save_to: Callable[[str], Path],
+    target: Target | None = None,
+    suggested: Target | None = None,
+    read_robot: ReadFlange | None = None,
+    camera: CameraModel | None = None,
+) -> Wizard:
+    """Return the wizard.
+
+    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
+    first step ``setup`` and ``robot`` (in whose convention poses are typed, a key of
+    :data:`~smartcam.calibration.formats._robots.ROBOTS`).
+
+    Its result: ``name, file, method, views, held_out_mm, mean_mm, translation_error_mm,
+    rotation_error_deg, remarks``.
+
+    Args:
+        take_picture: takes a picture; the robot stands still.
+        save_to: returns the file for a name.
+        target: what is on the sheet, with the lengths that it has on paper; None: it is asked.
+        suggested: the default of what is asked.
+        read_robot: reads the pose of the flange; None: it is typed.
+        camera: its lens; None: calibrated from the same views.
+
+    Cancellation: a picture or a pose under way is given up; a calculation ends in its thread, and
+    what it finds is dropped.
+    """
+
+    async def script(parameters: Mapping[str, Any]) -> Any:
+        setup, robot = await _ask_setup(parameters, typed=read_robot is None)
+        there = await ask_target(suggested) if target is None else target
+        views = _Views(there, setup, take_picture, read_robot or robot, camera)
+        calibration = await views.run()
+        name = str(parameters.get("name", KIND))
+        return await ask_to_save(name, save_to, KIND, _outcome(calibration))
+
+    return Wizard(name=KIND, version=1, script=script)
+
+
+async def _ask_setup(parameters: Mapping[str, Any], *, typed: bool) -> tuple[Setup, str]:
+    """Ask for the camera's place and for the convention in which the robot's poses are typed."""
+    setup = Option(
+        name="setup",
+        label="Where the camera is",
+        options={
+            "eye-in-hand": "on the robot's hand; the sheet lies still",
+            "eye-to-hand": "beside the robot; the sheet is on the hand",
+        },
+    )
+    robot = Option(
+        name="robot",
+        label="How the robot shows the pose of its flange",
+        options={name: f"{', '.join(one.numbers)}; {one.title}" for name, one in ROBOTS.items()},
+    )
+    inputs = (setup, robot) if typed else (setup,)
+    step = Step(
+        id="about",
+        title="Camera and robot",
+        description="The sheet must not slip on what carries it until all pictures are taken.",
+        inputs=inputs,
+    )
+    answer = await ask(step.with_defaults(parameters))
+    where: Setup = "eye-to-hand" if answer["setup"] == "eye-to-hand" else "eye-in-hand"
+    return where, str(answer.get("robot", ""))
+
+
+@dataclass(eq=False)
+class _Views:
+    """One run of the wizard; holds nothing but what the answers gave."""
+
+    _target: Target
+    _setup: Setup
+    _take_picture: TakePicture
+    _robot: ReadFlange | str
+    _camera: CameraModel | None
+    _samples: list[dict[str, Any]] = field(default_factory=list)
+
+    async def run(self) -> HandEyeCalibration:
+        """Ask for views until a calibration is accepted; return it."""
+        more = True
+        while True:
+            while more and await self._take_view():
+                pass
+            calibration, notes = await self._calculate()
+            answers = await ask(self._review(calibration, notes))
+            if answers["next"] == "accept" and calibration is not None:
+                return calibration
+            more = answers["next"] == "more"
+            if answers["next"] == "remove":
+                del self._samples[answers["view"] - 1]
+                more = len(self._samples) < LEAST_POSES
+
+    async def _take_view(self) -> bool:
+        """Take one more view; return false where it is to be calculated instead."""
+        count = len(self._samples)
+        if count >= MOST_VIEWS:
+            return False
+        inputs: tuple[Option | Number, ...] = ()
+        if count >= LEAST_POSES:
+            options = {
+                "view": "take this view",
+                "calculate": f"calculate with the {count} views; {ADVISED_VIEWS} or more are good",
+            }
+            default = "view" if count < ADVISED_VIEWS else "calculate"
+            inputs = (Option(name="next", label="What next", options=options, default=default),)
+        look = SUGGESTIONS[count % len(SUGGESTIONS)]
+        typed = ""
+        if isinstance(self._robot, str):
+            typed = " Then take the pose of the flange from the robot, in its base."
+            inputs = (*inputs, *_pose_inputs(self._robot, optional=count >= LEAST_POSES))
+        step = Step(
+            id=f"view-{count + 1}",
+            title=f"View {count + 1}",
+            description=f"{_MOVES[self._setup]}: {look}. The whole sheet must be in the image, and "
+            f"the robot must stand still.{typed}",
+            button="Take a picture" if count < LEAST_POSES else "Go on",
+            inputs=inputs,
+            notes=(f"{count} views so far",) if count else (),
+            preview=self._preview(),
+            timeout=PICTURE_TIMEOUT,
+        )
+        sample = (await ask(step, self._sample)).outcome
+        if sample:
+            self._samples.append(sample)
+        return bool(sample)
+
+    async def _sample(self, answers: Answers) -> dict[str, Any]:
+        """Take a picture and read the robot, if that is wanted."""
+        if answers.get("next") == "calculate":
+            return {}
+        typed = None
+        if isinstance(self._robot, str):  # a pose that is none shall not cost a picture
+            typed = _typed_pose(self._robot, answers)
+        image = await self._take_picture()
+        flange = typed or await self._flange()
+        name = f"view {len(self._samples) + 1}"
+        view, preview = await asyncio.to_thread(self._found, image, name)
+        frames = [flange.target, flange.source]
+        return {
+            "frames": frames,
+            "pose": motion_to_data(flange),
+            "view": view.to_data(),
+            "preview": preview,
+        }
+
+    async def _flange(self) -> Transform:
+        if isinstance(self._robot, str):
+            raise TypeError("the robot is not read")
+        pose = await self._robot()
+        return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
+
+    def _found(self, image: Any, name: str) -> tuple[TargetView, str]:
+        """Return the view found in a picture and an SVG of it; a large SVG is left out."""
+        view = find_target(image, self._target, name=name)
+        earlier = [TargetView.from_data(one["view"], target=self._target) for one in self._samples]
+        following = LOOKS[(len(earlier) + 1) % len(LOOKS)]
+        svg = draw(
+            image,
+            view=view,
+            earlier=earlier,
+            suggested=outline(following, self._target, view.size),
+            title=f"{name}; orange: the next one, about",
+        )
+        return view, svg if len(svg) <= MAX_PREVIEW else ""
+
+    def _preview(self) -> dict[str, Any] | None:
+        svg = self._samples[-1].get("preview") if self._samples else None
+        return {"svg": svg} if svg else None
+
+    async def _calculate(self) -> tuple[HandEyeCalibration | None, tuple[str, ...]]:
+        step = Step(
+            id="calculate",
+            title="Calculate",
+            description="Several ways are compared by the poses that each has not seen.",
+            button="Calculate",
+            notes=(f"{len(self._samples)} views",),
+            timeout=CALCULATION,
+        )
+        found = (await ask(step, self._solve)).outcome
+        if "code" in found:
+            return None, (f"{found['code']}: {found['text']}",)
+        views = [one["view"] for one in self._samples]
+        calibration = HandEyeCalibration.from_data({**found, "views": views})
+        return calibration, _outcome(calibration).notes
+
+    async def _solve(self, _answers: Answers) -> dict[str, Any]:
+        """Return the calibration without the samples' views, or why there is none."""
+        poses = [motion_from_data(one["pose"], *one["frames"]) for one in self._samples]
+        views = [TargetView.from_data(one["view"], target=self._target) for one in self._samples]
+        work = partial(calibrate_hand_eye, poses, views, setup=self._setup, camera=self._camera)
+        try:
+            calibration = await asyncio.to_thread(work)
+        except CalibrationError as exc:
+            return {"code": str(exc.code), "text": str(exc)}
+        return {**calibration.to_data(), "views": []}
+
+    def _review(self, calibration: HandEyeCalibration | None, notes: tuple[str, ...]) -> Step:
+        options = {
+            "accept": "accept it",
+            "more": "take another view",
+            "remove": "remove a view",
+        }
+        worst = len(self._samples)
+        if calibration is None:
+            del options["accept"]
+        else:
+            worst = 1 + calibration.worst
+        label = "View to remove; the worst one stands there"
+        return review_step(options, pick("view", label, len(self._samples), worst), notes)
+
+
+def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
+    """Return the inputs of a pose; where it is ``optional``, none is needed to calculate."""
+    convention = ROBOTS[robot]
+    unit = "mm" if convention.metre > 1 else "m"
+    return tuple(
+        Number(
+            name=name, label=name, unit=unit if name in {"x", "y", "z"} else "", optional=optional
+        )
+        for name in convention.numbers
+    )
+
+
+def _typed_pose(robot: str, answers: Answers) -> Transform:
+    values = [answers[name] for name in ROBOTS[robot].numbers]
+    missing = {
+        name: "no answer"
+        for name, value in zip(ROBOTS[robot].numbers, values, strict=True)
+        if value is None
+    }
+    if missing:
+        raise CalibrationError(
+            f"pose: no answer for {', '.join(missing)}", code=Code.WRONG_ANSWERS, got=missing
+        )
+    return pose_from(robot, values, source="flange")
+
+
+def _outcome(calibration: HandEyeCalibration) -> Calibrated:
+    held_out = calibration.held_out_error
+    remarks = [f"{one.code}: {one.text}" for one in calibration.warnings]
+    figures = {
+        "method": calibration.method,
+        "views": len(calibration.views),
+        "held_out_mm": None if held_out is None else 1e3 * held_out,
+        "mean_mm": 1e3 * calibration.mean_error,
+        "translation_error_mm": _known(1e3, calibration.translation_error),
+        "rotation_error_deg": _known(math.degrees(1.0), calibration.rotation_error),
+        "remarks": remarks,
+    }
+    notes = [f"{figures['views']} views, {figures['method']}"]
+    if held_out is not None:
+        worst = calibration.worst
+        off = 1e3 * float(calibration.leave_one_out[worst])
+        notes += [
+            f"{figures['held_out_mm']:.3g} mm rms on the sheet, at views that were left out",
+            f"the worst is view {worst + 1}: {off:.3g} mm",
+        ]
+    if figures["translation_error_mm"] is not None:
+        notes.append(
+            f"the camera's place is known to {figures['translation_error_mm']:.2g} mm, its "
+            f"orientation to {figures['rotation_error_deg']:.2g} deg"
+        )
+    return Calibrated(calibration, figures, (*notes, *remarks))
+
+
+def _known(factor: float, value: float) -> float | None:
+    return factor * value if math.isfinite(value) else None

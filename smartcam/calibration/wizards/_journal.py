@@ -1,0 +1,159 @@
+"""The journal of a sequence: a line for each thing that was done, on the disk before it counts.
+
+The first line tells whose it is, each other line is an entry. A line is written and synced before
+the next step is shown. A process that is killed leaves at most a piece of a line, which the next
+one takes away: what that line was to say had not been answered yet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+from smartcam._locks import try_lock
+from smartcam.calibration._codes import Code
+from smartcam.calibration._files.store import sync_folder
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Self
+
+MAX_ENTRIES = 10_000
+"""Entries of a journal; a calibration by hand has some dozens."""
+
+MAX_LINE = 1 << 20
+"""Bytes of an entry; a result of 900 localizations has a quarter of it."""
+
+_MAX_FILE = 1 << 28
+
+
+class Journal:
+    """A journal in a file, for one sequence at a time.
+
+    The file is locked as long as it is open, so that no other process writes into it.
+
+    Args:
+        path: the file; made where it is not there. A symbolic link is refused.
+
+    Attributes:
+        path: the file.
+        header: what the first line says; None for a new file.
+        entries: the entries.
+
+    Raises:
+        CalibrationError: ``IN_USE`` or ``BROKEN_FILE``.
+        OSError: it cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path: Path = path
+        self.header: dict[str, Any] | None = None
+        self.entries: list[dict[str, Any]] = []
+        self._size = 0
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+        self._stream = os.fdopen(os.open(path, flags, 0o644), "r+b", buffering=0)
+        try:
+            self._lock()
+            self._load()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def start(self, header: dict[str, Any]) -> None:
+        """Write the first line of a new file.
+
+        Raises ``NOT_STORABLE``; OSError: it cannot be written.
+        """
+        self.header = self._write(header)
+        sync_folder(self.path.parent)
+
+    def append(self, entry: dict[str, Any]) -> dict[str, Any]:
+        """Write an entry, return it as it will be read; it is on the disk then.
+
+        Raises ``NOT_STORABLE``: no JSON, too long, or one too many; OSError: it cannot be written,
+        the file is as it was.
+        """
+        if len(self.entries) >= MAX_ENTRIES:
+            raise CalibrationError(
+                f"{self.path}: entry {MAX_ENTRIES + 1}, expected {MAX_ENTRIES} at most",
+                code=Code.NOT_STORABLE,
+            )
+        read = self._write(entry)
+        self.entries.append(read)
+        return read
+
+    def close(self) -> None:
+        """Close the file, which frees its lock; does nothing if closed."""
+        self._stream.close()
+
+    def _lock(self) -> None:
+        if try_lock(self._stream.fileno()) is False:
+            raise CalibrationError(
+                f"{self.path}: another sequence writes it; expected one at a time",
+                code=Code.IN_USE,
+            )
+
+    def _load(self) -> None:
+        if os.fstat(self._stream.fileno()).st_size > _MAX_FILE:
+            raise self._broken(f"more than {_MAX_FILE} bytes")
+        data = self._stream.read() or b""
+        whole = data.rfind(b"\n") + 1
+        for number, line in enumerate(data[:whole].splitlines(), 1):
+            try:
+                value = json.loads(line)
+            except ValueError as exc:
+                raise self._broken(f"line {number} is no JSON: {exc}") from exc
+            if not isinstance(value, dict):
+                raise self._broken(f"line {number} is no object")
+            if number == 1:
+                self.header = value
+            else:
+                self.entries.append(value)
+        self._size = whole
+        self._cut()
+
+    def _write(self, value: dict[str, Any]) -> dict[str, Any]:
+        try:
+            line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+        except (TypeError, ValueError, RecursionError) as exc:
+            raise CalibrationError(
+                f"{self.path}: cannot be stored: {exc}", code=Code.NOT_STORABLE
+            ) from exc
+        if len(line) > MAX_LINE:
+            raise CalibrationError(
+                f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE} at most",
+                code=Code.NOT_STORABLE,
+            )
+        try:
+            self._put(line)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                self._cut()
+            raise
+        self._size += len(line)
+        read: dict[str, Any] = json.loads(line)
+        return read
+
+    def _put(self, line: bytes) -> None:
+        rest = memoryview(line)
+        while rest:
+            rest = rest[self._stream.write(rest) :]
+        os.fsync(self._stream.fileno())
+
+    def _cut(self) -> None:
+        self._stream.truncate(self._size)
+        self._stream.seek(self._size)
+
+    def _broken(self, why: str) -> CalibrationError:
+        return CalibrationError(
+            f"{self.path}: {why}; expected the journal of a sequence", code=Code.BROKEN_FILE
+        )

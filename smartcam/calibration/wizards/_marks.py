@@ -1,0 +1,117 @@
+"""Marks that a camera localizes: how a wizard takes a picture of them, and which are touched."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration.wizards._sequence import ask
+from smartcam.calibration.wizards._steps import Flag, Step
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Localization
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.calibration.wizards._steps import Answers
+
+MAX_MARKS = 25
+"""Marks of one picture that can be touched: 5 x 5."""
+
+Localize = Callable[[], Awaitable[list[Localization]]]
+"""Takes a picture and returns what was found in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A point that the camera sees, to be touched."""
+
+    feature: str  # its name; may be empty
+    x: float  # in the camera's unit; of a sheet's point metres on the sheet
+    y: float  # the same
+    theta: float  # radians
+    number: int | None = None  # of a sheet's point among those of its target; None: of no target's
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> Mark:
+        """Return the mark of a row that :meth:`MarkCamera.picture` gave."""
+        return cls(row["feature_id"], row["x"], row["y"], row["theta"])
+
+    def __str__(self) -> str:
+        name = self.feature if self.feature.isprintable() else repr(self.feature)
+        return f"{name or 'mark'} at x {self.x:.6g}, y {self.y:.6g}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarkCamera:
+    """A camera that localizes marks."""
+
+    localize: Localize
+    feature: str = ""  # only localizations of this name are marks; empty: all of them
+    # whether ``localize`` turns the camera's y axis, which points down, up; None: not known
+    y_down: bool | None = None
+
+    async def picture(self, _answers: Answers) -> list[dict[str, Any]]:
+        """Take a picture: the action of a step.
+
+        Returns:
+            A row for each mark: ``feature_id, quality, photo_index, frame_id, x, y, theta,
+            y_down``.
+
+        Raises:
+            CalibrationError: TOO_FEW: no mark; SHAPE: more than :data:`MAX_MARKS`.
+
+        Cancellation: as that of ``localize``.
+        """
+        found = await self.localize()
+        rows = [
+            {
+                "feature_id": one.feature_id,
+                "quality": one.quality,
+                "photo_index": one.photo_index,
+                "frame_id": one.pose.header.frame_id,
+                "x": one.pose.position.x,
+                "y": one.pose.position.y,
+                "theta": one.pose.orientation.theta,
+                "y_down": self.y_down,
+            }
+            for one in found
+            if self.feature in {"", one.feature_id}
+        ]
+        if not 0 < len(rows) <= MAX_MARKS:
+            wanted = f"{self.feature!r} " if self.feature else ""
+            raise CalibrationError(
+                f"the camera found {len(rows)} marks {wanted}among {len(found)} localizations; "
+                f"expected 1 to {MAX_MARKS}",
+                code=Code.TOO_FEW if not rows else Code.SHAPE,
+                got=len(rows),
+            )
+        return rows
+
+    def check_y_down(self, before: bool | None, what: str) -> None:
+        """Raise (MIRRORED) where the y axis is taken another way than ``before`` (None: unknown).
+
+        ``what``: what was made then, for people.
+        """
+        if None not in {before, self.y_down} and before != self.y_down:
+            raise CalibrationError(
+                f"{what} with y_down={before}, now it is {self.y_down}, and everything would be "
+                f"mirrored; expected y_down={before}",
+                code=Code.MIRRORED,
+                got=self.y_down,
+                expected=before,
+            )
+
+
+async def choose(marks: list[Mark]) -> list[Mark]:
+    """Ask which marks will be touched, where there are several."""
+    if len(marks) == 1:
+        return marks
+    flags = tuple(
+        Flag(name=f"mark_{number}", label=f"{number}: {mark}", default=True)
+        for number, mark in enumerate(marks, 1)
+    )
+    answer = await ask(Step(id="which", title="Which ones will be touched?", inputs=flags))
+    return [mark for flag, mark in zip(flags, marks, strict=True) if answer[flag.name]]

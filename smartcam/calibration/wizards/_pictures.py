@@ -1,0 +1,169 @@
+"""Pictures for the wizards: out of a file's bytes, or of a folder that a camera writes into."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._detection.image import LARGEST
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    import os
+
+    from numpy.typing import NDArray
+
+TakePicture = Callable[[], Awaitable[Any]]
+"""Takes a picture and returns it: uint8 or uint16, (H, W) or (H, W, 3)."""
+
+MAX_PREVIEW: Final = 700_000
+"""Bytes of a picture's preview, which is kept with its step: a line of a journal holds 1 MiB."""
+
+PICTURE_TIMEOUT: Final = 60.0
+"""Seconds that a picture may take, with what is found in it."""
+
+MAX_PICTURE: Final = 1 << 26
+"""Bytes of a picture's file: 20 million pixels of colour in a bitmap."""
+
+MAX_FILES: Final = 10_000
+"""Entries of a folder of pictures; it is looked through several times a second."""
+
+DEADLINE: Final = 25.0
+"""Seconds that a picture is waited for in a folder."""
+
+PERIOD: Final = 0.2
+"""Seconds between two looks at a folder; a file that is as long in both is written whole."""
+
+SUFFIXES: Final = frozenset(
+    {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}
+)
+"""Suffixes of files that are pictures, in small letters."""
+
+
+def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
+    """Return the picture that a file's bytes hold, (H, W), grey, uint8 or uint16.
+
+    Bitmap, JPEG, PNG, TIFF or what else OpenCV reads; as the camera's pixels lie, whatever the file
+    says of how it was held. ``name`` is for messages. Raises BAD_PICTURE: too many bytes or pixels,
+    or no picture; MissingExtraError: OpenCV is not installed.
+    """
+    if len(data) > MAX_PICTURE:
+        raise _bad(name, f"{MAX_PICTURE} bytes at most", f"{len(data)}")
+    cv2 = load("cv2")
+    try:
+        how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
+    except cv2.error:  # of no bytes, and of more pixels than OpenCV takes
+        image = None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise _bad(name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}")
+    if max(image.shape) > LARGEST:
+        raise _bad(name, f"{LARGEST} pixels along each side", f"{image.shape[1]}x{image.shape[0]}")
+    picture: NDArray[Any] = image
+    return picture
+
+
+class PictureFolder:
+    """A folder that a camera, or somebody, puts pictures into.
+
+    Args:
+        path: the folder.
+        deadline: how long :meth:`take` waits, seconds.
+
+    Attributes:
+        path: the folder.
+        deadline: as given.
+
+    Raises:
+        CalibrationError: NO_PICTURE: it is no folder.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, deadline: float = DEADLINE) -> None:
+        self.path: Path = Path(path)
+        self.deadline: float = deadline
+        self._look()
+
+    async def take(self) -> NDArray[Any]:
+        """Wait for the next picture and return it, (H, W).
+
+        What is in the folder already does not count, unless it is written anew: it shows what was
+        before the camera before. Of several that come the newest counts.
+
+        Raises:
+            CalibrationError: NO_PICTURE: none came in time, or the folder is gone or has too many
+                files; BAD_PICTURE: one came that cannot be read, or is too large.
+
+        Cancellation: safe; no file is changed.
+        """
+        before = self._look()
+        last: dict[str, tuple[int, int]] = before
+        try:
+            async with asyncio.timeout(self.deadline):
+                while True:
+                    await asyncio.sleep(PERIOD)
+                    now = self._look()
+                    fresh = [
+                        name
+                        for name, file in now.items()
+                        if file != before.get(name) and file == last.get(name) and file[1]
+                    ]
+                    if fresh:
+                        newest = max(fresh, key=lambda name: now[name])
+                        return await asyncio.to_thread(self._read, newest)
+                    last = now
+        except TimeoutError as exc:
+            raise CalibrationError(
+                f"no picture came into {self.path} within {self.deadline:g} s; expected a file "
+                f"that ends in one of {', '.join(sorted(SUFFIXES))}, written after the button",
+                code=Code.NO_PICTURE,
+                expected=sorted(SUFFIXES),
+            ) from exc
+
+    def _look(self) -> dict[str, tuple[int, int]]:
+        """Return when each picture was written, ns, and how many bytes it has."""
+        found: dict[str, tuple[int, int]] = {}
+        try:
+            for count, file in enumerate(self.path.iterdir()):
+                if count >= MAX_FILES:
+                    raise CalibrationError(
+                        f"{self.path}: expected {MAX_FILES} files at most, got more",
+                        code=Code.NO_PICTURE,
+                        expected=MAX_FILES,
+                    )
+                if file.suffix.lower() not in SUFFIXES:
+                    continue
+                try:
+                    about = file.stat()
+                except FileNotFoundError:  # taken away, or renamed, meanwhile
+                    continue
+                found[file.name] = (about.st_mtime_ns, about.st_size)
+        except OSError as exc:
+            raise CalibrationError(
+                f"{self.path}: expected a folder that pictures come into, got {exc.strerror}",
+                code=Code.NO_PICTURE,
+                got=exc.strerror,
+            ) from exc
+        return found
+
+    def _read(self, name: str) -> NDArray[Any]:
+        try:
+            with (self.path / name).open("rb") as stream:
+                data = stream.read(MAX_PICTURE + 1)
+        except OSError as exc:
+            raise _bad(name, "a file that can be read", str(exc.strerror)) from exc
+        return decode_picture(data, name)
+
+
+def _bad(name: str, expected: str, got: str) -> CalibrationError:
+    return CalibrationError(
+        f"{name}: expected {expected}, got {got}",
+        code=Code.BAD_PICTURE,
+        expected=expected,
+        got=got,
+    )

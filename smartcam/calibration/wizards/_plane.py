@@ -1,0 +1,183 @@
+"""The wizard that calibrates a smart camera's plane against a robot.
+
+The camera localizes marks, and each is touched with the robot's tip, as many as one likes; or it
+localizes the origin mark of the printed rays. It knows no client and no robot: it is given what
+takes a picture and, if the robot can be asked, what reads its pose.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.calibration._plane.calibration import KIND, fit_plane
+from smartcam.calibration._printing.page_layout import RULER
+from smartcam.calibration.wizards._marks import Mark, MarkCamera
+from smartcam.calibration.wizards._points import (
+    MAX_POINTS,
+    PointSource,
+    about_step,
+    calibrated_plane,
+)
+from smartcam.calibration.wizards._sequence import Wizard, ask
+from smartcam.calibration.wizards._steps import Number, Option, Step
+from smartcam.calibration.wizards._target_steps import ruler
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.calibration.wizards._marks import Localize
+    from smartcam.calibration.wizards._points import Calibrated
+    from smartcam.calibration.wizards._sequence import StepAnswer
+    from smartcam.calibration.wizards._steps import Answers
+    from smartcam.calibration.wizards._touches import ReadRobot, Touch
+
+
+def plane_wizard(
+    *,
+    localize: Localize,
+    save_to: Callable[[str], Path],
+    read_robot: ReadRobot | None = None,
+    y_down: bool | None = None,
+) -> Wizard:
+    """Return the wizard.
+
+    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
+    first step ``method`` (marks, rays), ``camera_unit`` (m, px), ``camera_frame``, ``robot_frame``,
+    ``tool``, ``unit`` (mm, m), ``side``, ``touch_sigma`` (mm); ``feature``: only marks of this name
+    count.
+
+    Its result: ``name, file, model, points, left_out`` (numbers of points, from 1)``, residual_mm,
+    held_out_mm, predicted_mm, remarks``. Points left out count in none of the errors.
+
+    Args:
+        localize: takes a picture.
+        save_to: returns the file for a name.
+        read_robot: reads the robot's pose; None: it is typed.
+        y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
+            known. It is kept with the calibration, and the same for all of its pictures.
+    """
+
+    async def script(parameters: Mapping[str, Any]) -> Any:
+        feature = str(parameters.get("feature") or "")
+        camera = MarkCamera(localize=localize, feature=feature, y_down=y_down)
+        step = about_step(
+            "The camera is fixed, and sees the plane that the robot works on. All touches are made "
+            "with one tool, held the same way: then what is wrong with its tip is the same in all "
+            "of them, and cancels out as long as parts are taken like that.",
+            {
+                "marks": "each mark that the camera sees; 9 over the whole field are good",
+                "rays": "the origin mark and a point on each of the rays A and B of its sheet",
+            },
+            parameters,
+            Option(
+                name="camera_unit",
+                label="Unit of the camera's positions",
+                options={"m": "metres, as its own calibration gives them", "px": "pixels"},
+            ),
+            typed=read_robot is None,
+        )
+        about = await ask(step)
+        source = _MarkSource(about, read_robot, camera)
+        return await source.run(str(parameters.get("name", KIND)), save_to)
+
+    return Wizard(name=KIND, version=1, script=script)
+
+
+class _MarkSource(PointSource):
+    """Marks that a camera localizes."""
+
+    KIND = KIND
+    POINTS = "marks"
+    ORIGIN = "the origin mark"
+    MORE = "take another picture, for more points"
+
+    def __init__(self, about: StepAnswer, read_robot: ReadRobot | None, camera: MarkCamera) -> None:
+        super().__init__(about, read_robot)
+        self.camera_frame = about["camera_frame"] or None
+        self.camera_unit = about["camera_unit"]
+        self._camera = camera
+
+    async def add(self) -> None:
+        done = len(self.touches)
+        step = Step(
+            id="picture",
+            title="Marks in the camera's field",
+            description="Lay one mark or several where the camera sees them, over the whole field "
+            "and at the height where parts lie; the robot must not hide them. They must not move "
+            "until they have been touched.",
+            button="Take a picture",
+            notes=(f"{done} points so far",) if done else (),
+        )
+        await self.add_marks(await self._seen(step), MAX_POINTS, "points")
+
+    async def redo(self, index: int) -> None:
+        mark = self.touches[index].mark
+        title = f"Touch point {index + 1} again"
+        self.touches[index] = await self.touch("redo", title, str(mark), mark)
+
+    async def ray_origin(self) -> tuple[Mark, float]:
+        scale = await self._nominal_scale()
+        step = Step(
+            id="origin",
+            title="The origin mark",
+            description="Lay the calibration sheet into the camera's field and fix it. The robot "
+            "must not hide the origin mark.",
+            button="Take a picture",
+        )
+        marks = [Mark.of(row) for row in await self._seen(step)]
+        if len(marks) == 1:
+            return marks[0], scale
+        options = {str(number): f"{mark}" for number, mark in enumerate(marks, 1)}
+        inputs = (Option(name="mark", label="The origin mark", options=options),)
+        step = Step(id="which", title="Which one is the origin?", inputs=inputs)
+        return marks[int((await ask(step))["mark"]) - 1], scale
+
+    async def _nominal_scale(self) -> float:
+        """Ask for metres for each unit of the camera, which touches of rays do not tell."""
+        if self.camera_unit == "px":
+            label = "Size of a pixel on the plane"
+            pixel = Number(name="pixel", label=label, unit="mm", minimum=1e-6, maximum=100.0)
+            step = Step(id="scale", title="Scale", inputs=(pixel,))
+            return 1e-3 * float((await ask(step))["pixel"])
+        step = Step(
+            id="scale",
+            title="Was the sheet printed true to size?",
+            description="Printers scale. The camera took its metres from the sheet as it should "
+            "be, so what the ruler really measures is the scale.",
+            inputs=(ruler("ruler"),),
+        )
+        return float((await ask(step))["ruler"]) / RULER
+
+    async def _seen(self, step: Step) -> Sequence[Mapping[str, Any]]:
+        """Ask for a picture; remember which way its y axis was taken."""
+        rows: Sequence[Mapping[str, Any]] = (await ask(step, self._picture)).outcome
+        told = [row.get("y_down") for row in rows]
+        self.y_down = next((one for one in told if one is not None), self.y_down)
+        return rows
+
+    async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
+        self._camera.check_y_down(self.y_down, "the picture before was taken")
+        return await self._camera.picture(answers)
+
+    def fit(self, *, robust: bool) -> PlaneCalibration:
+        return fit_plane(
+            [(one.mark.x, one.mark.y) for one in self.touches],
+            self.places,
+            touch_sigma=self.sigma,
+            nominal_scale=1.0 if self.camera_unit == "m" else None,
+            tool_z=self.tool_z,
+            robust=robust,
+            robot_frame=self.about["robot_frame"],
+            camera_frame=self.camera_frame,
+            y_down=self.y_down,
+        )
+
+    def sample(self, touch: Touch) -> dict[str, Any]:
+        mark = touch.mark
+        camera = [mark.x, mark.y, mark.theta]
+        return {"touched": touch.what, "feature_id": mark.feature, "camera": camera}
+
+    def outcome(self, plane: PlaneCalibration) -> Calibrated:
+        return calibrated_plane(plane)

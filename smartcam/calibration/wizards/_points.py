@@ -1,0 +1,337 @@
+"""The wizard that calibrates a plane by touches, whatever its points come from.
+
+A :class:`PointSource` says where they come from: marks that a camera localizes, or a sheet that is
+found in a picture. The robot touches as many of them as one likes, or the thesis' three: the origin
+and one point on each of the printed rays A and B.
+
+Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._files.store import write
+from smartcam.calibration._plane.robust import LEAST_POINTS
+from smartcam.calibration._plane.touches import fit_touches
+from smartcam.calibration.wizards._sequence import ask
+from smartcam.calibration.wizards._steps import Option, Step, Text, pick
+from smartcam.calibration.wizards._touch_previews import compared, plain
+from smartcam.calibration.wizards._touches import SIDE, SIGMA, UNIT, Touch, Touches
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Header, Localization, Pose, Position, Quaternion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from smartcam.calibration._files.load import AnyCalibration
+    from smartcam.calibration._hand_eye.result import HandEyeCalibration
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.calibration.wizards._marks import Mark
+    from smartcam.calibration.wizards._steps import Answers, Input
+
+MAX_POINTS = 200
+"""Touches of a calibration."""
+
+LEAST = 3
+"""Touches that a plane takes."""
+
+_SIGNS_OF_OUTLIERS = frozenset({Code.OUTLIER, Code.POOR_FIT, Code.NOT_PLANAR})
+"""Warnings after which points may be left out; two that are wrong can hide each other."""
+
+
+class Calibrated(NamedTuple):
+    """A calibration with its figures and notes."""
+
+    calibration: AnyCalibration | HandEyeCalibration
+    figures: dict[str, Any]  # what the wizard's result says of it, JSON-able
+    notes: tuple[str, ...]  # what people should know of it, a line each
+
+
+class PointSource(Touches, ABC):
+    """Where a plane's points come from, and their touches: one run of a wizard.
+
+    Args: as of :class:`~smartcam.calibration.wizards._touches.Touches`; ``about`` answers
+        :func:`about_step`.
+
+    Attributes:
+        camera_unit: unit of the camera's positions.
+        camera_frame: name of the only frame that localizations may come in; None: any.
+        y_down: whether the camera's y axis was turned up; None: not known.
+    """
+
+    KIND: ClassVar[str]
+    """Kind of the calibration in the store."""
+    FIRST: ClassVar[int] = LEAST
+    """Points that are touched before it is shown what came out."""
+    POINTS: ClassVar[str]
+    """Name of the points, for people."""
+    ORIGIN: ClassVar[str]
+    """Name of the origin of the rays, for people."""
+    MORE: ClassVar[str]
+    """Text of the option to touch more."""
+    SHOWN: ClassVar[Mapping[str, str]] = {}
+    """Further entries of a calibration's preview."""
+
+    camera_unit: str
+    camera_frame: str | None = None
+    y_down: bool | None = None
+
+    @abstractmethod
+    async def add(self) -> None:
+        """Ask for touches of one more point or several."""
+
+    @abstractmethod
+    async def redo(self, index: int) -> None:
+        """Ask for another touch in the place of one."""
+
+    @abstractmethod
+    async def ray_origin(self) -> tuple[Mark, float]:
+        """Return the origin of the rays, and metres for each unit of the camera."""
+
+    @abstractmethod
+    def fit(self, *, robust: bool) -> PlaneCalibration:
+        """Fit a plane to the touches; CalibrationError: there is none."""
+
+    @abstractmethod
+    def sample(self, touch: Touch) -> dict[str, Any]:
+        """Return the entries of a touch in a file's samples, JSON-able."""
+
+    @abstractmethod
+    def outcome(self, plane: PlaneCalibration) -> Calibrated:
+        """Return the calibration of a plane, with its figures and notes."""
+
+    async def run(self, name: str, save_to: Callable[[str], Path]) -> dict[str, Any]:
+        """Ask for touches and whether to save what came out; return the wizard's result."""
+        rays = self.about["method"] == "rays"
+        plane = await (self._touch_rays() if rays else self._touch_points())
+        about, outcome = self.about, self.outcome(plane)
+        context = {
+            "frames": {"camera": about["camera_frame"] or None, "robot": about["robot_frame"]},
+            "camera_unit": self.camera_unit,
+            "tool": about["tool"],
+            "method": about["method"],
+            "samples": [
+                {
+                    **self.sample(one),
+                    "robot": list(one.robot),
+                    "tool_z": None if one.tool_z is None else list(one.tool_z),
+                }
+                for one in self.touches
+            ],
+        }
+        preview = self._preview(plane)
+        return await ask_to_save(name, save_to, self.KIND, outcome, preview, context)
+
+    async def _touch_rays(self) -> PlaneCalibration:
+        origin, scale = await self.ray_origin()
+        for letter, place, mark in (
+            ("O", self.ORIGIN, origin),
+            ("A", "a point of ray A, as far out as it goes", replace(origin, number=None)),
+            ("B", "a point of ray B, as far out as it goes", replace(origin, number=None)),
+        ):
+            touched = await self.touch(f"touch-{letter}", f"Touch {letter}", place, mark, letter)
+            self.touches.append(touched)
+        header = Header(0, datetime.fromtimestamp(0, UTC), self.camera_frame or "")
+        pose = Pose(header, Position(origin.x, origin.y), Quaternion.from_theta(origin.theta))
+        plane = fit_touches(
+            Localization(origin.feature, 1.0, 0, pose),
+            *self.places,
+            nominal_scale=scale,
+            touch_sigma=self.sigma,
+            tool_z=self.tool_z,
+            robot_frame=self.about["robot_frame"],
+            camera_frame=self.camera_frame,
+            y_down=self.y_down,
+        )
+        await ask(
+            Step(
+                id="review",
+                title="What came out",
+                description="Three touches fit any plane: nothing tells how good they were. To "
+                f"know, touch {self.POINTS} instead.",
+                button="Accept",
+                notes=self.outcome(plane).notes,
+                preview=self._preview(plane),
+            )
+        )
+        return plane
+
+    async def _touch_points(self) -> PlaneCalibration:
+        wanted, robust = self.FIRST, False
+        while True:
+            while len(self.touches) < wanted:
+                await self.add()
+            wanted = LEAST
+            plane, notes = self._try_fit(robust=robust)
+            choice = await ask(self._review(plane, notes, robust=robust))
+            index = choice["point"] - 1
+            match choice["next"]:
+                case "accept" if plane is not None:
+                    return plane
+                case "more":
+                    await self.add()
+                case "redo":
+                    await self.redo(index)
+                case "remove":
+                    del self.touches[index]
+                case _:
+                    robust = choice["next"] == "robust"
+
+    def _try_fit(self, *, robust: bool) -> tuple[PlaneCalibration | None, tuple[str, ...]]:
+        try:
+            plane = self.fit(robust=robust and len(self.touches) >= LEAST_POINTS)
+        except CalibrationError as exc:
+            return None, (f"{exc.code}: {exc}",)
+        return plane, self.outcome(plane).notes
+
+    def _review(
+        self, plane: PlaneCalibration | None, notes: tuple[str, ...], *, robust: bool
+    ) -> Step:
+        options = {
+            "accept": "accept it",
+            "more": self.MORE,
+            "redo": "touch a point again",
+            "remove": "remove a point",
+        }
+        worst = 1
+        if plane is None:
+            del options["accept"]
+        else:
+            worst = 1 + min(plane.outliers, default=plane.worst)
+        doubtful = plane is None or any(one.code in _SIGNS_OF_OUTLIERS for one in plane.warnings)
+        if robust:
+            options["all"] = "count all points, also those that do not agree with the others"
+        elif len(self.touches) >= LEAST_POINTS and doubtful:
+            options["robust"] = "leave out the points that do not agree with the others"
+        label = "Point, to touch again or to remove; the worst one stands there"
+        point = pick("point", label, len(self.touches), worst)
+        return review_step(options, point, notes, self._preview(plane))
+
+    def _preview(self, plane: PlaneCalibration | None) -> dict[str, Any]:
+        """Return the data from which a picture of the touches is drawn."""
+        if plane is None:
+            return plain(self.touches)
+        found = compared(
+            plane,
+            self.touches,
+            plane.camera_points,
+            plane.residuals,
+            plane.leave_one_out,
+            worst=plane.worst,
+            left_out=plane.outliers,
+        )
+        return {**found, **self.SHOWN}
+
+
+def about_step(
+    description: str,
+    methods: Mapping[str, str],
+    parameters: Mapping[str, Any],
+    *more: Input,
+    typed: bool,
+) -> Step:
+    """Return the first step of a wizard over a source of points.
+
+    ``methods``: what can be touched, for people; ``rays`` among them. ``parameters``: defaults of
+    its inputs, WRONG_ANSWERS where one is no answer. ``more``: what is asked for behind the method.
+    ``typed``: whether the robot's pose is typed.
+    """
+    step = Step(
+        id="about",
+        title="Camera, robot and tool",
+        description=description,
+        inputs=(
+            Option(name="method", label="What is touched", options=methods),
+            *more,
+            Text(
+                name="camera_frame",
+                label="Name of the only frame that localizations may come in; empty: any",
+                default="",
+            ),
+            Text(name="robot_frame", label="Name of the robot's frame", default="robot"),
+            Text(name="tool", label="Which tool touches", default=""),
+            UNIT,
+            *((SIDE,) if typed else ()),
+            SIGMA,
+        ),
+    )
+    return step.with_defaults(parameters)
+
+
+def review_step(
+    options: Mapping[str, str],
+    number: Input,
+    notes: tuple[str, ...],
+    preview: Mapping[str, Any] | None = None,
+) -> Step:
+    """Return the step that shows what came out, and asks what ``next``, with which ``number``."""
+    inputs = (Option(name="next", label="What next", options=options), number)
+    return Step(id="review", title="What came out", notes=notes, inputs=inputs, preview=preview)
+
+
+async def ask_to_save(
+    name: str,
+    save_to: Callable[[str], Path],
+    kind: str,
+    outcome: Calibrated,
+    preview: Mapping[str, Any] | None = None,
+    context: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Ask to save a calibration, and its context with it; return the wizard's result."""
+    file = save_to(name)
+
+    async def save(_answers: Answers) -> dict[str, Any]:
+        write(file, kind, outcome.calibration.to_data(), context=context)
+        return {"file": file.name}
+
+    step = Step(
+        id="save",
+        title=f"Save {name}",
+        description="A calibration of that name is kept beside it as a backup.",
+        button="Save",
+        notes=outcome.notes,
+        preview=preview,
+    )
+    await ask(step, save)
+    return {"name": name, "file": file.name, **outcome.figures}
+
+
+def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
+    """Return a plane's calibration with its figures, in mm, and its notes."""
+    counted = calibration.weights > 0.0
+    residual = 1e3 * math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
+    held_out, predicted = calibration.held_out_error, None
+    if calibration.touch_sigma is not None:
+        at_points = calibration.predicted_error(calibration.camera_points[counted])
+        predicted = 1e3 * math.sqrt(float((at_points**2).mean()))
+    points, left_out = int(counted.sum()), [1 + index for index in calibration.outliers]
+    of = f" of {points + len(left_out)}" if left_out else ""
+    notes = [
+        f"model {calibration.model} from {points}{of} points",
+        f"residual {residual:.3f} mm rms: how well the points fit",
+    ]
+    if held_out is not None:
+        notes.append(
+            f"held-out error {1e3 * held_out:.3f} mm rms: each point against a calibration from "
+            f"the others; the worst is point {calibration.worst + 1}"
+        )
+    if predicted is not None:
+        notes.append(f"predicted error {predicted:.3f} mm rms at the points")
+    notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
+    found = {
+        "model": calibration.model,
+        "points": points,
+        "left_out": left_out,
+        "residual_mm": residual,
+        "held_out_mm": None if held_out is None else 1e3 * held_out,
+        "predicted_mm": predicted,
+        "remarks": [[one.code.value, one.text] for one in calibration.warnings],
+    }
+    return Calibrated(calibration, found, tuple(notes))

@@ -1,0 +1,560 @@
+r"""Sequences: a wizard is one coroutine that asks for steps, and any front-end drives it.
+
+::
+
+    async def greet(parameters):
+        answer = await ask(Step(id="name", title="Who?", inputs=(Text(name="name", label="Name"),)))
+        return f"Hello {answer['name']}"
+
+    session = WizardSession(Wizard(name="greet", version=1, script=greet))
+    step = session.current                                    # JSON-able: what to show
+    step = await session.submit(step["token"], {"name": "Ada"})
+
+How it works: the coroutine awaits nothing but :func:`ask`. What touches the world (a camera, a
+robot, a file) is an *action* of a step: an async function that runs when the step is answered, and
+whose outcome is written into the journal together with the answers. So the coroutine's state is the
+list of its answers and outcomes, and nothing else. To undo is to run the coroutine again with one
+less; to resume after a crash is to run it again with all of them. Neither repeats an action.
+
+An error keeps the step: of an answer, of an action, and of what the coroutine does with them before
+it asks for the next step. Only a step that was taken is written.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import copy
+import functools
+import hashlib
+import json
+import secrets
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal
+
+from smartcam.calibration._codes import Code
+from smartcam.exceptions import CalibrationError, SmartCamError
+
+if TYPE_CHECKING:
+    from smartcam.calibration.wizards._journal import Journal
+    from smartcam.calibration.wizards._steps import Answers, Step
+
+SCHEMA = "smartcam.sequence/1"
+"""Name of the journal's form, in its first line."""
+
+Action = Callable[["Answers"], Awaitable[Any]]
+"""Function that is run when a step is answered: takes the answers, returns something JSON-able.
+
+A SmartCamError or an OSError of it (TimeoutError is one) is shown and keeps the step; a
+CalibrationError of code ``WRONG_ANSWERS`` whose ``got`` maps inputs to texts is shown with them.
+"""
+
+State = Literal["asking", "ended", "aborted"]
+"""State of a sequence."""
+
+
+class StepAnswer(dict[str, Any]):
+    """Answers of a step by name, and the outcome of its action.
+
+    Attributes:
+        outcome: what the action returned, as JSON has it (lists for tuples); None without one.
+    """
+
+    def __init__(self, values: Mapping[str, Any], outcome: Any) -> None:
+        super().__init__(values)
+        self.outcome: Any = outcome
+
+
+@dataclass(frozen=True, slots=True)
+class PendingStep:
+    """A step to be answered, which a wizard awaits.
+
+    Attributes:
+        step: the step.
+        action: what is done with the answers; None for nothing.
+    """
+
+    step: Step
+    action: Action | None = None
+
+    def __await__(self) -> Generator[PendingStep, StepAnswer, StepAnswer]:
+        return (yield self)
+
+
+def ask(step: Step, action: Action | None = None) -> PendingStep:
+    """Return an awaitable that has a step answered.
+
+    Args:
+        step: what is shown and asked for.
+        action: run once, when the step is answered.
+
+    Returns:
+        Awaited, it gives the :class:`StepAnswer`.
+    """
+    return PendingStep(step, action)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wizard:
+    """A sequence that can be started.
+
+    Attributes:
+        name: what journals call it.
+        version: to be raised when its steps change, so that no journal is read with others.
+        script: the coroutine function; takes the parameters of the start, returns the result.
+    """
+
+    name: str
+    version: int
+    script: Callable[[Mapping[str, Any]], Coroutine[Any, Any, Any]]
+
+
+class _ScriptRun:
+    """The coroutine, brought to where some entries lead."""
+
+    def __init__(
+        self, wizard: Wizard, parameters: Mapping[str, Any], entries: list[dict[str, Any]]
+    ) -> None:
+        self._coroutine = wizard.script(copy.deepcopy(dict(parameters)))
+        self.request: PendingStep | None = None
+        self.result: Any = None
+        self._send(None)
+        for number, entry in enumerate(entries, 1):
+            if self.request is None or self.request.step.id != entry["step"]:
+                here = "the end" if self.request is None else f"step {self.request.step.id!r}"
+                self.close()
+                raise CalibrationError(
+                    f"entry {number} is of step {entry['step']!r}, expected {here}: another "
+                    f"version of {wizard.name!r} wrote it",
+                    code=Code.WRONG_JOURNAL,
+                )
+            self.take(entry)
+
+    def take(self, entry: Mapping[str, Any]) -> None:
+        """Give the coroutine an answer."""
+        self._send(StepAnswer(copy.deepcopy(entry["answers"]), copy.deepcopy(entry["outcome"])))
+
+    def _send(self, answer: StepAnswer | None) -> None:
+        try:
+            request = self._coroutine.send(answer)
+        except StopIteration as stop:
+            self.request, self.result = None, stop.value
+            return
+        if not isinstance(request, PendingStep):
+            self._coroutine.close()
+            raise TypeError(f"a wizard awaits steps only, not {request!r}: that is for an action")
+        self.request = request
+
+    def close(self) -> None:
+        self._coroutine.close()
+
+
+_OF_ANSWER = ("token", "step", "answers", "outcome", "acted", "at")
+_NAMES = {"answer": _OF_ANSWER, "repeat": _OF_ANSWER, "undo": ("token",), "abort": ("token",)}
+"""Keys that an entry must have, by its event."""
+
+
+@dataclass(slots=True)
+class _Replay:
+    """The state of a sequence after a list of entries."""
+
+    entries: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    state: State = "asking"
+    undone: Mapping[str, Any] | None = None
+
+    def then(self, entry: dict[str, Any]) -> _Replay:
+        for name in _NAMES[entry["event"]]:
+            _ = entry[name]
+        match entry["event"]:
+            case "answer":
+                return _Replay([*self.entries, entry])
+            case "repeat":
+                return _Replay([*self.entries[:-1], entry])
+            case "undo":
+                return _Replay(self.entries[:-1], undone=self.entries[-1])
+            case _:
+                return _Replay(self.entries, "aborted")
+
+
+class WizardSession:
+    """A sequence under way. Calls may overlap: they take turns.
+
+    Args:
+        wizard: the wizard.
+        journal: where its steps are kept; one with entries is resumed. None: nowhere.
+        parameters: JSON-able values for the wizard's start; a journal that is resumed has its own.
+
+    Attributes:
+        wizard: the wizard.
+        flow: name of this run, part of its tokens.
+        parameters: the parameters of its start.
+
+    Raises:
+        CalibrationError: ``WRONG_JOURNAL``: another wizard's, or another version's;
+            ``BROKEN_FILE``: not as a sequence writes it; ``NOT_STORABLE``: parameters that are no
+            JSON; or what the wizard finds wrong with the parameters.
+        OSError: the journal cannot be written.
+    """
+
+    def __init__(
+        self,
+        wizard: Wizard,
+        journal: Journal | None = None,
+        *,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.wizard: Wizard = wizard
+        self._journal = journal
+        header = self._header(parameters or {})
+        self._all: list[dict[str, Any]] = [] if journal is None else list(journal.entries)
+        try:
+            self.flow: str = str(header["flow"])
+            self.parameters: dict[str, Any] = dict(header["parameters"])
+            self._log = functools.reduce(_Replay.then, self._all, _Replay())
+        except (KeyError, IndexError, TypeError, ValueError) as exc:
+            raise CalibrationError(
+                f"the journal is incomplete: {exc!r}; expected one as a sequence writes it",
+                code=Code.BROKEN_FILE,
+            ) from exc
+        self._run = self._resumed()
+        if journal is not None and journal.header is None:
+            journal.start(header)
+        self._errors: dict[str, str] = {}
+        self._lock = asyncio.Lock()
+        self._scope: asyncio.Timeout | None = None
+
+    def _resumed(self) -> _ScriptRun:
+        try:
+            return _ScriptRun(self.wizard, self.parameters, self._log.entries)
+        except (AttributeError, LookupError, TypeError, ValueError) as exc:
+            if isinstance(exc, SmartCamError) or not self._log.entries:
+                raise
+            raise CalibrationError(
+                f"the journal's answers do not lead through {self.wizard.name!r}: {exc!r}; "
+                "expected those that its steps took",
+                code=Code.BROKEN_FILE,
+            ) from exc
+
+    def _header(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        wizard, journal = self.wizard, self._journal
+        mine = {"schema": SCHEMA, "wizard": wizard.name, "version": wizard.version}
+        if journal is not None and journal.header is not None:
+            found = {name: journal.header.get(name) for name in mine}
+            if found != mine:
+                raise CalibrationError(
+                    f"{journal.path}: written by {_named(found)}, expected {_named(mine)}",
+                    code=Code.WRONG_JOURNAL,
+                    got=found,
+                    expected=mine,
+                )
+            return journal.header
+        return {
+            **mine,
+            "flow": secrets.token_hex(8),
+            "started_at": datetime.now(UTC).isoformat(),
+            "parameters": _stored(dict(parameters), "the parameters"),
+        }
+
+    @property
+    def state(self) -> State:
+        """Where it stands."""
+        if self._log.state == "asking" and self._run.request is None:
+            return "ended"
+        return self._log.state
+
+    @property
+    def result(self) -> Any:
+        """The wizard's return value; None before its end."""
+        return self._run.result
+
+    @property
+    def step(self) -> Step | None:
+        """The current step; None at the end, and after an abort."""
+        request = self._run.request
+        return None if request is None or self.state != "asking" else request.step
+
+    @property
+    def busy(self) -> bool:
+        """Whether a call is under way."""
+        return self._lock.locked()
+
+    @property
+    def samples(self) -> list[dict[str, Any]]:
+        """The answers and outcomes that count, in order: ``step, answers, outcome, at``."""
+        names = ("step", "answers", "outcome", "at")
+        return [{name: copy.deepcopy(one[name]) for name in names} for one in self._log.entries]
+
+    @property
+    def token(self) -> str:
+        """A word that a call must bring, so that none is done twice: it changes with each entry."""
+        return f"{self.flow}.{len(self._all)}"
+
+    @property
+    def current(self) -> dict[str, Any]:
+        """The view that a front-end shows, JSON-able.
+
+        Returns:
+            ``flow, wizard, token, type, number`` (of the step, from 1)``, step`` (its id)``,
+            title, description, button, notes, preview, schema, defaults, errors`` (a text by input,
+            ``base`` for all else)``, can`` (of ``undo, repeat, abort``)``, result``. ``type`` is
+            ``form`` (with inputs), ``confirm`` (without), ``progress`` (its action is under way),
+            ``result`` or ``abort``.
+        """
+        view: dict[str, Any] = {
+            "flow": self.flow,
+            "wizard": self.wizard.name,
+            "token": self.token,
+            "type": {"ended": "result", "aborted": "abort"}.get(self.state, "confirm"),
+            "number": len(self._log.entries) + 1,
+            "errors": dict(self._errors),
+            "can": self._can(),
+            "result": self.result,
+        }
+        step = self.step
+        if step is None:
+            return view
+        if self._scope is not None:
+            view["type"] = "progress"
+        elif step.inputs:
+            view["type"] = "form"
+        return {
+            **view,
+            "step": step.id,
+            "title": step.title,
+            "description": step.description,
+            "button": step.button,
+            "notes": list(step.notes),
+            "preview": None if step.preview is None else dict(step.preview),
+            "schema": step.schema(),
+            "defaults": self._defaults(step),
+        }
+
+    def _can(self) -> list[str]:
+        if self.state != "asking":
+            return []
+        entries = self._log.entries
+        undo = ["undo"] if entries else []
+        repeat = ["repeat"] if entries and entries[-1].get("acted") else []
+        return [*undo, *repeat, "abort"]
+
+    def _defaults(self, step: Step) -> Answers:
+        undone = self._log.undone
+        if undone is None or undone["step"] != step.id:
+            return step.defaults()
+        return {**step.defaults(), **undone["answers"]}
+
+    async def submit(self, token: str, answers: object = None) -> dict[str, Any]:
+        """Answer the current step.
+
+        Args:
+            token: of the step. The one before with the same answers changes nothing: so a call
+                whose answer was lost can be made again.
+            answers: by the names of inputs; None for none.
+
+        Returns:
+            :attr:`current`: the next step, or the same one with ``errors``.
+
+        Raises:
+            CalibrationError: ``STALE_STEP`` or ``NOT_POSSIBLE``.
+
+        Cancellation: the action is cancelled and the step stays, unless it was taken already.
+        """
+        given = {} if answers is None else answers
+        async with self._lock:
+            if self._is_done("answer", token, given):
+                return self.current
+            request = self._expect(token)
+            with self._shown():
+                values = request.step.checked(self._with_undone(request.step, given))
+                outcome = await self._act(request, values)
+                self._take(self._run, self._entry("answer", request, values, outcome, given))
+            return self.current
+
+    def _with_undone(self, step: Step, given: object) -> object:
+        return {**self._defaults(step), **given} if isinstance(given, Mapping) else given
+
+    async def undo(self, token: str) -> dict[str, Any]:
+        """Go back to the step before; its answers stand there as defaults.
+
+        Arguments, result and errors are those of :meth:`submit`.
+
+        Raises:
+            OSError: the journal cannot be written; nothing is undone.
+
+        Cancellation: nothing is undone.
+        """
+        async with self._lock:
+            if self._is_done("undo", token):
+                return self.current
+            run = self._before("undo", token)
+            self._commit(run, {"event": "undo", "token": token})
+            return self.current
+
+    async def repeat(self, token: str) -> dict[str, Any]:
+        """Do the action of the step before again, with the same answers.
+
+        The new outcome takes the place of the old one. An error leaves the old one and is shown.
+        Arguments, result and errors are those of :meth:`submit`.
+
+        Cancellation: the action is cancelled and the old outcome stays.
+        """
+        async with self._lock:
+            if self._is_done("repeat", token):
+                return self.current
+            run, last = self._before("repeat", token), self._log.entries[-1]
+            request = run.request
+            if request is None or request.action is None:
+                raise self._impossible("repeat")
+            with self._shown():
+                outcome = await self._act(request, last["answers"])
+                self._take(run, self._entry("repeat", request, last["answers"], outcome, None))
+            return self.current
+
+    async def abort(self, token: str) -> dict[str, Any]:
+        """End the sequence without a result; an action under way is cut off.
+
+        What was done stays in the journal. Arguments, result and errors are those of
+        :meth:`submit`.
+
+        Raises:
+            OSError: the journal cannot be written; the sequence goes on.
+
+        Cancellation: the sequence goes on; an action under way is cut off all the same.
+        """
+        if self._scope is not None and token == self.token:
+            self._scope.reschedule(asyncio.get_running_loop().time())
+        async with self._lock:
+            if self._is_done("abort", token):
+                return self.current
+            self._expect(token)
+            self._commit(self._run, {"event": "abort", "token": token})
+            self._run.close()
+            return self.current
+
+    def close(self) -> None:
+        """Free the coroutine and the journal; the sequence can be resumed from it."""
+        self._run.close()
+        if self._journal is not None:
+            self._journal.close()
+
+    def _is_done(self, event: str, token: str, given: object = None) -> bool:
+        last = self._all[-1] if self._all else None
+        return (
+            last is not None
+            and last["token"] == token
+            and last["event"] == event
+            and last.get("given") == (_digest(given) if event == "answer" else None)
+        )
+
+    def _expect(self, token: str) -> PendingStep:
+        request = self._run.request
+        if self.state != "asking" or request is None:
+            raise CalibrationError(
+                f"the sequence is over ({self.state}); expected one that asks",
+                code=Code.NOT_POSSIBLE,
+                got=self.state,
+            )
+        if token != self.token:
+            raise CalibrationError(
+                "the step has changed meanwhile: look at the current one",
+                code=Code.STALE_STEP,
+                got=token,
+                expected=self.token,
+            )
+        return request
+
+    def _before(self, what: str, token: str) -> _ScriptRun:
+        """Return the coroutine as it was before the last step, for what is to be done with it."""
+        self._expect(token)
+        if what not in self._can():
+            raise self._impossible(what)
+        return _ScriptRun(self.wizard, self.parameters, self._log.entries[:-1])
+
+    def _impossible(self, what: str) -> CalibrationError:
+        return CalibrationError(
+            f"{what}: not possible here; expected one of {', '.join(self._can())}",
+            code=Code.NOT_POSSIBLE,
+            got=what,
+        )
+
+    async def _act(self, request: PendingStep, values: Answers) -> Any:
+        if request.action is None:
+            return None
+        seconds = request.step.timeout
+        try:
+            async with asyncio.timeout(seconds) as self._scope:
+                return await request.action(copy.deepcopy(values))
+        except TimeoutError as exc:
+            if self._scope is None or not self._scope.expired():
+                raise
+            raise TimeoutError(f"nothing came within {seconds:g} s") from exc
+        finally:
+            self._scope = None
+
+    def _entry(
+        self, event: str, request: PendingStep, values: Answers, outcome: Any, given: object
+    ) -> dict[str, Any]:
+        entry = {
+            "event": event,
+            "token": self.token,
+            "step": request.step.id,
+            "answers": values,
+            "outcome": outcome,
+            "acted": request.action is not None,
+            "given": _digest(given) if event == "answer" else None,
+        }
+        return _stored(entry, f"step {request.step.id!r}: its outcome")
+
+    def _take(self, run: _ScriptRun, entry: dict[str, Any]) -> None:
+        """Give a run its answer, and keep both where the coroutine took it."""
+        try:
+            run.take(entry)
+            self._commit(run, entry)
+        except BaseException:
+            run.close()
+            if run is self._run:
+                self._run = _ScriptRun(self.wizard, self.parameters, self._log.entries)
+            raise
+
+    def _commit(self, run: _ScriptRun, entry: dict[str, Any]) -> None:
+        entry = {**entry, "at": datetime.now(UTC).isoformat()}
+        if self._journal is not None:
+            entry = self._journal.append(entry)
+        self._all.append(entry)
+        self._log = self._log.then(entry)
+        if run is not self._run:
+            self._run.close()
+            self._run = run
+        self._errors = {}
+
+    @contextlib.contextmanager
+    def _shown(self) -> Iterator[None]:
+        """Turn errors into those of the step."""
+        self._errors = {}
+        try:
+            yield
+        except (SmartCamError, OSError) as exc:
+            errors: Any = {"base": str(exc)}
+            if isinstance(exc, CalibrationError) and exc.code == Code.WRONG_ANSWERS:
+                errors = exc.got
+            self._errors = errors
+
+
+def _named(header: Mapping[str, Any]) -> str:
+    return f"{header['wizard']!r} version {header['version']} ({header['schema']})"
+
+
+def _stored(value: dict[str, Any], what: str) -> dict[str, Any]:
+    """Return a value as it will be read, so that a resumed sequence sees what this one saw."""
+    try:
+        read: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
+    except (TypeError, ValueError) as exc:
+        raise CalibrationError(f"{what} cannot be stored: {exc}", code=Code.NOT_STORABLE) from exc
+    return read
+
+
+def _digest(answers: object) -> str:
+    text = json.dumps(answers, sort_keys=True, separators=(",", ":"), default=repr)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,267 @@
+"""The services of a calibration over one folder: start, go on, export, load, transform.
+
+A front-end needs nothing else: it starts a wizard under a name, shows what it is told and sends
+back what it is given. Whatever it sends, no file outside of the folder is read or written.
+
+Source: thesis 2.2.2, Figures 2.8 to 2.12 (published) for the services.
+"""
+
+from __future__ import annotations
+
+import itertools
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._files.directory import EXPORTS, Folder
+from smartcam.calibration._files.load import of_document
+from smartcam.calibration._files.store import keep_backup, read_document, replace_file
+from smartcam.calibration._plane.calibration import KIND, PlaneCalibration
+from smartcam.calibration.wizards._journal import Journal
+from smartcam.calibration.wizards._sequence import WizardSession
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Header, Localization, Pose, Position, Quaternion
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from smartcam.calibration._files.load import AnyCalibration
+    from smartcam.calibration._files.store import Document
+    from smartcam.calibration.wizards._sequence import Wizard
+
+JOURNALS = 5
+"""Journals of earlier runs that are kept for each name."""
+
+
+MATRIX = ".yaml"
+"""Suffix of the file of a matrix alone."""
+
+
+class CalibrationService:
+    """Calibrations in a folder, and one wizard at a time that makes or checks one.
+
+    Args:
+        folder: where calibrations and journals stand.
+        wizards: the wizards that can be started, by their names; each gets ``name`` among its
+            parameters.
+
+    Attributes:
+        folder: the folder.
+
+    Raises:
+        OSError: the folder cannot be made.
+    """
+
+    def __init__(
+        self, folder: str | os.PathLike[str] | Folder, wizards: Iterable[Wizard] = ()
+    ) -> None:
+        self.folder: Folder = folder if isinstance(folder, Folder) else Folder(folder)
+        self._wizards = {wizard.name: wizard for wizard in wizards}
+        self._session: WizardSession | None = None
+        self._name: str | None = None
+        self._calibration: AnyCalibration | None = None
+        self._numbers = itertools.count(1)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the calibrations in the folder, sorted."""
+        return self.folder.names()
+
+    @property
+    def wizards(self) -> list[str]:
+        """Names of the wizards that can be started."""
+        return list(self._wizards)
+
+    @property
+    def name(self) -> str | None:
+        """Name that the running wizard was started under; None without one."""
+        return self._name
+
+    @property
+    def session(self) -> WizardSession:
+        """The sequence under way, or the one that has ended last.
+
+        Raises:
+            CalibrationError: ``NO_SEQUENCE``.
+        """
+        if self._session is None:
+            raise CalibrationError(
+                "no calibration is under way; expected one to be started",
+                code=Code.NO_SEQUENCE,
+            )
+        return self._session
+
+    def start(
+        self,
+        name: str,
+        wizard: str = KIND,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        fresh: bool = False,
+    ) -> dict[str, Any]:
+        """Start a wizard, or go on with the one of that name that was broken off.
+
+        Args:
+            name: of the calibration.
+            wizard: which one; each has a journal of its own for a name.
+            parameters: for its start; one that is resumed has its own.
+            fresh: begin anew in any case. The journal of the run before is kept beside it.
+
+        Returns:
+            The first step, or the one where it was broken off: :attr:`WizardSession.current`.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``, ``NOT_FOUND`` (the wizard), ``IN_USE``,
+                ``WRONG_JOURNAL``, ``BROKEN_FILE``, ``NOT_POSSIBLE`` while an action is under way.
+            OSError: the journal cannot be opened or written.
+        """
+        path = self.folder.journal(name, "" if wizard == KIND else wizard)
+        if wizard not in self._wizards:
+            raise CalibrationError(
+                f"no wizard is called {wizard!r}; expected one of {', '.join(self._wizards)}",
+                code=Code.NOT_FOUND,
+                got=wizard,
+            )
+        if self._session is not None and self._session.busy:
+            raise CalibrationError(
+                "an action is under way; expected it to end or to be aborted",
+                code=Code.NOT_POSSIBLE,
+            )
+        self.close()
+        given = {**(parameters or {}), "name": name}
+        session = None if fresh else self._opened(path, wizard, given)
+        if session is None or session.state != "asking":
+            if session is not None:
+                session.close()
+            _put_aside(path)
+            session = self._opened(path, wizard, given)
+        self._session, self._name = session, name
+        return self.session.current
+
+    def _opened(self, path: Path, wizard: str, parameters: Mapping[str, Any]) -> WizardSession:
+        journal = Journal(path)
+        try:
+            return WizardSession(self._wizards[wizard], journal, parameters=parameters)
+        except BaseException:
+            journal.close()
+            raise
+
+    def export(self, name: str, target: str, form: str | None = None) -> str:
+        """Copy a calibration to a file of ``exports/``, as a backup or for another program.
+
+        Args:
+            name: of the calibration.
+            target: name of the file. With ``.json`` it is a copy, which :meth:`load` takes; with
+                ``.yaml`` the matrix, which PyYAML and ``cv2.FileStorage`` read, and
+                :func:`~smartcam.calibration.formats.read_matrix`.
+            form: instead of the matrix, the frame of its plane in this format, a key of
+                :data:`~smartcam.calibration.formats.TRANSFORMS`; the scale stands in a comment.
+
+        Returns:
+            The file's path in the folder.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read. ``UNKNOWN_FORMAT``;
+                ``WRONG_KIND``: a matrix is wanted of what is no plane's; ``NOT_SIMILAR``: it has no
+                frame; see :func:`~smartcam.calibration.formats.plane_frame`;
+                ``NOT_WRITTEN``: it cannot be written.
+        """
+        from smartcam.calibration.formats import PlaneMatrix, compose
+        from smartcam.calibration.formats._opencv import compose_matrix
+
+        source = self.folder.find(name)
+        path = self.folder.export(target)
+        document = read_document(source)
+        if form is None and path.suffix == ".json":
+            body = source.read_bytes()
+        elif form is None and path.suffix != MATRIX:
+            raise CalibrationError(
+                f"{path.name}: expected the format to be named, or a file that ends in .json or "
+                f"{MATRIX}",
+                code=Code.UNKNOWN_FORMAT,
+                expected=[".json", MATRIX],
+                got=path.suffix,
+            )
+        else:
+            calibration = PlaneCalibration.from_data(_of_kind(document, KIND, source.name))
+            if form is not None:
+                body = compose(form, calibration, suffix=path.suffix).encode()
+            else:
+                unit = str(document.context.get("camera_unit", "unit"))
+                body = compose_matrix(PlaneMatrix.of(calibration), unit).encode()
+        replace_file(path, body)
+        return f"{EXPORTS}/{path.name}"
+
+    def load(self, name_or_path: str) -> AnyCalibration:
+        """Load a calibration, of a plane or by a sheet, which :meth:`transform` then uses.
+
+        Args:
+            name_or_path: its name; or with a ``/`` the path of an exported one, in the folder.
+
+        Raises:
+            CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read.
+            OSError: it cannot be read.
+        """
+        path = self.folder.find(name_or_path)
+        self._calibration = of_document(read_document(path), path.name)
+        return self._calibration
+
+    def transform(self, x: float, y: float, theta: float = 0.0, frame: str | None = None) -> Pose:
+        """Return the robot's pose for a pose in the camera's plane, by the loaded calibration.
+
+        Args:
+            x: to the right, in the unit of the calibration.
+            y: upwards: of a sheet's calibration, whose pixels count down, -v.
+            theta: counter-clockwise, radians.
+            frame: frame that the pose must come out in; None for the calibration's.
+
+        Raises:
+            CalibrationError: ``NO_CALIBRATION``, ``WRONG_FRAME``, ``OUT_OF_FIELD``.
+        """
+        calibration = self._calibration
+        if calibration is None:
+            raise CalibrationError(
+                "no calibration is loaded; expected one to be loaded first",
+                code=Code.NO_CALIBRATION,
+            )
+        if frame not in {None, calibration.robot_frame}:
+            raise CalibrationError(
+                f"frame {frame!r}: expected {calibration.robot_frame!r}",
+                code=Code.WRONG_FRAME,
+                got=frame,
+                expected=calibration.robot_frame,
+            )
+        header = Header(next(self._numbers), datetime.now(UTC), calibration.camera_frame or "")
+        pose = Pose(header, Position(x, y), Quaternion.from_theta(theta))
+        return calibration.to_robot(Localization("", 1.0, 0, pose)).pose
+
+    def close(self) -> None:
+        """Free the sequence under way; it can be resumed. Does nothing where there is none."""
+        if self._session is not None:
+            self._session.close()
+        self._session = self._name = None
+
+
+def _put_aside(path: Path) -> None:
+    if not path.exists():
+        return
+    try:
+        Journal(path).close()  # nobody else writes it
+    except CalibrationError as exc:
+        if exc.code != Code.BROKEN_FILE:
+            raise
+    keep_backup(path, JOURNALS)
+    path.unlink(missing_ok=True)
+
+
+def _of_kind(document: Document, kind: str, name: str) -> dict[str, Any]:
+    if document.kind != kind:
+        raise CalibrationError(
+            f"{name}: holds {document.kind!r}, expected {kind!r}",
+            code=Code.WRONG_KIND,
+            got=document.kind,
+            expected=kind,
+        )
+    return document.data

@@ -1,0 +1,264 @@
+"""The wizard that calibrates a camera's pixels against a robot, by a picture of a printed sheet.
+
+It asks which target lies there and how long its rulers are, takes a picture and finds the target in
+it; then the robot touches corners of the target, any number, or the origin and the rays A and B. It
+knows no camera and no robot: it is given what takes a picture and, if the robot can be asked, what
+reads its pose.
+
+Source: thesis 3.2.3.2 (published) for the origin that a camera finds in its image.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+import numpy as np
+
+from smartcam.calibration._detection.find import find_target
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._sheet.calibration import KIND, calibrate_sheet, fit_corners
+from smartcam.calibration._sheet.plane import look_at_sheet
+from smartcam.calibration._targets import Charuco
+from smartcam.calibration._views import TargetView
+from smartcam.calibration.wizards._marks import Mark
+from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT
+from smartcam.calibration.wizards._points import (
+    MAX_POINTS,
+    Calibrated,
+    PointSource,
+    about_step,
+    calibrated_plane,
+)
+from smartcam.calibration.wizards._sequence import Wizard, ask
+from smartcam.calibration.wizards._steps import Step, pick
+from smartcam.calibration.wizards._target_drawing import draw_sheet, with_ring
+from smartcam.calibration.wizards._target_steps import ask_target
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration.wizards._pictures import TakePicture
+    from smartcam.calibration.wizards._sequence import StepAnswer
+    from smartcam.calibration.wizards._steps import Answers
+    from smartcam.calibration.wizards._touches import ReadRobot, Touch
+
+_DIAGONALS: Final = ((-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0))
+"""Directions in which the outermost points of a target lie, the origin first."""
+
+
+def sheet_wizard(
+    *,
+    take_picture: TakePicture,
+    save_to: Callable[[str], Path],
+    read_robot: ReadRobot | None = None,
+    suggested: Target | None = None,
+    camera: CameraModel | None = None,
+) -> Wizard:
+    """Return the wizard.
+
+    Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
+    first step ``method`` (corners, rays), ``camera_frame``, ``robot_frame``, ``tool``, ``unit``
+    (mm, m), ``side``, ``touch_sigma`` (mm).
+
+    Its result: as the plane's, and ``seen`` (points of the target in the picture)``, rms_px``
+    (of them about their plane); ``predicted_mm`` is at the points that were seen.
+
+    Args:
+        take_picture: takes a picture.
+        save_to: returns the file for a name.
+        read_robot: reads the robot's pose; None: it is typed.
+        suggested: the target that lies there, as the default of what is asked.
+        camera: the lens, kept with each picture; None: a homography of what is seen.
+
+    Cancellation: a picture under way is given up; what looks for the target in it ends in its
+    thread, and what that finds is dropped.
+    """
+
+    async def script(parameters: Mapping[str, Any]) -> Any:
+        step = about_step(
+            "The camera is fixed and gives positions in pixels. A printed sheet lies flat on the "
+            "plane that the robot works on, and does not move until all is touched. All touches "
+            "are made with one tool, held the same way.",
+            {
+                "corners": "corners of the target, or its dots; 9 over the whole sheet are good",
+                "rays": "the origin and a point on each of the rays A and B",
+            },
+            parameters,
+            typed=read_robot is None,
+        )
+        about = await ask(step)
+        target = await ask_target(suggested)
+        source = _SheetSource(about, read_robot, target)
+        await source.ask_picture(take_picture, camera)
+        return await source.run(str(parameters.get("name", KIND)), save_to)
+
+    return Wizard(name=KIND, version=1, script=script)
+
+
+class _SheetSource(PointSource):
+    """Points of a sheet that is found in a picture."""
+
+    KIND = KIND
+    FIRST = 4
+    POINTS = "corners"
+    ORIGIN = "the origin, the filled point in the picture"
+    MORE = "touch another point"
+    SHOWN: ClassVar[Mapping[str, str]] = {"of": "sheet"}
+    camera_unit = "px"
+
+    def __init__(self, about: StepAnswer, read_robot: ReadRobot | None, target: Target) -> None:
+        super().__init__(about, read_robot)
+        self._target = target
+        self._view: TargetView
+        self._camera: CameraModel | None = None
+        self._svg = ""
+
+    async def ask_picture(self, take_picture: TakePicture, lens: CameraModel | None) -> None:
+        """Ask for the picture, and keep what was found in it."""
+
+        async def look(_answers: Answers) -> dict[str, Any]:
+            image = await take_picture()
+            return await asyncio.to_thread(_found, image, self._target, lens)
+
+        step = Step(
+            id="picture",
+            title="The sheet in the camera's field",
+            description="Lay the sheet flat into the camera's field and fix it. The robot must not "
+            "hide it, and nothing must move until all is touched.",
+            button="Take a picture",
+            timeout=PICTURE_TIMEOUT,
+        )
+        found = (await ask(step, look)).outcome
+        self._view = TargetView.from_data(found["view"], target=self._target)
+        self._camera = None if found["camera"] is None else CameraModel.from_data(found["camera"])
+        self._svg = found["preview"]
+
+    def shown(self, mark: Mark) -> dict[str, Any]:
+        """Return notes on the picture, and the picture with a ring around the point."""
+        view = self._view
+        notes = [f"{len(view.ids)} of {len(self._target.points)} points of the target seen"]
+        if view.margin is not None:
+            notes.append(
+                f"the origin is told from the others by {view.margin:.0f} of 255 grey levels"
+            )
+        svg, seen = self._svg, np.flatnonzero(view.ids == mark.number)
+        if svg and len(seen):
+            svg = with_ring(svg, view.size, view.points[seen[0]])
+        return {"notes": tuple(notes), "preview": {"svg": svg} if svg else None}
+
+    async def ray_origin(self) -> tuple[Mark, float]:
+        return Mark("", 0.0, 0.0, 0.0, number=0), 1.0
+
+    async def add(self) -> None:
+        self.check_count(1, MAX_POINTS, "points")
+        number = len(self.touches) + 1
+        touched = await self._touch_corner(f"touch-{number}", f"Touch point {number}", self._next())
+        self.touches.append(touched)
+
+    async def redo(self, index: int) -> None:
+        number = self.touches[index].mark.number or 0
+        self.touches[index] = await self._touch_corner(
+            "redo", f"Touch point {index + 1} again", number
+        )
+
+    async def _touch_corner(self, step_id: str, title: str, suggested: int) -> Touch:
+        """Ask for the touch of a point of the target, or of another one that is named."""
+        columns, rows = _shape(self._target)
+        row, column = divmod(suggested, columns)
+        step = Step(
+            id=step_id,
+            title=title,
+            description=f"Move the tip of the tool onto point {column + 1} of row {row + 1}, which "
+            "has a ring in the picture, with the tool held as at every touch; or onto another one, "
+            "and say which. The origin is point 1 of row 1, points count along ray A, rows along "
+            "ray B.",
+            inputs=(
+                pick("column", "Point of its row, counted along ray A", columns, column + 1),
+                pick("row", "Row, counted along ray B", rows, row + 1),
+            ),
+            **self.shown(self._mark(column, row)),
+        )
+        return await self.ask_touch(
+            step, lambda answer: self._mark(answer["column"] - 1, answer["row"] - 1)
+        )
+
+    def _mark(self, column: int, row: int) -> Mark:
+        number = row * _shape(self._target)[0] + column
+        x, y, _ = self._target.points[number].tolist()
+        return Mark(f"point {column + 1} of row {row + 1}", x, y, 0.0, number)
+
+    def _next(self) -> int:
+        """Return the number of the point that is to be touched next.
+
+        First the outermost ones that the picture shows, then the farthest from all touched ones.
+        """
+        ids = self._view.ids
+        places = self._target.points[ids, :2]
+        for direction in _DIAGONALS:
+            outermost = int(ids[int(np.argmax(places @ direction))])
+            if outermost not in self._touched():
+                return outermost
+        apart = places[:, None] - self._target.points[self._touched(), :2]
+        nearest = (apart**2).sum(axis=2).min(axis=1).round(12)
+        return int(ids[int(np.argmax(nearest))])
+
+    def _touched(self) -> list[int]:
+        return [one.mark.number or 0 for one in self.touches]
+
+    def fit(self, *, robust: bool) -> PlaneCalibration:
+        return fit_corners(
+            self._target,
+            self._touched(),
+            self.places,
+            touch_sigma=self.sigma,
+            tool_z=self.tool_z,
+            robust=robust,
+            robot_frame=self.about["robot_frame"],
+        )
+
+    def sample(self, touch: Touch) -> dict[str, Any]:
+        mark = touch.mark
+        touched = mark.feature if touch.what == "mark" else touch.what
+        return {"touched": touched, "sheet": [mark.x, mark.y]}
+
+    def outcome(self, plane: PlaneCalibration) -> Calibrated:
+        frame = self.about["camera_frame"] or None
+        found = calibrate_sheet(self._view, plane, camera=self._camera, camera_frame=frame)
+        _, figures, lines = calibrated_plane(plane)
+        seen, predicted = len(self._view.ids), None
+        notes = [*lines, f"{seen} points seen, {found.rms:.2g} px beside their plane"]
+        if plane.touch_sigma is not None:
+            errors = found.predicted_error(self._view.points)
+            predicted = 1e3 * math.sqrt(float((errors**2).mean()))
+            unknown = "" if found.camera else "; what the lens distorts comes on top"
+            notes.append(
+                f"predicted error from pixel to robot {predicted:.3f} mm rms where the target was "
+                f"seen{unknown}"
+            )
+        notes += [f"{one.code}: {one.text}" for one in found.remarks]
+        remarks = [[one.code.value, one.text] for one in found.warnings]
+        more = {"predicted_mm": predicted, "seen": seen, "rms_px": found.rms, "remarks": remarks}
+        return Calibrated(found, figures | more, tuple(notes))
+
+
+def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
+    """Return the view found in a picture, the lens and an SVG, if it is small, JSON-able."""
+    view = find_target(image, target)
+    preview = draw_sheet(image, view, look_at_sheet(view, lens).plane)
+    return {
+        "view": view.to_data(),
+        "camera": None if lens is None else lens.to_data(),
+        "preview": preview if len(preview) <= MAX_PREVIEW else "",
+    }
+
+
+def _shape(target: Target) -> tuple[int, int]:
+    """Return the number of points of a target's row, and the number of rows."""
+    if isinstance(target, Charuco):
+        return target.columns - 1, target.rows - 1
+    return target.columns, target.rows

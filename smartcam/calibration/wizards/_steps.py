@@ -1,0 +1,352 @@
+"""Steps of a sequence: what is shown, and which answers are wanted.
+
+A step is data. Its inputs tell their JSON Schema, and check an answer by the same rules, so a
+front-end needs to know nothing about any wizard.
+
+Source: thesis 2.2.1 and Figure 2.9 (published) for a step's parts and for the three lists of
+numbers, texts and options, which :func:`as_lists` and :func:`from_lists` derive.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+from smartcam.calibration._codes import Code
+from smartcam.exceptions import CalibrationError
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+"""The JSON Schema that steps use."""
+
+Answers = dict[str, Any]
+"""Answers by the names of their inputs."""
+
+_SHOWN = 40
+"""Characters of a wrong answer that its error shows."""
+
+_YES_NO = {"no": False, "yes": True}
+"""A flag in the thesis' lists."""
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
+def _misfit(value: object, expected: str) -> ValueError:
+    return ValueError(f"{_shown(value)}: expected {expected}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Input(ABC):
+    """One answer that a step asks for.
+
+    Attributes:
+        name: of the answer.
+        label: what people read.
+        default: what stands there at first; None: nothing.
+    """
+
+    name: str
+    label: str
+    default: Any = None
+
+    def schema(self) -> dict[str, Any]:
+        """Return its JSON Schema.
+
+        A unit stands in ``x-unit``, options as a ``const`` and a ``title`` each.
+        """
+        return {"title": self.label, **self._schema()}
+
+    def checked(self, value: object) -> Any:
+        """Return an answer as it is used; ValueError: it is none, and what was expected."""
+        return self._checked(value)
+
+    @abstractmethod
+    def _schema(self) -> dict[str, Any]: ...
+
+    @abstractmethod
+    def _checked(self, value: object) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Number(Input):
+    """A number is asked for.
+
+    Attributes:
+        unit: shown behind it; the answer comes in this unit.
+        minimum: smallest one taken.
+        maximum: largest one taken.
+        integer: whether it must be whole.
+        optional: whether there may be none (null).
+    """
+
+    default: float | None = None
+    unit: str = ""
+    minimum: float = -1e9
+    maximum: float = 1e9
+    integer: bool = False
+    optional: bool = False
+
+    def _schema(self) -> dict[str, Any]:
+        kind = "integer" if self.integer else "number"
+        return {
+            "type": [kind, "null"] if self.optional else kind,
+            "minimum": self.minimum,
+            "maximum": self.maximum,
+            **({"x-unit": self.unit} if self.unit else {}),
+        }
+
+    def _checked(self, value: object) -> Any:
+        if value is None and self.optional:
+            return None
+        whole = "a whole number" if self.integer else "a number"
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise _misfit(value, whole)
+        if not self.minimum <= value <= self.maximum:  # NaN is in no range
+            raise _misfit(value, f"{whole} from {self.minimum:g} to {self.maximum:g}")
+        if not self.integer:
+            return float(value)
+        if value != math.floor(value):
+            raise _misfit(value, whole)
+        return int(value)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Text(Input):
+    """A text of one line is asked for.
+
+    Attributes:
+        pattern: a regular expression that all of it must match, in what Python and ECMAScript have
+            in common.
+        expected: what the pattern means, for people.
+        max_length: characters at most.
+    """
+
+    default: str | None = None
+    pattern: str = r"[^\x00-\x1f\x7f]*"
+    expected: str = "text in one line"
+    max_length: int = 200
+
+    def _schema(self) -> dict[str, Any]:
+        # not $, which in Python lets a line's end pass
+        pattern = rf"^(?:{self.pattern})(?![\s\S])"
+        return {"type": "string", "pattern": pattern, "maxLength": self.max_length}
+
+    def _checked(self, value: object) -> Any:
+        if not isinstance(value, str) or not re.fullmatch(self.pattern, value):
+            raise _misfit(value, self.expected)
+        if len(value) > self.max_length:
+            raise ValueError(
+                f"{len(value)} characters: expected {self.expected}, {self.max_length} at most"
+            )
+        return value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Option(Input):
+    """One of some options is asked for; without a default the first one is chosen at first.
+
+    Attributes:
+        options: what people read, by the answer that it stands for.
+    """
+
+    default: str | None = None
+    options: Mapping[str, str]
+
+    def _schema(self) -> dict[str, Any]:
+        rows = [{"const": value, "title": text} for value, text in self.options.items()]
+        return {"type": "string", "oneOf": rows}
+
+    def _checked(self, value: object) -> Any:
+        if not isinstance(value, str) or value not in self.options:
+            raise _misfit(value, f"one of {', '.join(self.options)}")
+        return value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flag(Input):
+    """Yes or no is asked for."""
+
+    default: bool = False
+
+    def _schema(self) -> dict[str, Any]:
+        return {"type": "boolean"}
+
+    def _checked(self, value: object) -> Any:
+        if not isinstance(value, bool):
+            raise _misfit(value, "true or false")
+        return value
+
+
+def pick(name: str, label: str, count: int, default: int) -> Number:
+    """Return an input for one of the numbers from 1 to ``count``."""
+    return Number(name=name, label=label, integer=True, minimum=1, maximum=count, default=default)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """A page of a wizard: texts to show, and inputs to ask for.
+
+    Attributes:
+        id: of the step; the same one may come again.
+        title: one line.
+        description: what to do now.
+        button: what stands on the button that goes on.
+        inputs: what is asked for; none: only that the button is pressed.
+        notes: what came out so far, a line each.
+        preview: JSON-able, for a picture; None for none.
+        timeout: seconds that the action behind the button may take.
+    """
+
+    id: str
+    title: str
+    description: str = ""
+    button: str = "Next"
+    inputs: tuple[Input, ...] = ()
+    notes: tuple[str, ...] = ()
+    preview: Mapping[str, Any] | None = field(default=None, compare=False)
+    timeout: float = 30.0
+
+    def schema(self) -> dict[str, Any]:
+        """Return the JSON Schema (2020-12) of its answers."""
+        return {
+            "$schema": DIALECT,
+            "type": "object",
+            "properties": {one.name: one.schema() for one in self.inputs},
+            "required": [one.name for one in self.inputs if one.name not in self.defaults()],
+            "additionalProperties": False,
+        }
+
+    def defaults(self) -> Answers:
+        """Return the default answers by their inputs' names; inputs without one are left out."""
+        values: Answers = {}
+        for one in self.inputs:
+            value = one.default
+            if value is None and isinstance(one, Option):
+                value = next(iter(one.options))
+            if value is not None or (isinstance(one, Number) and one.optional):
+                values[one.name] = value
+        return values
+
+    def with_defaults(self, parameters: Mapping[str, Any]) -> Step:
+        """Return the step with the parameters of its inputs' names as their defaults.
+
+        Raises:
+            CalibrationError: WRONG_ANSWERS: a parameter is no answer.
+        """
+        return replace(self, inputs=tuple(_with_default(one, parameters) for one in self.inputs))
+
+    def checked(self, answers: object) -> Answers:
+        """Return answers as they are used; a default stands for one that is missing.
+
+        Raises:
+            CalibrationError: ``WRONG_ANSWERS``; ``got`` has a text for each wrong one, under
+                ``base`` what belongs to no input.
+        """
+        if not isinstance(answers, Mapping):
+            raise _wrong({"base": f"{_shown(answers)}: expected answers by the names of inputs"})
+        given = {**self.defaults(), **cast("Mapping[str, Any]", answers)}
+        errors: dict[str, str] = {}
+        values: Answers = {}
+        for one in self.inputs:
+            try:
+                values[one.name] = one.checked(given.pop(one.name))
+            except KeyError:
+                errors[one.name] = "no answer"
+            except ValueError as exc:
+                errors[one.name] = str(exc)
+        if given:
+            known = ", ".join(one.name for one in self.inputs) or "nothing"
+            errors["base"] = f"{_shown(next(iter(given)))} is not asked for, but {known}"
+        if errors:
+            raise _wrong(errors)
+        return values
+
+
+def _with_default(one: Input, parameters: Mapping[str, Any]) -> Input:
+    value = parameters.get(one.name)
+    if value is None:
+        return one
+    try:
+        return replace(one, default=one.checked(value))
+    except ValueError as exc:
+        raise CalibrationError(
+            f"parameter {one.name}: {exc}", code=Code.WRONG_ANSWERS, got={one.name: str(exc)}
+        ) from exc
+
+
+def _wrong(errors: dict[str, str]) -> CalibrationError:
+    text = "; ".join(text if name == "base" else f"{name}: {text}" for name, text in errors.items())
+    return CalibrationError(text, code=Code.WRONG_ANSWERS, got=errors)
+
+
+# ---------------------------------------------------------------------- the thesis' lists
+
+
+def as_lists(step: Step) -> dict[str, list[Any]]:
+    """Return a step's inputs as the thesis' six lists.
+
+    Returns:
+        ``descriptions_for_needed_values``, ``default_needed_values`` and the same for ``strings``
+        and ``options``. An option is one text, ``"DEFAULT OPT1 OPT2 ..."``; a flag is an option of
+        ``no`` and ``yes``; a number without a default has 0.0.
+
+    Source: thesis Figure 2.9 (published).
+    """
+    lists: dict[str, list[Any]] = {}
+    for kind in ("values", "strings", "options"):
+        lists[f"descriptions_for_needed_{kind}"] = []
+        lists[f"default_needed_{kind}"] = []
+    for one in step.inputs:
+        kind, default = _as_listed(one, step.defaults().get(one.name))
+        unit = f" [{one.unit}]" if isinstance(one, Number) and one.unit else ""
+        lists[f"descriptions_for_needed_{kind}"].append(one.label + unit)
+        lists[f"default_needed_{kind}"].append(default)
+    return lists
+
+
+def _as_listed(one: Input, default: Any) -> tuple[str, Any]:
+    match one:
+        case Number():
+            return "values", 0.0 if default is None else float(default)
+        case Text():
+            return "strings", default or ""
+        case Option():
+            return "options", " ".join([str(default), *one.options])
+        case _:
+            return "options", " ".join(["yes" if default else "no", *_YES_NO])
+
+
+def from_lists(
+    step: Step,
+    values: Sequence[float] = (),
+    texts: Sequence[str] = (),
+    options: Sequence[str] = (),
+) -> Answers:
+    """Return the answers that came as the thesis' three lists, to be checked by the step.
+
+    Raises:
+        CalibrationError: ``WRONG_ANSWERS``, a list is too short or too long.
+    """
+    given: dict[str, list[Any]] = {
+        "values": list(values),
+        "strings": list(texts),
+        "options": list(options),
+    }
+    wanted = as_lists(step)
+    for kind, row in given.items():
+        count = len(wanted[f"default_needed_{kind}"])
+        if len(row) != count:
+            raise _wrong({"base": f"{len(row)} {kind}: expected {count}"})
+    answers: Answers = {}
+    for one in step.inputs:
+        value = given[_as_listed(one, None)[0]].pop(0)
+        if isinstance(one, Flag):
+            value = _YES_NO.get(value, value)
+        answers[one.name] = value
+    return answers

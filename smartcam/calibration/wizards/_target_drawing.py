@@ -1,0 +1,266 @@
+"""A picture of a step that looks at a target, as SVG: what was seen, what is still missing.
+
+The camera's picture lies under it, grey and made smaller: a page loads it at every step.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from html import escape
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._detection.image import grey_image
+from smartcam.calibration._geometry.rotations import as_points
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._sheet.plane import SheetPlane
+    from smartcam.calibration._views import TargetView
+
+MAX_SIDE: Final = 640
+"""Width and height at most of the camera's picture in the preview, pixels."""
+
+CELLS: Final = (6, 8)
+"""Rows and columns of an image's cells, which the views of a calibration are to cover."""
+
+WIDTH: Final = 900.0
+BORDER, HEAD, FOOT = 20.0, 40.0, 60.0
+"""Pixels of the preview: its picture's width; beside, above and below it."""
+
+LONGEST: Final = 0.05
+"""Length of the longest residual as it is drawn, about; parts of the picture's width."""
+
+END: Final = "</svg>"
+
+STYLE: Final = """\
+text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px }
+.covered { fill: #2e8b57; fill-opacity: 0.25 } .point { fill: none; stroke: #1f5fbf; \
+stroke-width: 1.5 }
+.origin { fill: #1f5fbf } .residual { stroke: #c0392b; stroke-width: 1.5 }
+.x { stroke: #c0392b; stroke-width: 3 } .y { stroke: #2e8b57; stroke-width: 3 }
+.z { stroke: #1f5fbf; stroke-width: 3 }
+.name { fill: #fff; stroke: #333; stroke-width: 3; paint-order: stroke }
+.suggested { fill: none; stroke: #e67e22; stroke-width: 3; stroke-dasharray: 12 8 }"""
+
+
+def cell_counts(views: Sequence[TargetView]) -> NDArray[np.intp]:
+    """Count the points of one camera's views in each cell of its image, ``CELLS``."""
+    counts = np.zeros(CELLS, dtype=np.intp)
+    for view in views:
+        # a pixel's middle is a whole number: the image begins half a pixel before the first
+        part = (view.points + 0.5) / view.size
+        column, row = np.floor(part * CELLS[::-1]).astype(np.intp).T
+        inside = (row >= 0) & (row < CELLS[0]) & (column >= 0) & (column < CELLS[1])
+        np.add.at(counts, (row[inside], column[inside]), 1)
+    return counts
+
+
+def draw(
+    image: Any,
+    *,
+    view: TargetView | None = None,
+    earlier: Sequence[TargetView] = (),
+    predicted: ArrayLike | None = None,
+    axes: ArrayLike | None = None,
+    suggested: ArrayLike | None = None,
+    title: str = "",
+) -> str:
+    """Return a preview.
+
+    Blue circles are the points that were found, the filled one is the target's origin. Green cells
+    are those in which some view has points. From each point a red line goes towards where the
+    calibration expects it, larger by a factor that the preview names. Thick lines are the target's
+    x (red), y (green) and z (blue); an orange outline is where the next view would tell most.
+
+    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red. ``view``: what was found
+    in it; None: nothing. ``earlier``: the views before. ``predicted`` (N, 2): where a calibration
+    has the points of ``view``, pixels; left out without one. ``axes`` (4, 2): the target's origin
+    and the ends of its x, y and z, pixels. ``suggested`` (M, 2): outline of the target in the view
+    that is wanted next, pixels. ``title``: a line on top.
+
+    The SVG document has a size of its own and no parts elsewhere; lines end with a line feed.
+    Raises SHAPE: no image; a view of another size; arrays of other shapes; NOT_FINITE.
+    """
+    grey = grey_image(image)
+    if view is not None and view.size != grey.size:
+        raise CalibrationError(
+            f"preview: expected a view of an image of {grey.size[0]} x {grey.size[1]} pixels, "
+            f"got one of {view.size[0]} x {view.size[1]}",
+            code=Code.SHAPE,
+            expected=grey.size,
+            got=view.size,
+        )
+    canvas = _Canvas(*grey.size)
+    width, height = WIDTH + 2 * BORDER, canvas.height + HEAD + FOOT
+    counts = cell_counts([*earlier, view] if view is not None else earlier)
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
+        f'viewBox="0 0 {width:.0f} {height:.0f}">',
+        f"<style>{STYLE}</style>",
+        f'<rect width="{width:.0f}" height="{height:.0f}" fill="#fff"/>',
+        f'<image x="{BORDER:.0f}" y="{HEAD:.0f}" width="{WIDTH:.0f}" height="{canvas.height:.2f}" '
+        f'href="data:image/png;base64,{_png(grey.bytes)}"/>',
+        *canvas.covered(counts),
+    ]
+    texts = ["no target found" if view is None else _found(view), _seen(counts, earlier, view)]
+    if suggested is not None:
+        lines.append(canvas.outline(as_points(suggested, 2, "suggested outline")))
+    if view is not None and predicted is not None:
+        residuals, text = canvas.residuals(view, _shaped(predicted, len(view.points)))
+        lines += residuals
+        texts.append(text)
+    if view is not None:
+        lines += canvas.points(view)
+    if axes is not None:
+        lines += canvas.axes(_shaped(axes, 4))
+    if title:
+        lines.append(_text((BORDER, 26), title, "title"))
+    lines.append(_text((BORDER, HEAD + canvas.height + 24), "; ".join(texts)))
+    return "\n".join([*lines, END]) + "\n"
+
+
+def draw_sheet(image: Any, view: TargetView, plane: SheetPlane) -> str:
+    """Return a picture with the target's points and the directions of the rays A and B, as SVG.
+
+    ``plane``: from the view's pixels to the sheet. Raises as :func:`draw`.
+    """
+    reach = view.target.points.max(axis=0)
+    rays = plane.in_image([[0.0, 0.0], [reach[0], 0.0], [0.0, reach[1]]])
+    origin, *ends = _Canvas(*view.size).place(rays)
+    parts: list[str] = []
+    for (u, v), name, kind in zip(ends, "AB", "xy", strict=True):
+        if np.isfinite([*origin, u, v]).all():
+            place = f'x="{u + 8:.2f}" y="{v - 8:.2f}"'
+            parts += [
+                _line(origin, (u, v), kind),
+                f'<text {place} class="name" style="font-size:26px">{name}</text>',
+            ]
+    return _with(draw(image, view=view, title="The sheet, its origin and rays"), parts)
+
+
+def with_ring(svg: str, size: tuple[int, int], pixel: Array) -> str:
+    """Return a picture of :func:`draw_sheet` with a ring around a pixel (2,), v down.
+
+    ``size``: width and height of the camera's image, pixels.
+    """
+    x, y = _Canvas(*size).place(pixel)
+    return _with(svg, [f'<circle cx="{x:.2f}" cy="{y:.2f}" r="24" class="suggested"/>'])
+
+
+def _with(svg: str, parts: Sequence[str]) -> str:
+    head, _, tail = svg.rpartition(END)
+    return "\n".join([head.rstrip("\n"), *parts, END]) + tail
+
+
+def _found(view: TargetView) -> str:
+    return f"{len(view.ids)} of {len(view.target.points)} points"
+
+
+def _seen(counts: NDArray[np.intp], earlier: Sequence[TargetView], view: TargetView | None) -> str:
+    views = len(earlier) + (view is not None)
+    plural = "" if views == 1 else "s"
+    return f"{np.count_nonzero(counts)} of {counts.size} cells seen by {views} view{plural}"
+
+
+def _shaped(given: ArrayLike, count: int) -> Array:
+    points = as_points(given, 2, "preview")
+    if len(points) != count:
+        raise CalibrationError(
+            f"preview: expected {count} points, got {len(points)}",
+            code=Code.SHAPE,
+            expected=count,
+            got=len(points),
+        )
+    return points
+
+
+def _png(image: NDArray[np.uint8]) -> str:
+    cv2 = load("cv2")
+    height, width = image.shape
+    factor = MAX_SIDE / max(width, height)
+    if factor < 1:
+        size = (max(round(width * factor), 1), max(round(height * factor), 1))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    _, encoded = cv2.imencode(".png", image)
+    return base64.b64encode(encoded.tobytes()).decode()
+
+
+class _Canvas:
+    """Where an image's pixels lie in the preview."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.zoom = WIDTH / width
+        self.height = height * self.zoom
+
+    def place(self, pixels: Array) -> Array:
+        """Return the preview's coordinates of pixels (..., 2)."""
+        places: Array = (pixels + 0.5) * self.zoom + [BORDER, HEAD]
+        return places
+
+    def covered(self, counts: NDArray[np.intp]) -> Iterator[str]:
+        rows, columns = counts.shape
+        wide, high = WIDTH / columns, self.height / rows
+        for row, column in np.argwhere(counts).tolist():
+            yield (
+                f'<rect x="{BORDER + column * wide:.2f}" y="{HEAD + row * high:.2f}" '
+                f'width="{wide:.2f}" height="{high:.2f}" class="covered"/>'
+            )
+
+    def points(self, view: TargetView) -> Iterator[str]:
+        for number, (x, y) in zip(view.ids.tolist(), self.place(view.points), strict=True):
+            kind = "point" if number else "point origin"
+            yield f'<circle cx="{x:.2f}" cy="{y:.2f}" r="5" class="{kind}"/>'
+
+    def residuals(self, view: TargetView, predicted: Array) -> tuple[list[str], str]:
+        """Return the lines, and what the legend says of them."""
+        apart = predicted - view.points
+        lengths = np.linalg.norm(apart, axis=1)
+        larger = _enlargement(float(lengths.max(initial=0.0)) * self.zoom)
+        ends = self.place(view.points + larger * apart)
+        lines = [
+            _line(start, end, "residual")
+            for start, end in zip(self.place(view.points), ends, strict=True)
+        ]
+        rms = math.sqrt(float(np.mean(lengths**2))) if len(lengths) else 0.0
+        return lines, f"residuals (red) {larger:g} times larger than they are, {rms:.3f} px rms"
+
+    def axes(self, axes: Array) -> Iterator[str]:
+        origin, *ends = self.place(axes)
+        for end, name in zip(ends, "xyz", strict=True):
+            yield _line(origin, end, name)
+            yield _text((end[0] + 6, end[1] + 4), name, "name")
+
+    def outline(self, corners: Array) -> str:
+        text = " ".join(f"{x:.2f},{y:.2f}" for x, y in self.place(corners))
+        return f'<polygon points="{text}" class="suggested"/>'
+
+
+def _enlargement(longest: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, by which the longest residual becomes visible."""
+    if not longest > 1e-6:
+        return 1.0
+    wanted = LONGEST * WIDTH / longest
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
+
+
+def _line(start: Sequence[float] | Array, end: Sequence[float] | Array, kind: str) -> str:
+    return (
+        f'<line x1="{start[0]:.2f}" y1="{start[1]:.2f}" x2="{end[0]:.2f}" y2="{end[1]:.2f}" '
+        f'class="{kind}"/>'
+    )
+
+
+def _text(place: tuple[float, float], text: str, kind: str = "") -> str:
+    of_kind = f' class="{kind}"' if kind else ""
+    return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}>{escape(text)}</text>'

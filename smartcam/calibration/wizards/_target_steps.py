@@ -1,0 +1,129 @@
+"""Steps that ask which target is on a sheet, and how long its rulers came out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._printing.page_layout import RULER
+from smartcam.calibration._printing.sheets import scaled
+from smartcam.calibration._targets import target_from_data, target_to_data
+from smartcam.calibration.wizards._sequence import ask
+from smartcam.calibration.wizards._steps import Flag, Number, Option, Step, Text
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration.wizards._steps import Input
+
+_COUNTS: Final = (
+    Number(name="columns", label="Columns", integer=True, minimum=3, maximum=1000),
+    Number(name="rows", label="Rows", integer=True, minimum=3, maximum=1000),
+)
+
+
+def _length(name: str, label: str, *, optional: bool = False) -> Number:
+    return Number(
+        name=name, label=label, unit="mm", minimum=0.1, maximum=10_000.0, optional=optional
+    )
+
+
+_INPUTS: Final[Mapping[str, tuple[Input, ...]]] = {
+    "checkerboard": (
+        *(replace(one, label=f"{one.label} of inner corners") for one in _COUNTS),
+        _length("square", "Side of a square"),
+        Flag(name="origin_mark", label="A black dot marks the origin", default=True),
+    ),
+    "charuco": (
+        *(replace(one, label=f"{one.label} of squares") for one in _COUNTS),
+        _length("square", "Side of a square"),
+        _length("marker", "Side of a marker"),
+        Text(name="dictionary", label="Dictionary of the markers", default="DICT_5X5_250"),
+        Flag(name="legacy_pattern", label="Printed by an OpenCV before 4.6"),
+    ),
+    "circles": (
+        *(replace(one, label=f"{one.label} of dots") for one in _COUNTS),
+        _length("spacing", "Distance of two dots of a row"),
+        _length("diameter", "Diameter of a dot"),
+        Flag(name="asymmetric", label="Every other row is shifted"),
+        _length("origin_diameter", "Diameter of the dot at the origin, if larger", optional=True),
+    ),
+}
+"""Inputs for each kind of target; names are its attributes', lengths in mm."""
+
+
+def ruler(name: str, along: str = "") -> Number:
+    """Return an input for the length of a printed ruler, mm."""
+    return Number(
+        name=name,
+        label=f"Length of the printed ruler{along}, which should be {RULER:g} mm",
+        unit="mm",
+        default=RULER,
+        minimum=0.5 * RULER,
+        maximum=2.0 * RULER,
+    )
+
+
+async def ask_target(suggested: Target | None = None) -> Target:
+    """Ask what is on the sheet, and how large it was printed: lengths are those on paper.
+
+    Refused as a step shows it: what is no description of a target, or rulers that
+    :func:`~smartcam.calibration.scaled` refuses.
+    """
+    kinds = Option(
+        name="kind",
+        label="What is printed on the sheet",
+        options={
+            "described": "what the description says",
+            "checkerboard": "a checkerboard",
+            "charuco": "a ChArUco board: markers in the white squares",
+            "circles": "dots in rows and columns",
+        },
+        default="checkerboard" if suggested is None else "described",
+    )
+    description = Text(
+        name="description",
+        label="Description, as smartcam sheet --describe writes it",
+        default="" if suggested is None else json.dumps(target_to_data(suggested)),
+        max_length=1000,
+    )
+    step = Step(id="sheet", title="Which sheet lies there?", inputs=(kinds, description))
+    answer = await ask(step)
+    if answer["kind"] == "described":
+        target = _described(answer["description"])
+    else:
+        kind = answer["kind"]
+        step = Step(id="target", title="What is on it", inputs=_INPUTS[kind])
+        given = await ask(step)
+        lengths = {one.name for one in _INPUTS[kind] if isinstance(one, Number) and one.unit}
+        values = {
+            name: 1e-3 * value if name in lengths and value is not None else value
+            for name, value in given.items()
+        }
+        target = target_from_data({"kind": kind, **values})
+    step = Step(
+        id="rulers",
+        title="Was the sheet printed true to size?",
+        description=f"Printers scale. Measure both rulers; leave {RULER:g} mm where the lengths "
+        "that were given are already those of the paper.",
+        inputs=tuple(ruler(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
+    )
+    measured = await ask(step)
+    return scaled(target, (measured["ruler_x"], measured["ruler_y"]))
+
+
+def _described(text: str) -> Target:
+    try:
+        data: object = json.loads(text)
+    except (ValueError, RecursionError):
+        data = None
+    if not isinstance(data, dict):
+        wrong = "expected the description of a target, such as "
+        wrong += '{"kind": "checkerboard", "columns": 9, "rows": 6, "square": 0.025}'
+        raise CalibrationError(wrong, code=Code.WRONG_ANSWERS, got={"description": wrong})
+    found: dict[str, Any] = data
+    return target_from_data(found)

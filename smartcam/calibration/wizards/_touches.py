@@ -1,0 +1,186 @@
+"""Touches with a robot's tip: how a wizard asks for them."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration.wizards._marks import Mark, choose
+from smartcam.calibration.wizards._sequence import ask
+from smartcam.calibration.wizards._steps import Number, Option, Step
+from smartcam.calibration.wizards._touch_previews import before
+from smartcam.exceptions import CalibrationError
+from smartcam.models import Pose, Quaternion
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration.wizards._sequence import StepAnswer
+    from smartcam.calibration.wizards._steps import Answers
+
+ReadRobot = Callable[[], Awaitable[Pose]]
+"""Returns where the robot's tip is, in the robot's base, metres; its z points out of the tool."""
+
+Vector = tuple[float, float, float]
+
+UNITS: Mapping[str, float] = {"mm": 1e-3, "m": 1.0}
+"""Metres, by the units that coordinates of the robot may be typed in."""
+
+UNIT = Option(
+    name="unit",
+    label="Unit of the robot's coordinates",
+    options={"mm": "millimetres", "m": "metres"},
+)
+"""Asks for one of :data:`UNITS`."""
+
+SIGMA = Number(
+    name="touch_sigma",
+    label="How well a touch repeats, standard deviation; empty if not known",
+    unit="mm",
+    minimum=1e-4,
+    maximum=100.0,
+    optional=True,
+)
+"""Asks for a touch's sigma."""
+
+SIDES: Mapping[str, Vector | None] = {
+    "-z": (0.0, 0.0, -1.0),
+    "+z": (0.0, 0.0, 1.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "+x": (1.0, 0.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "+y": (0.0, 1.0, 0.0),
+    "unknown": None,
+}
+"""Directions of a tool's axis in the robot's base, by what people choose."""
+
+SIDE = Option(
+    name="side",
+    label="Where the tool points when it touches",
+    options={name: f"{name} of the robot" for name in SIDES}
+    | {"-z": "down: -z of the robot", "unknown": "not known"},
+)
+"""Asks for one of :data:`SIDES`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """A touch."""
+
+    mark: Mark  # what the camera sees of it; of a ray its origin
+    robot: Vector  # where the tip was, in the robot's base, metres
+    tool_z: Vector | None  # where the tool pointed; None if that is not known
+    what: str = "mark"  # ``mark``, or the letter of a point of the rays
+
+
+@dataclass(eq=False)
+class Touches:
+    """Touches of one run of a wizard; holds nothing but what the answers gave.
+
+    Attributes:
+        about: answers of the first step: ``touch_sigma``, and where the robot's pose is typed
+            ``unit`` and ``side``, if they were asked for.
+        marks: those of the last picture.
+    """
+
+    about: StepAnswer
+    _read_robot: ReadRobot | None  # None: the robot's pose is typed
+
+    def __post_init__(self) -> None:
+        self.touches: list[Touch] = []
+        self.marks: Sequence[Mark] = ()
+
+    @property
+    def places(self) -> list[Vector]:
+        """Where the tip was at each touch, metres."""
+        return [one.robot for one in self.touches]
+
+    @property
+    def tool_z(self) -> Array | None:
+        """Mean of where the tool pointed; None if that is not known."""
+        axes = [one.tool_z for one in self.touches if one.tool_z is not None]
+        return np.mean(axes, axis=0) if axes else None
+
+    @property
+    def sigma(self) -> float | None:
+        """Standard deviation of a touch, metres; None if that is not known."""
+        sigma = self.about["touch_sigma"]
+        return None if sigma is None else 1e-3 * sigma
+
+    def check_count(self, more: int, most: int, noun: str) -> None:
+        """Raise (SHAPE) where some more touches are too many."""
+        count = len(self.touches) + more
+        if count > most:
+            raise CalibrationError(
+                f"{count} {noun}, expected {most} at most",
+                code=Code.SHAPE,
+                got=count,
+                expected=most,
+            )
+
+    async def add_marks(self, rows: Sequence[Mapping[str, Any]], most: int, noun: str) -> None:
+        """Ask which marks of a picture are touched, and for their touches.
+
+        ``rows``: of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.picture`. ``most``:
+        touches of a run (SHAPE: more). ``noun``: what they are called.
+        """
+        marks = await choose([Mark.of(row) for row in rows])
+        self.check_count(len(marks), most, noun)
+        self.marks = marks
+        for number, mark in enumerate(marks, 1):
+            title = f"Touch mark {number} of {len(marks)}"
+            self.touches.append(await self.touch(f"touch-{number}", title, str(mark), mark))
+
+    async def touch(
+        self, step_id: str, title: str, place: str, mark: Mark, what: str = "mark"
+    ) -> Touch:
+        """Ask for a touch.
+
+        ``place``: what is to be touched, for people. ``mark``: what the camera sees of it.
+        ``what``: as of :class:`Touch`.
+        """
+        description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"
+        step = Step(id=step_id, title=title, description=f"{description}.", **self.shown(mark))
+        return await self.ask_touch(step, lambda _: mark, what)
+
+    def shown(self, mark: Mark) -> dict[str, Any]:
+        """Return the ``notes`` and the ``preview`` of a step that asks for a touch."""
+        return {"preview": before(self.touches, self.marks, mark)}
+
+    async def ask_touch(
+        self, step: Step, mark_of: Callable[[StepAnswer], Mark], what: str = "mark"
+    ) -> Touch:
+        """Ask for a touch by a step that says of what; its answer tells the mark.
+
+        Where the robot is not read, ``x, y, z`` are asked for behind the step's inputs.
+        """
+        if self._read_robot is not None:
+            answer = await ask(
+                replace(step, button="It is there"), partial(_read, self._read_robot)
+            )
+            x, y, z = answer.outcome["position"]
+            axis = _axis_z(Quaternion(*answer.outcome["orientation"]))
+            return Touch(mark_of(answer), (x, y, z), axis, what)
+        unit = self.about.get("unit", "m")
+        place = tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz")
+        text = f"{step.description} Then take its position from the robot, in its base."
+        answer = await ask(replace(step, description=text, inputs=(*step.inputs, *place)))
+        x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
+        return Touch(mark_of(answer), (x, y, z), SIDES[self.about.get("side", "unknown")], what)
+
+
+async def _read(read_robot: ReadRobot, _answers: Answers) -> dict[str, Any]:
+    pose = await read_robot()
+    return {"position": list(pose.position), "orientation": list(pose.orientation)}
+
+
+def _axis_z(q: Quaternion) -> Vector:
+    """Return the direction of a turned z axis."""
+    x, y, z, w = q
+    return 2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z

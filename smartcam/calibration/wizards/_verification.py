@@ -1,0 +1,341 @@
+"""The wizard that asks whether a calibration is still true: touch some marks again, and compare.
+
+A camera that was knocked sees everything shifted; a few touches tell. What they say is compared
+with what the touches' noise explains, that of now and that of the calibration.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._files.store import read_document
+from smartcam.calibration._optional_imports import load
+from smartcam.calibration._plane.calibration import STALE_LEVEL, PlaneCalibration
+from smartcam.calibration.wizards._journal import Journal
+from smartcam.calibration.wizards._marks import MarkCamera
+from smartcam.calibration.wizards._sequence import Wizard, ask
+from smartcam.calibration.wizards._steps import Option, Step
+from smartcam.calibration.wizards._touch_previews import compared
+from smartcam.calibration.wizards._touches import SIGMA, UNIT, Touches
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._plane.calibration import Drift
+    from smartcam.calibration.wizards._marks import Localize
+    from smartcam.calibration.wizards._sequence import StepAnswer
+    from smartcam.calibration.wizards._steps import Answers
+    from smartcam.calibration.wizards._touches import ReadRobot
+
+WIZARD = "drift"
+"""Name of the wizard."""
+
+CHECKS = "smartcam.checks/1"
+"""Name of the form of a file of checks, in its first line."""
+
+KNOCK = 0.001
+"""Shift of a camera that was knocked, metres: a check should notice it."""
+
+NOTICED = 0.95
+"""Part of all checks that should notice it."""
+
+MAX_TOUCHES = 100
+"""Touches of a check; what more of them would tell is less than what the calibration knows."""
+
+
+def drift_wizard(
+    *,
+    localize: Localize,
+    find: Callable[[str], Path],
+    record_to: Callable[[str], Path],
+    read_robot: ReadRobot | None = None,
+    y_down: bool | None = None,
+) -> Wizard:
+    """Return the wizard.
+
+    Its parameters: ``name`` (of the calibration), ``feature`` (only marks of this name count), and
+    as defaults of the first step ``unit`` (mm, m) and ``touch_sigma`` (mm).
+
+    Its result: ``name, stale, touches, offsets_mm`` (the length of each)``, rms_mm, expected_mm,
+    z, chance, needed, needed_at`` (at the best mark, see :func:`touches_needed`)``, file``.
+
+    Each check that is finished is a line of a file, whose first line tells its form: there a drift
+    is seen that is too slow for any single check. The calibration's own file stays as it is. Of
+    checks it takes as many as a journal takes entries.
+
+    Args:
+        localize: takes a picture.
+        find: returns the file of a calibration by its name, or raises CalibrationError.
+        record_to: returns the file of its checks.
+        read_robot: reads the robot's pose; None: it is typed.
+        y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
+            known. A calibration that was made the other way is refused.
+    """
+
+    async def script(parameters: Mapping[str, Any]) -> Any:
+        name = str(parameters.get("name", "plane"))
+        feature = str(parameters.get("feature") or "")
+        camera = MarkCamera(localize=localize, feature=feature, y_down=y_down)
+        step = _about(name, typed=read_robot is None).with_defaults(parameters)
+        about = await ask(step, partial(_loaded, find, name, camera))
+        return await _DriftCheck(about, read_robot, camera, name, record_to).run()
+
+    return Wizard(name=WIZARD, version=1, script=script)
+
+
+def touches_needed(
+    calibration: PlaneCalibration,
+    camera_point: ArrayLike,
+    *,
+    knock: float = KNOCK,
+    noticed: float = NOTICED,
+) -> int | None:
+    """Return the number of touches of one mark that it takes to notice a knock.
+
+    None where none up to :data:`MAX_TOUCHES` does: the calibration itself is known too badly there.
+    ``camera_point`` (2,): where the camera sees the mark. ``knock``: how far the camera's plane is
+    shifted, in the direction that is the hardest to notice, metres. ``noticed``: in how many of all
+    checks it must be called stale, 0 to 1. Raises SHAPE or NOT_FINITE; UNVERIFIED: nothing tells
+    the touches' sigma; MissingExtraError: SciPy is not installed.
+    """
+    known = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
+    sigma = calibration.touch_sigma or 0.0
+    freedom = None if calibration.sigma_given else calibration.freedom
+    for count in range(1, MAX_TOUCHES + 1):
+        # the mean of the touches, minus where the calibration says that they are
+        variance = known + sigma**2 / count
+        shift = min(knock**2 / max(variance, knock**2 / _PLAIN), _PLAIN)
+        if _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift) >= noticed:
+            return count
+    return None
+
+
+_PLAIN = 1e4
+"""A shift's square over its variance from which on it is noticed in any case."""
+
+
+def _power(level: float, freedom: int | None, shift: float) -> float:
+    """Return the probability that a test at a level calls a shift's three coordinates stale."""
+    special = load("scipy.special")
+    if freedom is None:
+        return 1.0 - float(special.chndtr(special.chdtri(3, level), 3, shift))
+    limit = special.fdtri(3, freedom, 1.0 - level)
+    return 1.0 - float(special.ncfdtr(3, freedom, shift, limit))
+
+
+def _about(name: str, *, typed: bool) -> Step:
+    sigma = replace(
+        SIGMA, label="How well a touch repeats, standard deviation; empty: as the calibration says"
+    )
+    return Step(
+        id="about",
+        title=f"Is {name} still true?",
+        description="Touch a mark or several again, with the same tool held the same way. Offsets "
+        "are compared with what the touches' noise explains, that of now and that of the "
+        "calibration.",
+        inputs=(UNIT, sigma) if typed else (sigma,),
+    )
+
+
+async def _loaded(
+    find: Callable[[str], Path], name: str, camera: MarkCamera, answers: Answers
+) -> dict[str, Any]:
+    """Read the file of a calibration, so that a check that is resumed has the same."""
+    file = find(name)
+    calibration = PlaneCalibration.load(file)
+    camera.check_y_down(calibration.y_down, f"{name} was made")
+    if calibration.touch_sigma is None and answers["touch_sigma"] is None:
+        raise CalibrationError(
+            f"{name} does not tell how well a touch repeats: expected the touches' sigma",
+            code=Code.WRONG_ANSWERS,
+            got={"touch_sigma": "no answer, and the calibration has none: expected one"},
+        )
+    document = read_document(file)
+    return {
+        "data": calibration.to_data(),
+        "written_at": document.written_at,
+        "tool": str(document.context.get("tool", "")),
+    }
+
+
+class _DriftCheck(Touches):
+    """Touches that are compared with a calibration."""
+
+    def __init__(
+        self,
+        about: StepAnswer,
+        read_robot: ReadRobot | None,
+        camera: MarkCamera,
+        name: str,
+        record_to: Callable[[str], Path],
+    ) -> None:
+        super().__init__(about, read_robot)
+        self.name = name
+        self._camera = camera
+        self._record_to = record_to
+        found = PlaneCalibration.from_data(about.outcome["data"])
+        if self.sigma is not None:
+            found = replace(found, touch_sigma=self.sigma, sigma_given=True)
+        self.calibration = found
+
+    async def run(self) -> dict[str, Any]:
+        while True:
+            await self._touch_marks()
+            if not self.touches:
+                continue
+            drift = self.calibration.check(self._seen(), self.places)
+            figures = self._figures(drift)
+            choice = await ask(self._verdict(drift, figures), partial(self._end, drift, figures))
+            if choice["next"] == "finish":
+                return {"name": self.name, **figures, **choice.outcome}
+
+    def _seen(self) -> Array:
+        return np.array([(one.mark.x, one.mark.y) for one in self.touches])
+
+    async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
+        self._camera.check_y_down(self.calibration.y_down, f"{self.name} was made")
+        rows = await self._camera.picture(answers)
+        wanted = self.calibration.camera_frame
+        frames = {row["frame_id"] for row in rows} - {wanted}
+        if wanted is not None and frames:
+            raise CalibrationError(
+                f"the camera's localizations are in frame {min(frames)!r}, the calibration "
+                f"expected {wanted!r}",
+                code=Code.WRONG_FRAME,
+                got=min(frames),
+                expected=wanted,
+            )
+        self.calibration.transform([(row["x"], row["y"]) for row in rows])
+        return rows
+
+    async def _touch_marks(self) -> None:
+        tool = self.about.outcome["tool"]
+        step = Step(
+            id="picture",
+            title="Marks in the camera's field",
+            description="Lay one mark or several where the camera sees them, at the height where "
+            "parts lie, far from each other; the robot must not hide them. They must not move "
+            "until they have been touched.",
+            button="Take a picture",
+            notes=(
+                f"{self.name} was made at {self.about.outcome['written_at'][:19]} UTC"
+                + (f", with the tool {tool!r}" if tool else ""),
+                *((f"{_touches(len(self.touches))} so far",) if self.touches else ()),
+            ),
+        )
+        await self.add_marks((await ask(step, self._picture)).outcome, MAX_TOUCHES, "touches")
+
+    def _verdict(self, drift: Drift, figures: Mapping[str, Any]) -> Step:
+        stale, offsets = figures["stale"], figures["offsets_mm"]
+        return Step(
+            id="verdict",
+            title=f"{self.name} {'is stale' if stale else 'still holds'}",
+            description="Take a touch back if it went wrong. If the next touches say the same, "
+            "calibrate anew."
+            if stale
+            else "",
+            notes=tuple(_notes(figures)),
+            button="Go on",
+            inputs=(
+                Option(
+                    name="next",
+                    label="What next",
+                    options={
+                        "finish": "finish, and note it in the file of its checks",
+                        "more": "take another picture, to touch more",
+                    },
+                ),
+            ),
+            preview=compared(
+                self.calibration,
+                self.touches,
+                self._seen(),
+                drift.offsets,
+                worst=offsets.index(max(offsets)),
+            ),
+        )
+
+    def _figures(self, drift: Drift) -> dict[str, Any]:
+        offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
+        needed = [touches_needed(self.calibration, point) for point in self._seen()]
+        known = [one for one in needed if one is not None]
+        return {
+            "stale": drift.stale,
+            "touches": len(self.touches),
+            "offsets_mm": np.round(offsets, 6).tolist(),
+            "rms_mm": math.sqrt(float((offsets**2).mean())),
+            "expected_mm": 1e3 * drift.expected,
+            "z": drift.z,
+            "chance": drift.chance,
+            "needed": min(known, default=None),
+            "needed_at": 1 + needed.index(min(known)) if known else None,
+        }
+
+    async def _end(
+        self, drift: Drift, figures: Mapping[str, Any], answers: Answers
+    ) -> dict[str, str] | None:
+        """Note the check in its file, if it is to end: the action of the last step."""
+        if answers["next"] != "finish":
+            return None
+        file = self._record_to(self.name)
+        with Journal(file) as checks:
+            if checks.header is None:
+                checks.start({"schema": CHECKS, "name": self.name})
+            elif checks.header.get("schema") != CHECKS:
+                raise CalibrationError(
+                    f"{file.name}: schema {checks.header.get('schema')!r}, expected {CHECKS!r}",
+                    code=Code.BROKEN_FILE,
+                    got=checks.header.get("schema"),
+                    expected=CHECKS,
+                )
+            checks.append(
+                {
+                    "at": datetime.now(UTC).isoformat(),
+                    "calibration": self.about.outcome["written_at"],
+                    **figures,
+                    "samples": [
+                        {
+                            "feature_id": one.mark.feature,
+                            "camera": [one.mark.x, one.mark.y],
+                            "robot": list(one.robot),
+                            "offset": offset,
+                        }
+                        for one, offset in zip(self.touches, drift.offsets.tolist(), strict=True)
+                    ],
+                }
+            )
+        return {"file": file.name}
+
+
+def _notes(figures: Mapping[str, Any]) -> list[str]:
+    """Return the notes of a verdict, a line each."""
+    count, offsets = figures["touches"], figures["offsets_mm"]
+    knock = f"a knock of {1e3 * KNOCK:g} mm is noticed in {100 * NOTICED:g} of 100 checks"
+    needed = figures["needed"]
+    return [
+        f"{_touches(count)}: {figures['rms_mm']:.3f} mm rms off, where noise explains "
+        f"{figures['expected_mm']:.3f} mm; the furthest is touch "
+        f"{1 + offsets.index(max(offsets))}, {max(offsets):.3f} mm",
+        f"noise alone gives as much in {100 * figures['chance']:.2g} % of checks "
+        f"(z = {figures['z']:.2f})",
+        f"{knock} with {_touches(needed)} of the mark of touch {figures['needed_at']}"
+        if needed is not None
+        else f"{knock} with no number of touches of these marks: the calibration is known too "
+        "badly there",
+    ]
+
+
+def _touches(count: int) -> str:
+    return f"{count} touch{'es' if count != 1 else ''}"

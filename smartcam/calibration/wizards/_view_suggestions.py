@@ -1,0 +1,71 @@
+"""From where a camera is to look at a target, one view after the other, and how that looks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration.formats._robots import rotation_zyx
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._targets import Target
+
+
+class Look(NamedTuple):
+    """A view that tells something which the others do not."""
+
+    text: str  # for people
+    # direction in the image about which the target is tilted, degrees from u towards v
+    axis: float = 0.0
+    tilt: float = 0.0  # degrees
+    roll: float = 0.0  # about the line of sight, degrees
+    fill: float = 0.6  # part of the image's width or height that the target takes
+    place: tuple[float, float] = (0.5, 0.5)  # its middle, in parts of the image's width and height
+
+
+LOOKS: Final = (
+    Look("straight from the front, the sheet in the middle of the image"),
+    Look("tilted by 30 degrees about one side of the sheet", tilt=30),
+    Look("tilted by 30 degrees to the opposite side", tilt=-30),
+    Look("tilted by 30 degrees about the other side of the sheet", axis=90, tilt=30),
+    Look("tilted by 30 degrees to the opposite side of that", axis=90, tilt=-30),
+    Look("turned by 90 degrees about the line of sight", roll=90),
+    Look("turned by 90 degrees the other way, and tilted by 20 degrees", tilt=20, roll=-90),
+    Look("nearer, so that the sheet fills the image, tilted by 20 degrees", tilt=20, fill=0.95),
+    Look("farther away, tilted by 30 degrees towards a corner of the sheet", 45, 30, fill=0.35),
+    Look(
+        "with the sheet in a corner of the image, tilted towards another corner",
+        135,
+        30,
+        fill=0.45,
+        place=(0.27, 0.27),
+    ),
+)
+"""The views, in the order in which they are best taken."""
+
+FOCAL: Final = 1.2
+"""Focal length of the camera that outlines are drawn for, image widths."""
+
+
+def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
+    """Return the outline of a target's points in a view, (4, 2) pixels; of a camera like most.
+
+    ``size``: width and height of the image, pixels.
+    """
+    low, high = target.points.min(axis=0), target.points.max(axis=0)
+    half = (high - low) / 2
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half
+    axis, tilt, roll = np.radians([look.axis, look.tilt, look.roll]).tolist()
+    facing = np.diag([1.0, -1.0, -1.0])
+    tilted = rotation_zyx(axis, 0.0, tilt) @ rotation_zyx(-axis, 0.0, 0.0) @ facing
+    placed = corners @ (rotation_zyx(roll, 0.0, 0.0) @ tilted).T
+    focal, image = FOCAL * size[0], np.array(size, dtype=np.float64)
+    away = 10.0 * float(np.linalg.norm(half))
+    for _ in range(5):  # a little nearer or farther changes the perspective a little, too
+        seen = focal * placed[:, :2] / (placed[:, 2:] + away)
+        away *= float((np.ptp(seen, axis=0) / image).max()) / look.fill
+    seen = focal * placed[:, :2] / (placed[:, 2:] + away)
+    found: Array = seen - (seen.max(axis=0) + seen.min(axis=0)) / 2 + image * look.place
+    return found
