@@ -10,9 +10,12 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.doctor import result_checks, session_checks, state_checks, trigger_checks
-from smartcam.doctor.context import Plan, Visit, Witness
-from smartcam.doctor.findings import Exit, Finding, Severity, summary
+from smartcam.doctor import _result_checks as result_checks
+from smartcam.doctor import _session_checks as session_checks
+from smartcam.doctor import _state_checks as state_checks
+from smartcam.doctor import _trigger_checks as trigger_checks
+from smartcam.doctor._context import DoctorOptions, Examination, Witness
+from smartcam.doctor._findings import Exit, Finding
 from smartcam.exceptions import (
     CameraFaultError,
     CommandRejectedError,
@@ -22,16 +25,19 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
-from smartcam.interpreters.base import resolve
+from smartcam.interpreters._base import resolve
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable
 
-    from smartcam._client.link import TraceEntry
-    from smartcam.interpreters.base import Spec
+    from smartcam.interpreters._base import Spec
+    from smartcam.observers import TraceEntry
 
-__all__ = ["Exit", "Finding", "Severity", "examine", "summary"]
+__all__ = [
+    "Finding",
+    "examine",
+]
 
 NOTICE = Finding(
     check="notice",
@@ -48,51 +54,50 @@ MAX_TRIGGERS = 10_000
 """Triggers at most: their times are kept."""
 
 
-class _Check(NamedTuple):
-    """One check.
+class _DoctorCheck(NamedTuple):
+    """One check."""
 
-    Attributes:
-        name: as its findings call it.
-        run: looks, and reports to the visit.
-        limit: seconds that it may take, by what was asked for.
-        in_session: whether it needs a session.
-    """
-
-    name: str
-    run: Callable[[Visit], Awaitable[None]]
-    limit: Callable[[Plan], float]
-    in_session: bool = True
+    name: str  # as its findings call it
+    run: Callable[[Examination], Awaitable[None]]  # looks, and reports to the exam
+    limit: Callable[[DoctorOptions], float]  # seconds that it may take, by what was asked for
+    in_session: bool = True  # whether it needs a session
 
 
-def _requests(plan: Plan) -> float:
-    return plan.step(5.0) + state_checks.QUERIES_WITHIN
+def _requests(options: DoctorOptions) -> float:
+    return options.step(5.0) + state_checks.QUERIES_WITHIN
 
 
-def _switch(plan: Plan) -> float:
-    return 2 * plan.step(10.0)  # the turn, and what is done in it
+def _switch(options: DoctorOptions) -> float:
+    return 2 * options.step(10.0)  # the turn, and what is done in it
 
 
 _CHECKS = (
-    _Check("name", session_checks.resolve, lambda plan: plan.step(10.0) + 1.0, in_session=False),
-    _Check(
+    _DoctorCheck(
+        "name", session_checks.resolve, lambda options: options.step(10.0) + 1.0, in_session=False
+    ),
+    _DoctorCheck(
         "session",
         session_checks.connect,
         # a session that fails, every other way, and a session by one of them; and their ends
-        lambda plan: 4 * plan.step(10.0) + session_checks.CONNECTS_WITHIN + session_checks.CONNECTS,
+        lambda options: (
+            4 * options.step(10.0) + session_checks.CONNECTS_WITHIN + session_checks.CONNECTS
+        ),
         in_session=False,
     ),
-    _Check("status", state_checks.look_at_status, _requests),
-    _Check(
+    _DoctorCheck("status", state_checks.look_at_status, _requests),
+    _DoctorCheck(
         "application",
         trigger_checks.look_at_application,
-        lambda plan: _requests(plan) + _switch(plan),
+        lambda options: _requests(options) + _switch(options),
     ),
-    _Check("round trip", state_checks.measure_round_trip, _requests),
-    _Check("run state", state_checks.watch, lambda plan: plan.seconds + 1.0),
-    _Check("trigger", trigger_checks.trigger, lambda plan: plan.count * plan.step(5.0) + 1.0),
-    _Check("application", trigger_checks.give_back, _switch),
-    _Check("layout", result_checks.look_at_results, lambda plan: 10.0),
-    _Check("clock", state_checks.look_at_clock, _requests),
+    _DoctorCheck("round trip", state_checks.measure_round_trip, _requests),
+    _DoctorCheck("run state", state_checks.watch, lambda options: options.seconds + 1.0),
+    _DoctorCheck(
+        "trigger", trigger_checks.trigger, lambda options: options.count * options.step(5.0) + 1.0
+    ),
+    _DoctorCheck("application", trigger_checks.give_back, _switch),
+    _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
+    _DoctorCheck("clock", state_checks.look_at_clock, _requests),
 )
 """In their order. The limits are there for a fault of ours: each step has a bound of its own. Their
 sum, and a second for the end of the session, bounds the whole."""
@@ -139,7 +144,7 @@ async def examine(
             f"{MAX_SECONDS} seconds and {MAX_TRIGGERS} triggers"
         )
     interpreter = None if interpret_as is None else resolve(interpret_as)
-    plan = Plan(
+    options = DoctorOptions(
         application=application,
         interpreter=interpreter,
         y_down=y_down,
@@ -148,56 +153,49 @@ async def examine(
         seconds=seconds,
         count=count,
     )
-    visit = Visit(plan, parse_address(url), trace, Witness(), wants_trigger=trigger)
-    visit.make_camera()  # which sees to it that the options can work
+    exam = Examination(options, parse_address(url), trace, Witness(), wants_trigger=trigger)
+    exam.make_camera()  # which sees to it that the options can work
     yield NOTICE
-    async with visit.stack, visit.borrowed:
+    async with exam.stack, exam.borrowed:
         for check in _CHECKS:
-            goes_on = await _run(check, visit)
-            for finding in visit.take():
+            goes_on = await _run(check, exam)
+            for finding in exam.take():
                 yield finding
             if not goes_on:
                 return
 
 
-async def _run(check: _Check, visit: Visit) -> bool:
+async def _run(check: _DoctorCheck, exam: Examination) -> bool:
     """Run a check within its limit; return whether the next ones make sense."""
-    limit = check.limit(visit.plan)
+    limit, exam.check = check.limit(exam.options), check.name
     try:
         async with asyncio.timeout(limit):
-            await check.run(visit)
+            await check.run(exam)
             if not check.in_session:
-                return not any(one.exit_code for one in visit.pending) or visit.camera is not None
-            if not visit.patient.connected and check.name != "clock":
-                await visit.patient.query_application()  # raises why
+                return not any(one.exit_code for one in exam.pending) or exam.camera is not None
+            if not exam.patient.connected and check.name != "clock":
+                await exam.patient.query_application()  # raises why
     except LinkError as exc:
-        await session_checks.explain_loss(visit, exc)
+        await session_checks.explain_loss(exam, exc)
         return False
     except ResponseTimeoutError as exc:
-        if not visit.patient.connected:  # an answer that did not come costs the session
-            await session_checks.explain_loss(visit, exc)
+        if not exam.patient.connected:  # an answer that did not come costs the session
+            await session_checks.explain_loss(exam, exc)
             return False
-        visit.say(
-            check.name,
-            "error",
+        exam.fail(
             f"the camera did not get ready in time: {exc}",
             "Give it more time (--timeout), and see whether somebody works on its pages.",
             exit_code=Exit.RAN_OUT,
         )
     except SmartCamError as exc:
         refused = isinstance(exc, (CameraFaultError, CommandRejectedError, UnsupportedError))
-        visit.say(
-            check.name,
-            "error",
-            f"this check failed: {exc}",
-            exit_code=Exit.REFUSED if refused else Exit.NO_SESSION,
+        exam.fail(
+            f"this check failed: {exc}", exit_code=Exit.REFUSED if refused else Exit.NO_SESSION
         )
     except TimeoutError:
-        visit.say(
-            check.name,
-            "error",
+        exam.fail(
             f"this check did not end within {limit:g} s",
             "Try again; then please tell us, with --trace.",
             exit_code=Exit.RAN_OUT,
         )
-    return visit.camera is not None and visit.camera.connected
+    return exam.camera is not None and exam.camera.connected

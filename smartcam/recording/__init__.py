@@ -11,16 +11,12 @@
 The container is MCAP, which Foxglove and others open. It needs the extra ``record``.
 """
 
-from smartcam.recording.form import RecordedError
-from smartcam.recording.pcap import write_pcap
-from smartcam.recording.reader import RecordedCamera, Recording, load_recording
-from smartcam.recording.recorder import Counts, Recorder
-from smartcam.recording.replay import ReplayedCamera
+from smartcam.recording._pcap import write_pcap
+from smartcam.recording._reader import Recording, load_recording
+from smartcam.recording._recorder import Recorder
+from smartcam.recording._replay import ReplayedCamera
 
 __all__ = [
-    "Counts",
-    "RecordedCamera",
-    "RecordedError",
     "Recorder",
     "Recording",
     "ReplayedCamera",

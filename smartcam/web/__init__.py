@@ -6,30 +6,28 @@
         site.url    # http://127.0.0.1:PORT/
 
 It needs the extra ``web``; without it the first use of a name is a
-:class:`~smartcam.exceptions.MissingExtraError`.
+:class:`~smartcam.MissingExtraError`.
 """
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
+from smartcam._lazy import lazy
 from smartcam.exceptions import MissingExtraError
 
 if TYPE_CHECKING:
-    from smartcam.web.emulator import EmulatorSite
-    from smartcam.web.wizard import WizardSite
+    from smartcam.web._emulator import EmulatorSite
+    from smartcam.web._wizard import WizardSite
 
 __all__ = ["EmulatorSite", "WizardSite"]
 
-_HOMES = {"EmulatorSite": "emulator", "WizardSite": "wizard"}
+_resolve = lazy(__name__, {"_emulator": "EmulatorSite", "_wizard": "WizardSite"})
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'smartcam.web' has no attribute {name!r}")
     try:
-        return getattr(importlib.import_module(f"smartcam.web.{_HOMES[name]}"), name)
+        return _resolve(name)
     except ModuleNotFoundError as exc:
         if exc.name != "aiohttp":
             raise

@@ -10,35 +10,31 @@ without pytest. Names are resolved when they are first used: importing this is l
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.conformance.camera.judging import judge
-    from smartcam.conformance.camera.options import Allow, Plan
-    from smartcam.conformance.camera.pytest_options import add_options
-    from smartcam.conformance.camera.report import Report
-    from smartcam.conformance.camera.suite import CameraConformance
+    from smartcam.conformance.camera._judging import judge
+    from smartcam.conformance.camera._options import Allow, ConformanceOptions
+    from smartcam.conformance.camera._report import CameraReport
+    from smartcam.conformance.camera._suite import CameraConformance
 
-__all__ = ["Allow", "CameraConformance", "Plan", "Report", "add_options", "judge"]
+__all__ = [
+    "Allow",
+    "CameraConformance",
+    "CameraReport",
+    "ConformanceOptions",
+    "judge",
+]
 
-_HOMES = {
-    "Allow": "options",
-    "CameraConformance": "suite",
-    "Plan": "options",
-    "Report": "report",
-    "add_options": "pytest_options",
-    "judge": "judging",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'smartcam.conformance.camera' has no attribute {name!r}")
-    value: Any = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_judging": "judge",
+            "_options": "Allow ConformanceOptions",
+            "_report": "CameraReport",
+            "_suite": "CameraConformance",
+        },
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from smartcam.conformance.camera.suite import CameraConformance
+from smartcam.conformance.camera._suite import CameraConformance
 
 __all__ = ["TestCamera"]
 

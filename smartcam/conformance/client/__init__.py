@@ -17,72 +17,37 @@ what the camera expects. Names are resolved when they are first used: importing 
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.conformance.client.checks import CHECKS, Check, Grade
-    from smartcam.conformance.client.pytest_options import add_options, terminal_summary
-    from smartcam.conformance.client.report import ClientFinding, judge
-    from smartcam.conformance.client.runs import Run, perform
-    from smartcam.conformance.client.scenes import SCENES, Scene
-    from smartcam.conformance.client.suite import ClientConformance
-    from smartcam.conformance.client.tasks import (
-        Client,
-        CommandClient,
-        FunctionClient,
-        Outcome,
-        Task,
-    )
+    from smartcam.conformance.client._checks import CHECKS
+    from smartcam.conformance.client._runs import perform
+    from smartcam.conformance.client._scenes import SCENES, Scene
+    from smartcam.conformance.client._suite import ClientConformance
+    from smartcam.conformance.client._tasks import CommandClient, FunctionClient, Outcome, Task
 
 __all__ = [
     "CHECKS",
     "SCENES",
-    "Check",
-    "Client",
     "ClientConformance",
-    "ClientFinding",
     "CommandClient",
     "FunctionClient",
-    "Grade",
     "Outcome",
-    "Run",
     "Scene",
     "Task",
-    "add_options",
-    "judge",
     "perform",
-    "terminal_summary",
 ]
 
-_HOMES = {
-    "CHECKS": "checks",
-    "SCENES": "scenes",
-    "Check": "checks",
-    "Client": "tasks",
-    "ClientConformance": "suite",
-    "ClientFinding": "report",
-    "CommandClient": "tasks",
-    "FunctionClient": "tasks",
-    "Grade": "checks",
-    "Outcome": "tasks",
-    "Run": "runs",
-    "Scene": "scenes",
-    "Task": "tasks",
-    "add_options": "pytest_options",
-    "judge": "report",
-    "perform": "runs",
-    "terminal_summary": "pytest_options",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value: Any = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_checks": "CHECKS",
+            "_runs": "perform",
+            "_scenes": "SCENES Scene",
+            "_suite": "ClientConformance",
+            "_tasks": "CommandClient FunctionClient Outcome Task",
+        },
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from smartcam.conformance.client.suite import ClientConformance
+from smartcam.conformance.client._suite import ClientConformance
 
 __all__ = ["TestClient"]
 

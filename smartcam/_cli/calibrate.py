@@ -1,0 +1,488 @@
+"""``smartcam calibrate``: the wizards of a calibration in the terminal, or as a web page."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import json
+import os
+import sys
+import textwrap
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
+from smartcam._cli.page import PageOptions, page_options
+from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import CalibrationError, ConfigurationError, UnsupportedError
+from smartcam.models import Localization
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Mapping
+
+    from smartcam.calibration._files.directory import Folder
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration.wizards._sequence import Wizard, WizardSession
+    from smartcam.calibration.wizards._services import CalibrationService
+
+ABORTED = 130
+"""Exit code after an abort: as after Ctrl-C there is no calibration."""
+
+STALE = 7
+"""Exit code after a check that found the calibration stale."""
+
+MAX_DESCRIPTION = 65_536
+"""Bytes of a target's description."""
+
+WIDTH = 88
+"""Columns of a text."""
+
+
+@click.command(
+    help="Calibrate a camera against a robot: where its localizations lie in the robot's space. "
+    "Asks step by step; an answer is on the disk before the next step is shown, so the same "
+    "command goes on where it was broken off. Beside an answer, :undo, :repeat and :abort are "
+    "understood. With --json each step is a line of stdout and each line of stdin "
+    '{"answers": {...}} or {"do": "undo"|"repeat"|"abort"}, each with the "token" of the step that '
+    "is meant, or without for the current one. "
+    "With --check it asks for some touches only, and tells whether a calibration is still true: "
+    f"exit code {STALE} if it is stale. "
+    "With --wizard sheet or hand-eye the camera's own pictures are looked at: those of a camera "
+    "that sends them, or those that come into the folder of --pictures; then no URL is needed. "
+    f"The camera is connected for each picture only. {CONNECTS}"
+)
+@click.argument("url", required=False)
+@click.option("--name", "called", metavar="NAME", help="Its name.  [default: that of the wizard]")
+@click.option(
+    "--wizard",
+    type=click.Choice(["plane", "sheet", "hand-eye"]),
+    help="What to calibrate: a plane from what the camera localizes, a plane from a picture of a "
+    "printed sheet, or a camera on a robot or beside it.  [default: plane]",
+)
+@click.option(
+    "--pictures",
+    metavar="FOLDER",
+    type=click.Path(file_okay=False),
+    help="Take the next picture that comes into this folder, as by FTP.",
+)
+@click.option(
+    "--target",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    help="What is on the sheet, as smartcam sheet --describe writes it.",
+)
+@click.option(
+    "--lens",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    help="The camera's lens: a camera_info of ROS, YAML.",
+)
+@click.option("--check", metavar="NAME", help="Check the calibration of that name.")
+@click.option(
+    "--folder",
+    type=click.Path(file_okay=False),
+    default="calibrations",
+    show_default=True,
+    help="Where calibrations and journals stand; made if need be.",
+)
+@page_options("Serve a page instead of asking here, until Ctrl-C; its address goes to stdout.")
+@click.option("--fresh", is_flag=True, help="Begin anew, also where one was broken off.")
+@click.option("--feature", metavar="ID", help="Only localizations of this feature are marks.")
+@option("--application", help="Have this application running and ready for each picture.")
+@option(
+    "--interpret-as",
+    default="localizations",
+    show_default=True,
+    help="How to read results; must give localizations.",
+)
+@option("--y-down")
+@option(
+    "--timeout",
+    help="Bound of each step of a picture: connect (default 10), switch (10), trigger (5).",
+)
+@runs(*OUTPUT)
+async def calibrate(
+    url: str | None,
+    called: str | None,
+    wizard: str | None,
+    pictures: str | None,
+    target: str | None,
+    lens: str | None,
+    check: str | None,
+    folder: str,
+    fresh: bool,
+    feature: str | None,
+    web: PageOptions,
+    options: Options,
+) -> None:
+    """Calibrate a camera against a robot."""
+    if called is not None and check is not None:
+        raise click.UsageError("--check names the calibration: no --name beside it")
+    if wizard is not None and check is not None:
+        raise click.UsageError("--check asks for touches of marks: no --wizard beside it")
+    if url is None and (pictures is None or wizard in {None, "plane"}):
+        raise click.UsageError(
+            "a URL is missing: only --wizard sheet and --wizard hand-eye do without one, with "
+            "--pictures FOLDER"
+        )
+    from smartcam.calibration.wizards._verification import WIZARD
+
+    sources = _Sources(options, url, pictures, target, lens)
+    parameters = {} if feature is None else {"feature": feature}
+    started = WIZARD if check is not None else wizard or "plane"
+    named = next(one for one in (check, called, started) if one is not None)
+    try:
+        service = _service(folder, sources)
+        try:
+            if check is not None:
+                options.check_y_down(service.load(check), f"--check {check}")
+            service.start(named, started, parameters, fresh=fresh)
+            if web.wanted:
+                await _serve(service, options, web)
+            else:
+                await _drive(service.session, options)
+        finally:
+            service.close()
+    except CalibrationError as exc:
+        raise ConfigurationError(str(exc)) from exc
+
+
+async def _serve(service: CalibrationService, options: Options, web: PageOptions) -> None:
+    from smartcam.web import WizardSite
+
+    async with WizardSite(service, **web.place) as site:
+        options.show({"page": site.url}, f"page: {site.url}")
+        await asyncio.Event().wait()
+
+
+def _service(folder: str, sources: _Sources) -> CalibrationService:
+    from smartcam.calibration._files.directory import Folder
+    from smartcam.calibration._optional_imports import load
+    from smartcam.calibration.wizards._services import CalibrationService
+
+    load("scipy")  # before anything is measured
+    with naming(f"--folder {folder}"):
+        inside = Folder(folder)
+    return CalibrationService(inside, sources.wizards(inside))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sources:
+    """Where localizations and pictures come from, and what is known of target and lens."""
+
+    options: Options
+    url: str | None
+    pictures: str | None
+    target: str | None
+    lens: str | None
+
+    def wizards(self, folder: Folder) -> list[Wizard]:
+        """Return the wizards that can work with what there is; the first is the page's default.
+
+        Raises ConfigurationError: a file of the options cannot be used.
+        """
+        from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
+        from smartcam.calibration.wizards._plane import plane_wizard
+        from smartcam.calibration.wizards._sheet import sheet_wizard
+        from smartcam.calibration.wizards._verification import drift_wizard
+
+        found: list[Wizard] = []
+        if self.url is not None:
+            with self.options.camera(self.url):  # an address or option that cannot work
+                y_down = self.options.y_down
+            found = [
+                plane_wizard(localize=self.localize, save_to=folder.calibration, y_down=y_down),
+                drift_wizard(
+                    localize=self.localize,
+                    find=folder.find,
+                    record_to=folder.checks,
+                    y_down=y_down,
+                ),
+            ]
+        target = None if self.target is None else _read_target(self.target)
+        lens = None if self.lens is None else _read_lens(self.lens)
+        take_picture = self._taking()
+        for make in (sheet_wizard, hand_eye_wizard):
+            found.append(
+                make(
+                    take_picture=take_picture,
+                    save_to=folder.calibration,
+                    suggested=target,
+                    camera=lens,
+                )
+            )
+        return found
+
+    async def localize(self) -> list[Localization]:
+        options = self.options
+        with options.camera(str(self.url)) as unopened:
+            async with unopened as camera:
+                result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
+        found = result.value
+        if not isinstance(found, list) or not all(isinstance(one, Localization) for one in found):
+            raise ConfigurationError(
+                f"--interpret-as {options.interpret_as}: expected localizations, "
+                f"got {type(found).__name__}"
+            )
+        return found
+
+    def _taking(self) -> Callable[[], Coroutine[Any, Any, Any]]:
+        from smartcam.calibration.wizards._pictures import PictureFolder
+
+        if self.pictures is None:
+            return self.take_picture
+        return PictureFolder(self.pictures).take
+
+    async def take_picture(self) -> Any:
+        from smartcam.calibration.wizards._pictures import decode_picture
+
+        # the picture counts, not what the application says of it
+        options = replace(self.options, interpret_as=None)
+        wait = options.step(DEFAULT_TRIGGER_TIMEOUT)
+        with options.camera(str(self.url)) as unopened:
+            async with unopened as camera:
+                if not camera.capabilities.read_image:
+                    raise UnsupportedError(
+                        f"{camera.name}: its protocol sends no pictures; expected one that does, "
+                        "or --pictures FOLDER, where the camera writes them by FTP"
+                    )
+                await camera.trigger(timeout=wait)
+                data = await camera.read_image(timeout=wait)
+                name = camera.name
+        return await asyncio.to_thread(decode_picture, data, name)
+
+
+def _read_target(path: str) -> Target:
+    from smartcam.calibration._targets import target_from_data
+
+    try:
+        with Path(path).open("rb") as stream:
+            data: object = json.loads(stream.read(MAX_DESCRIPTION))
+    except OSError as exc:
+        raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
+    except (ValueError, RecursionError) as exc:
+        raise ConfigurationError(f"--target {path}: no JSON: {exc}") from exc
+    if not isinstance(data, dict):
+        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
+    described: dict[str, Any] = data
+    try:
+        return target_from_data(described)
+    except CalibrationError as exc:
+        raise ConfigurationError(f"--target {path}: {exc}") from exc
+
+
+def _read_lens(path: str) -> CameraModel:
+    from smartcam.calibration.formats._cameras import read_cameras
+
+    try:
+        with naming(f"--lens {path}"):
+            return read_cameras(path, "camera_info").cameras[0]
+    except CalibrationError as exc:
+        raise ConfigurationError(f"--lens: {exc}") from exc
+
+
+async def _drive(session: WizardSession, options: Options) -> None:
+    lines = _Lines()
+    view = session.current
+    while view["type"] not in {"result", "abort"}:
+        options.show(view, _step_text)
+        if options.as_json:
+            view = await _from_json(session, await lines.next())
+        else:
+            view = await _from_prompts(session, view, lines)
+    options.show(view, _end_text)
+    if view["type"] == "abort":
+        raise SystemExit(ABORTED)
+    if view["result"].get("stale"):
+        raise SystemExit(STALE)
+
+
+_COMMANDS = ("undo", "repeat", "abort")
+
+
+async def _do(session: WizardSession, command: str, token: str) -> dict[str, Any]:
+    view: dict[str, Any] = await getattr(session, command)(token)
+    return view
+
+
+async def _from_json(session: WizardSession, line: str) -> dict[str, Any]:
+    try:
+        asked = json.loads(line)
+        token = asked.get("token", session.token)
+        answers, command = asked.get("answers"), asked.get("do")
+    except (ValueError, RecursionError, AttributeError) as exc:
+        raise ConfigurationError(
+            f'a line of input: expected {{"answers": {{...}}}}, got {line[:64]!r}'
+        ) from exc
+    if command is None:
+        return await session.submit(token, answers)
+    if command not in _COMMANDS:
+        raise ConfigurationError(f"do: expected one of {', '.join(_COMMANDS)}, got {command!r}")
+    return await _do(session, command, token)
+
+
+async def _from_prompts(
+    session: WizardSession, view: dict[str, Any], lines: _Lines
+) -> dict[str, Any]:
+    """Ask for a step's answers until it is left; what was answered stands there again."""
+    defaults = dict(view["defaults"])
+    token = view["token"]
+    while view["token"] == token:
+        answers: dict[str, Any] = {}
+        properties = view["schema"]["properties"]
+        for name, schema in properties.items():
+            text = await _ask(lines, _prompt(schema, defaults.get(name)))
+            if text.startswith(":"):
+                return await _command(session, view, text[1:])
+            if text or name in defaults:
+                answers[name] = _value(schema, text) if text else defaults[name]
+        if not properties:
+            text = await _ask(lines, f"{view['button']}: press Enter")
+            if text.startswith(":"):
+                return await _command(session, view, text[1:])
+        view = await session.submit(token, answers)
+        wrong = view["errors"]
+        defaults.update({name: value for name, value in answers.items() if name not in wrong})
+        if view["token"] == token:
+            click.echo(_errors_text(view))
+    return view
+
+
+async def _command(session: WizardSession, view: Mapping[str, Any], text: str) -> dict[str, Any]:
+    command = text.strip()
+    if command in view["can"]:
+        return await _do(session, command, view["token"])
+    possible = ", ".join(f":{one}" for one in view["can"])
+    click.echo(f"! :{command}: expected one of {possible}")
+    return session.current
+
+
+async def _ask(lines: _Lines, prompt: str) -> str:
+    click.echo(f"{prompt}: ", nl=False)
+    return await lines.next()
+
+
+# ---------------------------------------------------------------------- texts
+
+
+def _prompt(schema: Mapping[str, Any], default: Any) -> str:
+    unit = f", {schema['x-unit']}" if "x-unit" in schema else ""
+    shown = "" if default is None else f" [{_default_text(default)}]"
+    rows = [f"    {one['const']}: {one['title']}\n" for one in schema.get("oneOf", ())]
+    head = f"{schema['title']}{unit}"
+    return f"{head}\n{''.join(rows)}  answer{shown}" if rows else f"{head}{shown}"
+
+
+def _default_text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+_BOOLEANS = {"y": True, "yes": True, "n": False, "no": False}
+
+
+def _value(schema: Mapping[str, Any], text: str) -> Any:
+    """Return the value of a text; one that stands for nothing is the session's to refuse."""
+    kind = schema.get("type")
+    if kind == "boolean":
+        return _BOOLEANS.get(text.lower(), text)
+    if kind == "string":
+        return text
+    with contextlib.suppress(ValueError):
+        return float(text.replace(",", "."))
+    return text
+
+
+def _step_text(view: Mapping[str, Any]) -> str:
+    commands = ", ".join(f":{one}" for one in view["can"])
+    lines = ["", f"{view['number']}. {view['title']}  ({commands})"]
+    lines += textwrap.wrap(view["description"], WIDTH)
+    for note in view["notes"]:
+        lines += textwrap.wrap(note, WIDTH, initial_indent="  - ", subsequent_indent="    ")
+    errors = _errors_text(view)
+    return "\n".join([*lines, errors] if errors else lines)
+
+
+def _errors_text(view: Mapping[str, Any]) -> str:
+    properties = view["schema"]["properties"]
+    rows = [
+        f"! {text}" if name == "base" else f"! {properties[name]['title']}: {text}"
+        for name, text in view["errors"].items()
+    ]
+    return "\n".join(rows)
+
+
+def _end_text(view: Mapping[str, Any]) -> str:
+    if view["type"] == "abort":
+        return "\naborted; what was measured stands in the journal"
+    result = view["result"].items()
+    rows = [f"  {name}: {_result_text(value)}" for name, value in result if name != "remarks"]
+    return "\n".join(["", "done", *rows])
+
+
+def _result_text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_result_text, value)) or "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else "-" if value is None else str(value)
+
+
+# ---------------------------------------------------------------------- standard input
+
+
+class _Lines:
+    """Lines of standard input, one when it is asked for; the event loop goes on meanwhile.
+
+    A thread waits for each. It reads the descriptor itself: one that is left waiting in Python's
+    own buffer at the end would stop the interpreter from ending.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    async def next(self) -> str:
+        """Return the next line without its end; ConfigurationError: there is none.
+
+        Cancellation: the thread goes on waiting, and ends with the process.
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[str] = loop.create_future()
+
+        def tell(line: str) -> None:
+            if not future.done():
+                future.set_result(line)
+
+        def wait() -> None:
+            line = self._read()
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                loop.call_soon_threadsafe(tell, line)
+
+        threading.Thread(target=wait, name="stdin", daemon=True).start()
+        line = await future
+        if not line:
+            raise ConfigurationError(
+                "the input has ended before the calibration has; what was done is kept: "
+                "the same command goes on with it"
+            )
+        return line.strip()
+
+    def _read(self) -> str:
+        try:
+            descriptor = sys.stdin.fileno()
+        except (io.UnsupportedOperation, AttributeError, ValueError):
+            return sys.stdin.readline() if sys.stdin is not None else ""
+        while b"\n" not in self._buffer:
+            more = os.read(descriptor, 4096)
+            if not more:
+                break
+            self._buffer += more
+        line, end, self._buffer = self._buffer.partition(b"\n")
+        return (line + end).decode(errors="replace")

@@ -1,0 +1,170 @@
+"""``smartcam decode``: bytes against a dialect or a layout, without a camera."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.texts import table_text, value_text
+from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
+from smartcam.interpreters._base import Context, Interpreter, Reader, resolve, run
+from smartcam.protocols._bvs import BVS
+from smartcam.protocols._framed.constructs import view_fields
+from smartcam.protocols._framed.framing import Framer
+from smartcam.protocols.messages import ResultContainer, Sender
+
+if TYPE_CHECKING:
+    from smartcam.models import ByteOrder
+    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols._framed.framing import Frame
+
+
+def from_hex(text: str, where: str) -> bytes:
+    """Return the bytes of hex text (ConfigurationError: it is none); spaces are allowed."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError as exc:
+        raise ConfigurationError(f"{where}: {text[:64]!r} is no hex: {exc}") from exc
+
+
+@click.command(
+    help="Decode DATA: hex, the name of a file (binary or hex text), or - for standard input. "
+    "Frames are shown field by field (those without a magic number need --dialect); anything else "
+    "is a result container's data and needs --interpret-as."
+)
+@click.argument("data")
+@option("--interpret-as", help="How to read a result container's data.")
+@click.option("--big-endian", is_flag=True, help="The container is big endian.")
+@click.option(
+    "--dialect",
+    "dialect_name",
+    type=click.Choice(tuple(BVS.dialects)),
+    help="Whose frames they are.",
+)
+@click.option("--quirks", metavar="NAMES", default="", help="The dialect's quirks, as in a URL.")
+@runs(*OUTPUT)
+async def decode(
+    data: str, big_endian: bool, dialect_name: str | None, quirks: str, options: Options
+) -> None:
+    """Print what bytes mean; a frame with a magic number shows its dialect by itself."""
+    payload = _load(data)
+    if not payload:
+        raise ConfigurationError("decode: there are no bytes to decode")
+    byte_order: ByteOrder = "big" if big_endian else "little"
+    interpreter = None if options.interpret_as is None else resolve(options.interpret_as)
+    if dialect_name is None and quirks:
+        raise ConfigurationError("decode: --quirks are a dialect's: name it with --dialect")
+    dialect = _dialect_of(payload) if dialect_name is None else BVS.dialects[dialect_name]
+    if dialect is not None and quirks:
+        dialect = dialect.with_quirks(name.strip() for name in quirks.split(","))
+    if dialect is not None:
+        _decode_frames(payload, dialect, interpreter, byte_order, options)
+        return
+    if interpreter is None:
+        raise ConfigurationError(
+            f"decode: {hex_excerpt(payload[:8])} begins no frame (no magic number), so "
+            "--dialect must say whose frames they are, or --interpret-as what the container holds"
+        )
+    value = _interpret(payload, interpreter, byte_order)
+    options.show({"value": value}, value_text(value))
+
+
+def _load(data: str) -> bytes:
+    if data == "-":
+        raw = sys.stdin.buffer.read() if sys.stdin is not None else b""
+    else:
+        try:
+            path = Path(data)
+            if not path.is_file():
+                return from_hex(data, "decode: neither a file nor hex")
+            raw = path.read_bytes()
+        except (OSError, ValueError) as exc:
+            if isinstance(exc, ConfigurationError):
+                raise
+            raise ConfigurationError(f"decode: {data[:64]!r}: {exc}") from exc
+    try:
+        return bytes.fromhex(raw.decode("ascii"))
+    except ValueError:
+        return raw  # a binary file
+
+
+def _dialect_of(payload: bytes) -> FramedDialect | None:
+    for dialect in BVS.dialects.values():
+        if dialect.header.magic and payload.startswith(dialect.header.magic):
+            return dialect
+    return None
+
+
+def _decode_frames(
+    payload: bytes,
+    dialect: FramedDialect,
+    interpreter: Interpreter | None,
+    byte_order: ByteOrder,
+    options: Options,
+) -> None:
+    framer = Framer(dialect.header, dialect.header.max_payload)
+    framer.feed(payload)
+    offset = 0
+    while (frame := framer.next_frame()) is not None:
+        _show_frame(frame, offset, dialect, interpreter, byte_order, options)
+        offset += dialect.header.size + len(frame.payload)
+    if framer.buffered:
+        raise FrameError(
+            f"decode: the last {framer.buffered} bytes, from offset {offset}, are no whole frame: "
+            f"{hex_excerpt(framer.pending)}",
+            offset=offset,
+            data=framer.pending,
+        )
+
+
+def _show_frame(
+    frame: Frame,
+    offset: int,
+    dialect: FramedDialect,
+    interpreter: Interpreter | None,
+    byte_order: ByteOrder,
+    options: Options,
+) -> None:
+    """Print one frame field by field, as each message that it can be."""
+    raw = dialect.encode_frame(frame)
+    for sender in _senders(dialect, frame):
+        name = type(dialect.decode(sender, frame)).__name__  # says plainly if it is too short
+        fields = view_fields(dialect, sender, raw)
+        shown: dict[str, Any] = {
+            "offset": offset,
+            "dialect": dialect.name,
+            "sender": sender.value,
+            "message_id": frame.message_id,
+            "message": name,
+            "fields": fields,
+        }
+        lines = [f"at {offset}: {name} from the {sender.value}, dialect {dialect.label}"]
+        rows = [
+            (f.offset, f.name, hex_excerpt(f.raw), f.value if isinstance(f.value, int) else "")
+            for f in fields
+        ]
+        lines.append(table_text(("offset", "field", "bytes", "value"), rows))
+        if name == ResultContainer.__name__ and interpreter is not None:
+            shown["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
+            lines.append(value_text(shown["value"]))
+        options.show(shown, "\n".join(lines))
+
+
+def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
+    """Return the senders that the frame can have, by id and size; both where neither fits."""
+    exact = [
+        sender
+        for sender in Sender
+        if dialect.knows(sender, frame.message_id) and dialect.surplus(sender, frame) == 0
+    ]
+    known = [sender for sender in Sender if dialect.knows(sender, frame.message_id)]
+    return exact or known[-1:] or [Sender.CAMERA]
+
+
+def _interpret(payload: bytes, interpreter: Interpreter, byte_order: ByteOrder) -> Any:
+    reader = Reader(payload, Context(byte_order=byte_order), interpreter.layout)
+    return run(interpreter, reader)

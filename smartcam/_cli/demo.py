@@ -1,0 +1,132 @@
+"""``smartcam demo``: the main job against an emulated camera, step by step."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import smartcam
+from smartcam._cli.texts import table_text
+from smartcam.emulator import EmulatedCamera
+from smartcam.models import ApplicationChanged, StatusChanged
+
+if TYPE_CHECKING:
+    from smartcam._cli.options import Options
+
+STREAMED = 10
+TANGRAM, COUNTER, HELLO = 7, 9, 21
+
+
+@dataclass(eq=False)
+class Steps:
+    """Prints steps, as text or JSON lines."""
+
+    _options: Options
+    _number: int = 0
+
+    def step(self, text: str, **values: Any) -> None:
+        """Print the next one, with its number; ``values`` stand beside the text in JSON."""
+        self._number += 1
+        number = self._number
+        self._options.show({"step": number, "text": text, **values}, f"\n{number}. {text}")
+
+    def detail(self, text: str, **values: Any) -> None:
+        """Print more about it."""
+        self._options.show({"text": text, **values}, text)
+
+
+async def demo(options: Options) -> None:
+    """Connect, switch while BUSY, trigger, localize, stream, disconnect."""
+    say = Steps(options)
+    async with EmulatedCamera(seed=1) as emulator:
+        say.step(f"An emulated BVS002C listens on real TCP: {emulator.url}", url=emulator.url)
+        interpret_as = {
+            TANGRAM: "localizations",
+            COUNTER: "n: int32",
+            HELLO: "text: string[20]",
+        }
+        async with smartcam.connect(
+            emulator.url, name="demo", application=HELLO, interpret_as=interpret_as
+        ) as camera:
+            say.step(f"Connected, application {camera.active_application} runs: {camera.status}")
+            await _switch(camera, say)
+            await _localize(camera, emulator, say)
+            await _stream(camera, say)
+            account = camera.statistics()
+        say.step("Disconnected. The account of every result that arrived:")
+        say.detail(
+            f"   received {account.received} = triggered {account.triggered} + streamed "
+            f"{account.streamed} + unclaimed {account.unclaimed} + late {account.late} + wrong "
+            f"application {account.wrong_application} + uninterpretable {account.uninterpretable}",
+            statistics=account,
+        )
+
+
+async def _switch(camera: smartcam.SmartCamera, say: Steps) -> None:
+    loop = asyncio.get_running_loop()
+    say.step(
+        f"Switch to application {TANGRAM}. The camera must be stopped, is BUSY, then runs again:"
+    )
+    begin = loop.time()
+    events = camera.events()
+    switching = asyncio.create_task(camera.switch_application(TANGRAM))
+    await camera.wait_status(lambda status: smartcam.Status.BUSY in status)
+    # asked for while the camera is BUSY: it waits until the camera takes a trigger
+    result = await camera.trigger()
+    await switching
+    while events.statistics().queued:
+        event = await anext(events)
+        match event:
+            case StatusChanged(status=status):
+                say.detail(f"   status: {status}", status=status)
+            case ApplicationChanged(application=application):
+                say.detail(f"   application {application} is active", application=application)
+            case _:
+                pass
+    say.detail(
+        f"   ready {1e3 * (loop.time() - begin):.0f} ms after the order, with a trigger that was "
+        f"asked for while BUSY: {len(result.value)} parts"
+    )
+
+
+async def _localize(camera: smartcam.SmartCamera, emulator: EmulatedCamera, say: Steps) -> None:
+    result = await camera.trigger(timeout=2.0)
+    say.step(
+        f"Triggered: {len(result.value)} parts after {1e3 * (result.latency or 0):.0f} ms. "
+        "Found beside their true poses (metres, degrees):"
+    )
+    truth = emulator.scene.pieces
+    rows: list[tuple[object, ...]] = []
+    for part in result.value:
+        piece, position = truth[part.feature_id], part.pose.position
+        found, true = part.pose.orientation.theta, piece.theta
+        off = 1e3 * math.hypot(position.x - piece.x, position.y - piece.y)
+        rows.append(
+            (
+                part.feature_id,
+                position.x,
+                position.y,
+                math.degrees(found),
+                piece.x,
+                piece.y,
+                math.degrees(math.remainder(true, 2 * math.pi)),
+                f"{off:.2f} mm",
+            )
+        )
+    head = ("part", "x", "y", "theta", "true x", "true y", "true theta", "off by")
+    say.detail(table_text(head, rows), result=result)
+
+
+async def _stream(camera: smartcam.SmartCamera, say: Steps) -> None:
+    say.step(f"Application {COUNTER} runs free: {STREAMED} results as they come:")
+    async with camera.application(COUNTER):
+        numbers: list[int] = []
+        async with camera.results() as results, asyncio.timeout(10):
+            async for result in results:
+                numbers.append(result.value.n)
+                if len(numbers) == STREAMED:
+                    break
+    say.detail(f"   {', '.join(map(str, numbers))}", numbers=numbers)
+    say.detail(f"   and back in application {camera.active_application}")

@@ -1,0 +1,246 @@
+"""``smartcam demo --pick``: an emulated camera and a simulated robot, from touches to picks.
+
+The robot knows nothing of where the table is: it touches marks that the camera sees, and from these
+pairs comes the calibration. What the robot then does is compared with the truth, which a real cell
+does not know, and with what the calibration predicted, which a real cell does.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import smartcam
+from smartcam._cli.demo import Steps
+from smartcam._cli.options import naming
+from smartcam._cli.texts import table_text
+from smartcam.emulator import EmulatedCamera
+from smartcam.emulator._scene import TABLE_SIZE, TablePose
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam._cli.options import Options
+    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.emulator._scene import TableScene
+    from smartcam.models import Localization
+
+TANGRAM: Final = 7
+
+TOUCH_SIGMA: Final = 2e-4
+"""Metres; standard deviation of a touch along each of the robot's axes."""
+
+GRIP: Final = 2e-3
+"""Metres; how far beside a part the gripper still takes it."""
+
+EDGE: Final = 0.025
+"""Metres from the table's edge to the outer marks."""
+
+
+class Pick(NamedTuple):
+    """How one part was picked."""
+
+    part: str
+    x: float  # where the robot went, metres in the robot's frame
+    y: float  # the same
+    z: float  # the same
+    error: float  # distance from there to the part, metres
+    predicted: float  # rms of the error to expect there, metres
+    turned: float  # by how much the gripper's heading was off, radians
+    taken: bool  # whether it was near enough
+
+
+class SimulatedRobot:
+    """A robot beside the table, which lies somewhere in its frame.
+
+    Args:
+        scene: the table.
+        seed: of where the table is, and of the noise of the touches.
+    """
+
+    def __init__(self, scene: TableScene, seed: int) -> None:
+        import numpy as np
+
+        from smartcam.calibration._geometry.frames import Transform
+
+        self._scene = scene
+        self._random = np.random.default_rng(seed)
+        turn = self._random.normal(size=4)
+        place = self._random.uniform(-0.6, 0.6, 3)
+        self.table: Transform = Transform.from_quaternion(
+            "robot", "table", place, turn / np.linalg.norm(turn)
+        )
+        """The truth; nothing but the comparison looks at it."""
+
+    @property
+    def tool_z(self) -> NDArray[Any]:
+        """Direction of the tool's axis when it touches the table, (3,), in the robot's frame."""
+        return -self.table.rotation[:, 2]
+
+    def touch(self, mark: TablePose) -> NDArray[Any]:
+        """Return the robot's reading when its tip touches a mark, (3,) in metres."""
+        true = self.table.apply([mark.x, mark.y, 0.0])
+        return true + self._random.normal(0.0, TOUCH_SIGMA, 3)
+
+    def pick(self, part: Localization, predicted: float) -> Pick:
+        """Go to a pose in the robot's frame and close the gripper; a part that is there is taken.
+
+        ``part``: its pose, the tool's z into the table. ``predicted``: rms of the error that is
+        expected there, metres.
+        """
+        from smartcam.calibration._geometry.frames import Transform
+
+        pose = part.pose
+        gripper = Transform.from_quaternion("robot", "part", pose.position, pose.orientation)
+        found = self.table.inverse() @ gripper
+        x, y, z = found.translation.tolist()
+        true = self._scene.pieces[part.feature_id]
+        error = math.dist((x, y, z), (true.x, true.y, 0.0))
+        heading = math.atan2(found.rotation[1, 0], found.rotation[0, 0])
+        turned = math.remainder(heading - true.theta, math.tau)
+        taken = error < GRIP
+        if taken:
+            del self._scene.pieces[part.feature_id]
+        return Pick(part.feature_id, *pose.position, error, predicted, turned, taken)
+
+
+async def pick(options: Options, picture: str, seed: int) -> None:
+    """Calibrate, localize, pick all seven pieces, and write a picture (SVG).
+
+    ``seed``: of the camera's noise, of where the table is and of the touches' noise. Raises
+    MissingExtraError: the extra ``calibration`` is not installed; ConfigurationError: the picture
+    cannot be written.
+    """
+    from smartcam.calibration._optional_imports import load
+
+    load("scipy")  # first, since all that comes before the calibration would be in vain
+    say = Steps(options)
+    async with EmulatedCamera(active=TANGRAM, seed=seed) as emulator:
+        robot = SimulatedRobot(emulator.scene, seed)
+        say.step(
+            f"A camera above a table: {emulator.url}. A robot beside it, which does not know where "
+            "the table is.",
+            url=emulator.url,
+        )
+        async with smartcam.connect(
+            emulator.url, name="demo", application=TANGRAM, interpret_as="localizations"
+        ) as camera:
+            timeout = options.step(5.0)
+            pieces = dict(emulator.scene.pieces)
+            marks = nine_marks()
+            _lay(emulator.scene, marks)
+            seen = (await camera.trigger(timeout=timeout)).value
+            calibration = _calibrate(seen, marks, robot, say)
+            _lay(emulator.scene, pieces)
+            result = await camera.trigger(timeout=timeout)
+            noise = emulator.scene.pixel_noise / emulator.scene.scale
+            _pick_all(result.value, calibration, robot, noise, say)
+            left = (await camera.trigger(timeout=timeout)).value
+            say.step(f"Triggered once more: {len(left)} parts on the table.", left=len(left))
+    _write(picture, calibration, result.value, say)
+
+
+def nine_marks() -> dict[str, TablePose]:
+    """Return marks on a grid over the whole table: three by three."""
+    columns, rows = ((EDGE, size / 2, size - EDGE) for size in TABLE_SIZE)
+    places = [(x, y) for y in rows for x in columns]
+    return {f"mark_{n}": TablePose(x, y, 0.0) for n, (x, y) in enumerate(places, start=1)}
+
+
+def _lay(scene: TableScene, things: dict[str, TablePose]) -> None:
+    """Clear the table and put these things onto it."""
+    scene.pieces.clear()
+    scene.pieces.update(things)
+
+
+def _calibrate(
+    seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, say: Steps
+) -> PlaneCalibration:
+    from smartcam.calibration._plane.calibration import fit_plane
+
+    camera_points = [tuple(mark.pose.position[:2]) for mark in seen]
+    robot_points = [robot.touch(marks[mark.feature_id]).tolist() for mark in seen]
+    say.step(
+        f"The camera localizes {len(seen)} marks, the robot touches each of them "
+        f"({1e3 * TOUCH_SIGMA:g} mm of noise on each axis), mm:",
+        camera_points=camera_points,
+        robot_points=robot_points,
+    )
+    rows = [
+        (mark.feature_id, *_mm(*camera, *touched))
+        for mark, camera, touched in zip(seen, camera_points, robot_points, strict=True)
+    ]
+    say.detail(table_text(("mark", *_right("camera x", "y", "robot x", "y", "z")), rows))
+    calibration = fit_plane(
+        camera_points, robot_points, touch_sigma=TOUCH_SIGMA, tool_z=robot.tool_z
+    )
+    held_out = calibration.held_out_error or math.nan
+    say.step(
+        f"Calibrated ({calibration.model}). Each touch against a calibration from the other eight: "
+        f"{1e3 * held_out:.2f} mm rms, the touch's own noise included",
+        model=calibration.model,
+        held_out_error=held_out,
+        warnings=[remark.text for remark in calibration.warnings],
+    )
+    for remark in calibration.warnings:
+        say.detail(f"   {remark.code}: {remark.text}")
+    return calibration
+
+
+def _pick_all(
+    parts: list[Localization],
+    calibration: PlaneCalibration,
+    robot: SimulatedRobot,
+    noise: float,
+    say: Steps,
+) -> None:
+    """Pick every part; the camera's noise on both axes adds to the calibration's error."""
+    where = [part.pose.position[:2] for part in parts]
+    predicted = [math.hypot(p, noise, noise) for p in calibration.predicted_error(where).tolist()]
+    targets = calibration.to_robot(parts, tool_flip=True)
+    picks = [robot.pick(part, error) for part, error in zip(targets, predicted, strict=True)]
+    say.step(f"Triggered: {len(parts)} parts. The robot goes to each of them and picks it, mm:")
+    rows = [
+        (
+            pick.part,
+            *_mm(pick.x, pick.y, pick.z, pick.error, pick.predicted),
+            f"{math.degrees(pick.turned):+.2f} deg",
+            "picked" if pick.taken else "missed",
+        )
+        for pick in picks
+    ]
+    head = ("part", *_right("x", "y", "z", "error", "predicted"), "turned by", "")
+    say.detail(table_text(head, rows), picks=picks)
+    errors, expected = ([getattr(pick, name) for pick in picks] for name in ("error", "predicted"))
+    say.detail(
+        f"   error {1e3 * _rms(errors):.2f} mm rms, predicted {1e3 * _rms(expected):.2f} mm; "
+        f"{sum(pick.taken for pick in picks)} of {len(picks)} picked",
+        error=_rms(errors),
+        predicted=_rms(expected),
+        picked=sum(pick.taken for pick in picks),
+    )
+
+
+def _mm(*metres: float) -> list[str]:
+    """Return lengths as millimetres."""
+    return _right(*(f"{1e3 * value:.2f}" for value in metres))
+
+
+def _right(*texts: str) -> list[str]:
+    """Return texts in cells of one width, to the right."""
+    return [text.rjust(9) for text in texts]
+
+
+def _rms(values: list[float]) -> float:
+    return math.hypot(*values) / math.sqrt(len(values))
+
+
+def _write(path: str, calibration: PlaneCalibration, parts: list[Localization], say: Steps) -> None:
+    from smartcam.calibration._plane.drawing import draw
+
+    text = draw(calibration, parts, title="smartcam demo --pick")
+    with naming(f"--picture {path}"):
+        Path(path).write_text(text, encoding="utf-8", newline="\n")
+    say.step(f"What was touched, how well it fits and how good it is: {path}", picture=path)

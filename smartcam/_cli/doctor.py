@@ -1,0 +1,80 @@
+"""``smartcam doctor``: what is wrong with a camera, in plain words and with the cure."""
+
+from __future__ import annotations
+
+from contextlib import aclosing
+
+import click
+
+from smartcam._cli.options import CAMERA, CONNECTS, Options, camera_url, option, runs
+from smartcam._cli.probe import frame_text
+from smartcam._cli.texts import table_text
+from smartcam.doctor import Finding, examine
+from smartcam.doctor._findings import summary
+
+MAX_BROKEN = 4
+"""Lines of broken bytes below a finding."""
+
+
+@click.command(
+    help="Say what is wrong, in plain words and with the cure: name, session, status, application, "
+    "round trip, run state, results, clock. Changes nothing on the camera and triggers nothing, "
+    f"unless --trigger is given. Exit code: that of the worst finding. {CONNECTS}"
+)
+@click.argument("url")
+@click.option(
+    "--trigger",
+    is_flag=True,
+    help="Send triggers; load and start --application for them, and go back afterwards.",
+)
+@option(
+    "--application",
+    help="The application that should be active; only compared, unless --trigger is given.",
+)
+@option("--interpret-as", help="Compare results with this layout or interpreter.")
+@option("--y-down")
+@option("--count", type=click.IntRange(1, 10_000), help="How many triggers; 10 by default.")
+@option("--seconds", help="How long to watch what comes by itself; 3 by default.")
+@runs(*CAMERA)
+async def doctor(url: str, trigger: bool, options: Options) -> None:
+    """Print what an examination finds, as it finds it; end with the exit code of the worst."""
+    findings: list[Finding] = []
+    with options.tracing() as trace:
+        examination = examine(
+            camera_url(url),
+            application=options.application,
+            interpret_as=options.interpret_as,
+            y_down=options.y_down,
+            trigger=trigger,
+            timeout=options.timeout,
+            seconds=options.seconds or 3.0,
+            count=options.count or 10,
+            trace=trace,
+        )
+        async with aclosing(examination):
+            async for finding in examination:
+                findings.append(finding)
+                options.show(finding, _text)
+    end = summary(findings)
+    options.show(end, f"{end.text[0].upper()}{end.text[1:]}.")
+    if end.exit_code:
+        raise SystemExit(int(end.exit_code))
+
+
+def _text(finding: Finding) -> str:
+    lines = [f"{finding.severity:<8} {finding.check}: {finding.text}"]
+    lines += [f"         {line}" for line in _broken(finding)]
+    if finding.cure:
+        lines.append(f"         -> {finding.cure}")
+    rows = finding.details.get("dump")
+    if rows:
+        table = table_text(("offset", "field", "bytes", "value"), rows)
+        lines += [f"       {line}" for line in table.splitlines()]
+    return "\n".join(lines)
+
+
+def _broken(finding: Finding) -> list[str]:
+    """Return the broken bytes that came, which tell an owner more than words."""
+    frames = [entry for trial in finding.details.get("frames", ()) for entry in trial]
+    broken = {entry.hex: frame_text(entry) for entry in reversed(frames) if entry.direction == "!"}
+    return list(broken.values())[:MAX_BROKEN]

@@ -1,0 +1,259 @@
+"""Options that commands share, and what is made of them."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from smartcam._cli.running import run
+from smartcam.client import SmartCamera, connect
+from smartcam.doctor._context import FrameObserver
+from smartcam.exceptions import ConfigurationError
+from smartcam.models import jsonable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterator, Mapping
+
+    from smartcam.calibration._files.load import AnyCalibration
+    from smartcam.observers import TraceEntry
+
+F = TypeVar("F", bound="Callable[..., Any]")
+
+CONNECTS = (
+    "Connecting takes the camera from another client, where it serves one: the newcomer wins."
+)
+
+
+class _Seconds(click.FloatRange):
+    """Seconds; NaN, which is below no bound and above none, is refused too."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        seconds = super().convert(value, param, ctx)
+        if math.isnan(seconds):
+            self.fail(f"{value!r} is not a number.", param, ctx)
+        return seconds
+
+
+SECONDS = _Seconds(min=0, min_open=True, max=86_400)
+
+INTERPRET_AS = (
+    "An interpreter, a layout, or both: localizations; 'x: real32 mm, y: real32 mm'; "
+    "'table: (x: real32)*'. Default raw: bytes, shown as hex."
+)
+
+_OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "--application": {
+        "type": click.IntRange(0, 0xFFFFFFFF),
+        "help": "Have this application running and ready first (stop, switch, start as needed).",
+    },
+    "--interpret-as": {"metavar": "SPEC", "help": INTERPRET_AS},
+    "--y-down": {"is_flag": True, "help": "The camera's y axis points down."},
+    "--calibration": {
+        "metavar": "FILE",
+        "type": click.Path(dir_okay=False),
+        "help": "Show localizations in the robot's frame, by what smartcam calibrate wrote.",
+    },
+    "--name": {
+        "metavar": "NAME",
+        "help": "The camera's name: in results, and as the frame of poses; default HOST:PORT.",
+    },
+    "--count": {"type": click.IntRange(min=1), "help": "End after so many results."},
+    "--seconds": {"type": SECONDS, "help": "End after so many seconds."},
+    "--timeout": {
+        "type": SECONDS,
+        "help": "Bound of each step: connect (default 10), switch until ready (10), trigger (5).",
+    },
+    "--trace": {
+        "type": click.Path(dir_okay=False),
+        "help": "Write every frame, decoded and hex, as JSON lines.",
+    },
+    "--json": {"is_flag": True, "help": "One JSON object a line on stdout."},
+    "--debug": {
+        "is_flag": True,
+        "help": "Log what happens and show tracebacks, on stderr.",
+    },
+    "--output": {"type": click.Path(dir_okay=False), "help": "The file to write."},
+}
+"""Options that several commands have."""
+
+OUTPUT = ("--json", "--debug")
+"""Of commands that print."""
+
+CAMERA = ("--timeout", "--trace", *OUTPUT)
+"""Of those that connect, too."""
+
+RESULTS = (
+    *("--application", "--interpret-as", "--y-down", "--calibration", "--name"),
+    *("--count", "--seconds"),
+    *CAMERA,
+)
+"""Of those that print results, too."""
+
+
+def option(name: str, **changes: Any) -> Callable[[F], F]:
+    """Declare an option that several commands have; ``changes`` are what this one has otherwise."""
+    names = {"--json": (name, "as_json"), "--output": ("-o", name)}.get(name, (name,))
+    return click.option(*names, **{**_OPTIONS[name], **changes})
+
+
+def runs(
+    *names: str, program: str = "smartcam", interrupted: int = 130, terminated: int = 143
+) -> Callable[[Callable[..., Coroutine[Any, Any, None]]], Callable[..., None]]:
+    """Make a coroutine function a command's: it gets the shared ones of its options as ``options``.
+
+    ``names``: of shared options that it has beside those declared above. ``program``: its name, for
+    the error line. ``interrupted``: exit code after Ctrl-C; 0 where that is the way to end, as it
+    is with a page. ``terminated``: exit code after SIGTERM.
+    """
+
+    def decorate(main: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+        @functools.wraps(main)
+        def start(*args: Any, **given: Any) -> None:
+            common = {one.name for one in fields(Options)} & given.keys()
+            options = Options(**{name: given.pop(name) for name in common})
+            has_page = "web" in given and given["web"].wanted
+            run(
+                main(*args, options=options, **given),
+                program=program,
+                debug=options.debug,
+                interrupted=0 if has_page else interrupted,
+                terminated=terminated,
+            )
+
+        for name in reversed(names):
+            start = option(name)(start)
+        return start
+
+    return decorate
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Make what goes wrong with a file in here a ConfigurationError that says whose it is."""
+    try:
+        yield
+    except OSError as exc:
+        raise ConfigurationError(f"{what}: {exc.strerror}") from exc
+
+
+def application(text: str) -> int | str:
+    """Return an application's id, or the name of its file: whatever is no number.
+
+    Raises click.BadParameter: an id that none can have; ValueError: signs and digits that make no
+    number.
+    """
+    if not text.lstrip("+-").isdecimal():
+        return text
+    number = int(text)
+    if not 0 <= number <= 0xFFFFFFFF:
+        raise click.BadParameter(f"{text} is not in the range 0<=x<=4294967295.")
+    return number
+
+
+def camera_url(text: str) -> str:
+    """Return a camera's URL; a bare host is one that speaks BVS over TCP."""
+    return text if "://" in text else f"bvs://{text}"
+
+
+@dataclass(slots=True)
+class Options:
+    """The shared options as a command uses them."""
+
+    as_json: bool = False
+    debug: bool = False
+    timeout: float | None = None
+    trace: str | None = None
+    application: int | None = None
+    interpret_as: str | None = None
+    y_down: bool = False
+    calibration: str | None = None
+    name: str | None = None
+    count: int | None = None
+    seconds: float | None = None
+
+    def step(self, default: float) -> float:
+        """Return the bound of a step, seconds."""
+        return default if self.timeout is None else self.timeout
+
+    def check_y_down(self, calibration: AnyCalibration, what: str) -> None:
+        """Raise ConfigurationError where ``--y-down`` is not as it was when a calibration was made.
+
+        ``what``: the option that names the calibration.
+        """
+        if calibration.y_down is not None and calibration.y_down != self.y_down:
+            made, then = ("with", "give it") if calibration.y_down else ("without", "leave it out")
+            raise ConfigurationError(
+                f"{what}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
+            )
+
+    @contextmanager
+    def camera(self, url: str, **other: Any) -> Iterator[SmartCamera]:
+        """Give an unopened camera; the trace file is open around it.
+
+        ``other``: options of :func:`smartcam.connect` that the command line does not have. Raises
+        CalibrationError: the calibration's file is damaged, newer, or holds something else;
+        ConfigurationError: a file cannot be opened, or an option cannot work.
+        """
+        calibration = None
+        if self.calibration is not None:
+            from smartcam.calibration._files.load import load_calibration
+
+            what = f"--calibration {self.calibration}"
+            with naming(what):
+                calibration = load_calibration(self.calibration)
+            self.check_y_down(calibration, what)
+        with self.tracing() as trace:
+            options: dict[str, Any] = {
+                "observers": [FrameObserver(trace)] if trace is not None else [],
+                "reconnect": None,
+                "name": self.name or "",
+                "application": self.application,
+                "interpret_as": self.interpret_as,
+                "calibration": calibration,
+                "y_down": self.y_down,
+                "connect_timeout": self.step(10.0),
+                "switch_timeout": self.step(10.0),
+            }
+            yield connect(camera_url(url), **{**options, **other})
+
+    @contextmanager
+    def tracing(self) -> Iterator[Callable[[TraceEntry], None] | None]:
+        """Give what writes the trace file, None where none is wanted."""
+        if self.trace is None:
+            yield None
+            return
+        with naming(f"--trace {self.trace}"):
+            stream = Path(self.trace).open("w", encoding="utf-8", buffering=1)  # noqa: SIM115
+        failed: list[OSError] = []
+
+        def write(entry: TraceEntry) -> None:
+            # called from the link, which would take an OSError for one of its own
+            if not failed:
+                try:
+                    stream.write(json.dumps(jsonable(entry)) + "\n")
+                except OSError as exc:
+                    failed.append(exc)
+
+        try:
+            yield write
+        finally:
+            try:
+                stream.close()
+            except OSError as exc:
+                failed.append(exc)
+        if failed:
+            raise ConfigurationError(f"--trace {self.trace}: {failed[0].strerror}") from failed[0]
+
+    def show(self, value: object, text: str | Callable[[Any], str]) -> None:
+        """Print ``value`` as a line of JSON, or for people ``text`` (of it); flushed."""
+        if self.as_json:
+            click.echo(json.dumps(jsonable(value)))
+        else:
+            click.echo(text if isinstance(text, str) else text(value))

@@ -1,0 +1,79 @@
+"""``--web``: the options, and a page beside what a command does."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class PageOptions:
+    """The page as the options want it.
+
+    Args:
+        web: whether there is one.
+        web_host: address to listen on, None for loopback.
+        web_port: port to listen on, None for a free one.
+        web_token: the token, None for the site's own choice.
+
+    Attributes:
+        wanted: whether there is one.
+        place: where it is, and its token, as a site takes them.
+
+    Raises:
+        click.UsageError: something is said of a page that is not wanted.
+    """
+
+    def __init__(
+        self, *, web: bool, web_host: str | None, web_port: int | None, web_token: str | None
+    ) -> None:
+        said = {"--web-host": web_host, "--web-port": web_port}
+        needless = [name for name, value in said.items() if value is not None]
+        if needless and not web:
+            raise click.UsageError(f"{needless[0]} needs --web")
+        self.wanted: bool = web
+        self.place: dict[str, Any] = {
+            "host": web_host or "127.0.0.1",
+            "port": web_port or 0,
+            "token": web_token,
+        }
+
+
+def page_options(about: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that gives a command the options of a page, as ``web``.
+
+    ``about``: what ``--web`` does.
+    """
+    options = [
+        click.option("--web", is_flag=True, help=f'{about} Needs the extra "web".'),
+        click.option("--web-host", metavar="HOST", help="Its address.  [default: 127.0.0.1]"),
+        click.option(
+            "--web-port",
+            type=click.IntRange(0, 65535),
+            help="Its port; 0, the default, a free one.",
+        ),
+        click.option(
+            "--web-token",
+            metavar="TOKEN",
+            envvar="SMARTCAM_WEB_TOKEN",
+            show_envvar=True,
+            help="What everybody must know who uses it. Without one this machine's users need "
+            "none; on an address that others can reach, one is made.",
+        ),
+    ]
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(function)
+        def packed(*args: Any, **given: Any) -> None:
+            web = {name: given.pop(name) for name in ("web", "web_host", "web_port", "web_token")}
+            function(*args, web=PageOptions(**web), **given)
+
+        for option in reversed(options):
+            packed = option(packed)
+        return packed
+
+    return decorate

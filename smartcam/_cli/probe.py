@@ -1,0 +1,89 @@
+"""``smartcam probe``: which transport and dialect does a camera speak."""
+
+from __future__ import annotations
+
+from contextlib import aclosing
+from typing import TYPE_CHECKING
+
+import click
+
+from smartcam._cli.options import CAMERA, CONNECTS, Options, camera_url, runs
+from smartcam.doctor._probing import trials
+from smartcam.exceptions import ConnectFailedError
+from smartcam.settings import parse_address
+
+if TYPE_CHECKING:
+    from smartcam.doctor._probing import CameraAnswer, Trial
+    from smartcam.observers import TraceEntry
+
+MAX_HEX = 128
+"""Hex digits of a frame that a line shows; ``--json`` and ``--trace`` have all."""
+
+
+@click.command(
+    help="Find out how a camera speaks; HOST or URL. Tries transports and dialects, the most "
+    f"probable first, until one is answered; --timeout bounds all of it. {CONNECTS}"
+)
+@click.argument("host_or_url")
+@click.option("--all", "go_on", is_flag=True, help="Try the rest too where one is answered.")
+@runs(*CAMERA)
+async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
+    """Try transports and dialects, one after the other on fresh links.
+
+    Raises ConnectFailedError: none answered; names each try.
+    """
+    address = parse_address(camera_url(host_or_url))
+    answers: list[CameraAnswer] = []
+    failed: list[str] = []
+    with options.tracing() as trace:
+        timeout = options.step(10.0)
+        async with aclosing(trials(address, timeout=timeout, trace=trace, go_on=go_on)) as tries:
+            async for trial in tries:
+                _show_trial(trial, options)
+                if trial.answer is not None:
+                    answers.append(trial.answer)
+                else:
+                    failed.append(str(trial))
+    if not answers:
+        raise ConnectFailedError(
+            f"no session with {address.host}:{address.port}: " + "; ".join(failed),
+            host=address.host,
+            port=address.port,
+            attempts=tuple(failed),
+        )
+    _show_answers(answers, options)
+
+
+def frame_text(entry: TraceEntry) -> str:
+    """Return an entry as a line: what it is, its fields, its bytes; broken bytes as text too."""
+    data = entry.hex[:MAX_HEX] + ("..." if len(entry.hex) > MAX_HEX else "")
+    if entry.direction != "!":
+        fields = ", ".join(f"{name}={value}" for name, value in (entry.fields or {}).items())
+        return f"{entry.direction} {entry.message}({fields})  {data}"
+    raw = bytes.fromhex(entry.hex)[: MAX_HEX // 2]
+    text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in raw)
+    return f"! {entry.message}" + (f"  {data}  '{text}'" if raw else "")
+
+
+def _show_trial(trial: Trial, options: Options) -> None:
+    told = ("transport", "dialect", "step", "outcome", "frames", "omitted")
+    value = {name: getattr(trial, name) for name in told}
+    outcome = f"{trial.step}: {trial.outcome}" if trial.answer is None else "a camera answers"
+    lines = [f"{trial.transport} {trial.dialect}: {outcome}"]
+    lines += [f"  {frame_text(entry)}" for entry in trial.frames]
+    if trial.omitted:
+        lines.append(f"  ... and {trial.omitted} more")
+    options.show(value, "\n".join(lines))
+
+
+def _show_answers(answers: list[CameraAnswer], options: Options) -> None:
+    first, *more = answers
+    lines = [f"status: {first.status}", *(f"also: {one.url}" for one in more), f"use: {first.url}"]
+    value = {
+        "url": first.url,
+        "status": first.status,
+        "protocol_version": first.protocol_version,
+        "application": first.application,
+        "also": [one.url for one in more],
+    }
+    options.show(value, "\n".join(lines))

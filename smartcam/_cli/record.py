@@ -1,0 +1,233 @@
+"""``smartcam record``, ``replay`` and ``pcap``: a camera's run in a file, and out of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, runs
+from smartcam._cli.texts import camera_value, not_running
+from smartcam.backoff import Backoff
+from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import (
+    CameraFaultError,
+    ConnectionClosedError,
+    ConnectionLostError,
+    ConnectionTakenError,
+    InterpretationError,
+    NotRunningError,
+    ResponseTimeoutError,
+    TriggerError,
+    UnsupportedError,
+)
+from smartcam.recording import Recorder, ReplayedCamera, load_recording, write_pcap
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from smartcam.client import SmartCamera
+    from smartcam.recording import Recording
+
+_force = click.option("--force", is_flag=True, help="Take the place of a file that is there.")
+_camera = click.option(
+    "--camera", metavar="NAME", help="Which camera of the recording; default all of them."
+)
+
+
+@click.command(
+    help="Record everything a camera says to an MCAP file, until Ctrl-C, --count or --seconds: "
+    "frames, results, events, errors. A lost link is made again, and the recording goes on. "
+    f"{CONNECTS}"
+)
+@click.argument("url")
+@option("--output", required=True)
+@_force
+@click.option(
+    "--every", type=SECONDS, metavar="SECONDS", help="Send a trigger every so many seconds."
+)
+@option("--name", help="The camera's name in the file; default HOST:PORT.")
+@option("--application")
+@option("--interpret-as", help="How to read results; default raw: bytes, kept as hex.")
+@runs("--y-down", "--count", "--seconds", "--timeout", *OUTPUT, interrupted=0)
+async def record(url: str, output: str, force: bool, every: float | None, options: Options) -> None:
+    """Record a camera."""
+    recorder = Recorder(output, overwrite=force)
+    with options.camera(url, observers=[recorder], reconnect=Backoff()) as unopened:
+        await _record(unopened, recorder, every, options)
+
+
+async def _record(
+    unopened: SmartCamera, recorder: Recorder, every: float | None, options: Options
+) -> None:
+    recorder.open()
+    facts = {name: getattr(options, name) for name in ("interpret_as", "application", "y_down")}
+    recorder.describe(unopened.name, **{name: fact for name, fact in facts.items() if fact})
+    try:
+        # subscribed, so that every container is interpreted
+        results = unopened.results(max_queue=1)
+        async with unopened as camera:
+            if every is None and not camera.capabilities.unasked_results:
+                raise UnsupportedError(
+                    f"{camera.name}: the camera sends no results by itself; to have some triggered "
+                    "while it is recorded: --every SECONDS"
+                )
+            value = {"url": camera.url, "file": str(recorder.path)}
+            options.show(value, f"recording {camera.url} to {recorder.path}, Ctrl-C to end")
+            jobs: list[Coroutine[Any, Any, None]] = [_watch_disk(recorder)]
+            jobs.append(_count(results, recorder, options.count))
+            if every is not None:
+                jobs.append(_trigger(camera, every, options.step(DEFAULT_TRIGGER_TIMEOUT)))
+            await _first(jobs, options.seconds)
+    finally:
+        await _end(recorder, unopened, options)
+
+
+async def _first(jobs: list[Coroutine[Any, Any, None]], seconds: float | None) -> None:
+    """Run jobs until the first is over, or for so many seconds; raise what it raised."""
+    tasks = [asyncio.create_task(job) for job in jobs]
+    try:
+        done, _ = await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        for task in tasks:
+            if task in done:
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        # what a second one raised is the same loss again, and is not to be complained about
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _watch_disk(recorder: Recorder) -> None:
+    raise await recorder.wait_failed()
+
+
+async def _count(results: Any, recorder: Recorder, count: int | None) -> None:
+    """Return when there are so many results; the stream's end is the camera's."""
+    while count is None or recorder.counts.results < count:
+        try:
+            await anext(results)
+        except InterpretationError:
+            pass  # it is recorded as an error
+        except StopAsyncIteration:
+            return
+
+
+async def _trigger(camera: SmartCamera, every: float, timeout: float) -> None:
+    """Send triggers; what goes wrong with one is recorded, as long as the first ones went well."""
+    loop = asyncio.get_running_loop()
+    when, worked = loop.time(), False
+    while True:
+        try:
+            await camera.trigger(timeout=timeout)
+            worked = True
+        except NotRunningError as exc:
+            if not worked:
+                raise not_running(exc, camera, "record") from exc
+        except (TriggerError, CameraFaultError, InterpretationError, ResponseTimeoutError):
+            pass
+        except (ConnectionTakenError, ConnectionClosedError):
+            raise
+        except ConnectionLostError:
+            with contextlib.suppress(ResponseTimeoutError):
+                await camera.wait_connected()
+        # a trigger that took longer than planned leaves some out, and none comes in a hurry
+        when += every * max(1, -(-(loop.time() - when) // every))
+        await asyncio.sleep(when - loop.time())
+
+
+async def _end(recorder: Recorder, camera: SmartCamera, options: Options) -> None:
+    """End the file, and tell what is in it; without a session there is no file."""
+    path = recorder.path
+    await asyncio.to_thread(recorder.close)
+    if camera.statistics().sessions:
+        counts, size = recorder.counts._asdict(), path.stat().st_size
+        told = ", ".join(f"{kind} {number}" for kind, number in counts.items())
+        options.show({"file": str(path), **counts, "bytes": size}, f"{path}: {told}; {size} bytes")
+    elif path.is_file() and not path.is_symlink():
+        path.unlink()
+
+
+@click.command(
+    help="Emulate the recorded cameras: each trigger gets the recorded containers, byte for byte "
+    "and after the same time, and what came by itself comes again. Prints one line per camera, its "
+    "URL. When a recording is over its triggers get no result, unless --loop."
+)
+@click.argument("recording", metavar="RUN.mcap", type=click.Path())
+@click.option("--speed", type=float, default=1.0, show_default=True, help="How many times faster.")
+@click.option("--loop", is_flag=True, help="Begin again when it is over.")
+@_camera
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    show_default=True,
+    help="Port; 0 takes a free one. Further cameras take the next ones.",
+)
+@click.option(
+    "--transport", type=click.Choice(("tcp", "udp")), help="Over; default the recorded one."
+)
+@runs(*OUTPUT, interrupted=0, terminated=0)
+async def replay(
+    recording: str,
+    speed: float,
+    loop: bool,
+    camera: str | None,
+    host: str,
+    port: int,
+    transport: Literal["tcp", "udp"] | None,
+    options: Options,
+) -> None:
+    """Play a recording."""
+    loaded = _loaded(recording)
+    names = list(loaded.cameras) if camera is None else [camera]
+    async with contextlib.AsyncExitStack() as stack:
+        for index, name in enumerate(names or [None]):
+            emulator = ReplayedCamera(
+                loaded,
+                camera=name,
+                speed=speed,
+                loop=loop,
+                host=host,
+                port=port + index if port else 0,
+                transport=transport,
+                on_over=_over,
+            )
+            await stack.enter_async_context(emulator)
+            ids = emulator.device.applications
+            value = camera_value(emulator, emulator.transport, emulator.dialect, ids)
+            options.show({**value, "camera": emulator.name}, emulator.url)
+        await asyncio.Event().wait()
+
+
+def _over() -> None:
+    click.echo("smartcam: note: the recording is over: triggers get no result any more", err=True)
+
+
+@click.command(
+    help="Write a recording's frames as packets for Wireshark: Ethernet, IP, TCP or UDP, with the "
+    "recorded times. The client's address and the division into packets are made up."
+)
+@click.argument("recording", metavar="RUN.mcap", type=click.Path())
+@option("--output", required=True)
+@_force
+@_camera
+@runs(*OUTPUT)
+async def pcap(
+    recording: str, output: str, force: bool, camera: str | None, options: Options
+) -> None:
+    """Show a recording to Wireshark."""
+    count = write_pcap(_loaded(recording), output, camera=camera, overwrite=force)
+    options.show({"file": output, "packets": count}, f"{output}: {count} packets")
+
+
+def _loaded(path: str) -> Recording:
+    """Return a recording; where it stops being readable stands on stderr."""
+    loaded = load_recording(Path(path))
+    if loaded.remark:
+        click.echo(f"smartcam: note: {path}: {loaded.remark}", err=True)
+    return loaded

@@ -1,0 +1,132 @@
+"""Running a command: signals, exit codes, errors in one line."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import logging
+import os
+import signal
+import sys
+import traceback
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from smartcam.exceptions import (
+    CalibrationError,
+    CameraFaultError,
+    CommandRejectedError,
+    ConfigurationError,
+    InterpretationError,
+    LayoutError,
+    LinkError,
+    ProtocolError,
+    SmartCamError,
+    TriggerError,
+    UnsupportedError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
+    (ConfigurationError, 2),
+    (LinkError, 3),
+    (ProtocolError, 3),
+    (CalibrationError, 2),
+    (InterpretationError, 6),
+    (TimeoutError, 4),
+    (CommandRejectedError, 5),
+    (UnsupportedError, 5),
+    (CameraFaultError, 5),
+    (TriggerError, 5),
+)
+"""First match decides. 0 done; 1 a fault of ours; 2 wrong usage; 3 no session or a broken one; 4 a
+wait in a session ran out; 5 the camera refused or is not running; 6 a result is not interpretable;
+7 ``calibrate --check``: stale; 130 and 143: cut off by Ctrl-C or SIGTERM."""
+
+
+def exit_code(error: BaseException) -> int:
+    """Return the exit code for an error."""
+    return next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1)
+
+
+def run(
+    main: Coroutine[Any, Any, None],
+    *,
+    program: str,
+    debug: bool,
+    interrupted: int = 130,
+    terminated: int = 143,
+) -> NoReturn:
+    """Run a command's coroutine to its end and exit.
+
+    Ctrl-C and SIGTERM cancel it, so every ``async with`` in it closes in order (a camera gets its
+    Disconnect).
+
+    Args:
+        main: what to run.
+        program: its name, for the error line.
+        debug: log to stderr and show tracebacks.
+        interrupted: exit code after Ctrl-C; 0 where that is the way to end.
+        terminated: exit code after SIGTERM.
+    """
+    if debug:
+        logging.basicConfig(level=logging.DEBUG, stream=sys.stderr)
+    else:
+        # without a handler Python prints warnings on its own, beside our one line
+        logging.getLogger("smartcam").addHandler(logging.NullHandler())
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # a camera's texts may have letters that the terminal's encoding lacks
+        sys.stdout.reconfigure(errors="backslashreplace")
+    ended_by: list[signal.Signals] = []
+    try:
+        asyncio.run(_with_signals(main, ended_by))
+    except (KeyboardInterrupt, asyncio.CancelledError):
+        sys.exit(terminated if signal.SIGTERM in ended_by else interrupted)
+    except BrokenPipeError:
+        # the reader went away, as `head` does; nothing may be written at exit either
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except click.ClickException:
+        raise  # a wrong use, which click tells
+    except Exception as exc:  # noqa: BLE001 - the last place: one line instead of a traceback
+        if debug:
+            traceback.print_exc()
+        sys.stderr.write(f"{program}: error: {_one_line(exc)}\n")
+        sys.exit(exit_code(exc))
+    sys.exit(0)
+
+
+def _one_line(error: Exception) -> str:
+    if not isinstance(error, (SmartCamError, OSError)):
+        return f"unexpected {error!r}; --debug shows where"
+    lines = str(error).splitlines()
+    if isinstance(error, LayoutError):
+        del lines[1:]  # the text with a mark below it; the first line tells the position
+    return " ".join(line.strip() for line in lines)
+
+
+async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:
+    """Let the first SIGINT or SIGTERM cancel ``main``; a second one ends the program as usual.
+
+    The handlers are set here and not left to asyncio, which sets none where SIGINT was ignored at
+    the start, as it is for a job in a shell script's background.
+    """
+    loop = asyncio.get_running_loop()
+    task = asyncio.current_task()
+
+    def on_signal(number: signal.Signals) -> None:
+        ended_by.append(number)
+        for one in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(one)
+        if task is not None:
+            task.cancel()
+
+    with contextlib.suppress(NotImplementedError):  # Windows: asyncio's own handling of Ctrl-C
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, on_signal, number)
+    await main

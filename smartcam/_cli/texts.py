@@ -1,0 +1,109 @@
+"""Values as text for people."""
+
+from __future__ import annotations
+
+import shlex
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import NotRunningError, hex_excerpt
+from smartcam.models import Localization, Result, jsonable
+from smartcam.protocols.messages import UNNAMED_APPLICATION
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from smartcam.client import SmartCamera
+    from smartcam.emulator import EmulatedCamera
+    from smartcam.emulator._insight.camera import EmulatedInSight
+
+
+def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return rows as aligned columns; numbers to the right."""
+    cells = [[_cell(value) for value in row] for row in rows]
+    widths = [max(len(text) for text in column) for column in zip(head, *cells, strict=True)]
+    numeric = [bool(rows) and isinstance(value, (int, float)) for value in (rows or [head])[0]]
+    lines = [
+        "  ".join(
+            text.rjust(width) if right else text.ljust(width)
+            for text, width, right in zip(line, widths, numeric, strict=True)
+        ).rstrip()
+        for line in [list(head), *cells]
+    ]
+    return "\n".join("  " + line for line in lines)
+
+
+def camera_value(
+    emulator: EmulatedCamera | EmulatedInSight, transport: str, dialect: str, ids: Iterable[int]
+) -> dict[str, Any]:
+    """Return an emulated camera's address and applications, for JSON."""
+    return {
+        "url": emulator.url,
+        "host": emulator.host,
+        "port": emulator.port,
+        "transport": transport,
+        "dialect": dialect,
+        "applications": sorted(ids),
+    }
+
+
+def application_text(application: int | None) -> str:
+    """Return the application in words; a job of a camera may have none of the ids."""
+    if application == UNNAMED_APPLICATION:
+        return "application without an id"
+    return f"application {application}"
+
+
+def not_running(error: NotRunningError, camera: SmartCamera, verb: str) -> NotRunningError:
+    """Return an error with what to do beside it; ``verb`` is the command that met it."""
+    return NotRunningError(
+        f"{error}. To start it: smartcam start {shlex.quote(camera.url)}, or {verb} with "
+        f"--application {camera.active_application}"
+    )
+
+
+def result_text(result: Result) -> str:
+    """Return a result: a line about it, then its value."""
+    latency = f", {1e3 * result.latency:.1f} ms after its trigger" if result.latency else ""
+    sequence = f", sequence {result.sequence}" if result.sequence is not None else ""
+    return (
+        f"result {result.number} of {application_text(result.application)}{sequence}{latency}\n"
+        f"{value_text(result.value)}"
+    )
+
+
+def value_text(value: Any) -> str:
+    """Return an interpreter's value as text."""
+    if isinstance(value, bytes):
+        return f"  {hex_excerpt(value)}"
+    if isinstance(value, list) and value and all(isinstance(v, Localization) for v in value):
+        return _localizations_text(value)
+    plain = jsonable(value)
+    if isinstance(plain, dict):
+        return "\n".join(f"  {name} = {_cell(item)}" for name, item in plain.items())
+    if isinstance(plain, list) and plain and all(isinstance(item, dict) for item in plain):
+        return table_text(list(plain[0]), [list(item.values()) for item in plain])
+    if isinstance(plain, list):
+        return "\n".join(f"  {_cell(item)}" for item in plain) or "  (nothing)"
+    return f"  {_cell(plain)}"
+
+
+def _localizations_text(parts: list[Localization]) -> str:
+    """Return a row for each: in the plane where all of them lie there, else in space."""
+    head: tuple[str, ...]
+    rows: list[tuple[object, ...]]
+    if any(pose.position.z or any(pose.orientation[:2]) for *_, pose in parts):
+        head = ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw")
+        rows = [(*part.pose.position, *part.pose.orientation) for part in parts]
+    else:
+        head = ("x [m]", "y [m]", "theta [rad]")
+        rows = [(*part.pose.position[:2], part.pose.orientation.theta) for part in parts]
+    named = [(*part[:2], *row) for part, row in zip(parts, rows, strict=True)]
+    return table_text(("feature_id", "quality", *head), named)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = str(value)
+    # a camera's text stays in its cell: no line breaks, nothing that a terminal obeys
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)

@@ -1,0 +1,83 @@
+"""Options of the command line for judging cameras and clients, and what is found of clients.
+
+It is light: the pytest plugin imports it in every run of pytest.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+PROPERTY = "smartcam-client-finding"
+"""Name of a test report's property that holds a finding: reports pass from process to process."""
+
+CAMERA: Mapping[str, str] = {
+    "--camera-url": (
+        "the camera that smartcam.conformance.camera judges, such as bvs://192.168.0.10; "
+        "it is taken from whoever has it"
+    ),
+    "--camera-application": (
+        "id of the application that may be started and triggered (default: the active one)"
+    ),
+    "--camera-other-application": (
+        "id of another application, which may be loaded for a moment (default: none is)"
+    ),
+    "--camera-allow": (
+        "what may be done to the camera beside run, trigger and switch, which are put back: "
+        "clock, number, input, errors, reboot, all; 'nothing' takes the three away"
+    ),
+    "--camera-timeout": "seconds that an answer, a status or a result may take (default 5)",
+    "--camera-quiet": "seconds of silence that count as no answer (default 0.5)",
+    "--camera-switch-timeout": "seconds that loading an application may take (default 30)",
+    "--camera-reboot-timeout": "seconds that a restart may take (default 180)",
+    "--camera-sequence-offset": (
+        "where in the application's results its sequence number (int32) stands, bytes "
+        "behind the application's id"
+    ),
+    "--camera-input": "input data that the application takes, as hex",
+    "--camera-report": "file to write the report to, as JSON",
+}
+"""Help text of each that is about a camera."""
+
+CLIENT: Mapping[str, str] = {
+    "--client-command": (
+        "The client to judge: a command with {task}, and {url} or {host} and {port}. It does the "
+        "task and prints each result's bytes as hex or JSON, one line each; exit code 0: done, 77: "
+        "it has no such task, anything else: failed."
+    ),
+    "--client-dialect": "What the client speaks, with commas between several; default handbook.",
+    "--client-transport": "tcp, udp, or both with a comma between them; default tcp.",
+    "--client-timeout": "Seconds that a task may take; default 30.",
+}
+"""Help text of each that is about a client."""
+
+
+def add_options(parser: Any) -> None:
+    """Register the options with pytest's ``parser`` (``pytest_addoption``)."""
+    for name, title, options in (
+        ("smartcam", "smartcam: is it a BVS camera?", CAMERA),
+        ("smartcam-client", "smartcam: how good is a client?", CLIENT),
+    ):
+        group = parser.getgroup(name, title)
+        for option, text in options.items():
+            metavar = option.rpartition("-")[2].upper()
+            kind = float if option == "--client-timeout" else str
+            group.addoption(option, type=kind, default=None, metavar=metavar, help=text)
+
+
+def terminal_summary(reporter: Any) -> None:
+    """Write what was found of clients into pytest's report; nothing where nothing was."""
+    found = [
+        value
+        for reports in reporter.stats.values()
+        for one in reports
+        if getattr(one, "when", None) == "call"
+        for name, value in one.user_properties
+        if name == PROPERTY
+    ]
+    if found:
+        from smartcam.conformance.client._report import ClientFinding, write_findings
+
+        write_findings(reporter, [ClientFinding.from_json(value) for value in found])

@@ -1,0 +1,97 @@
+"""Checks: messages that a camera is to ignore, and what it may say at all."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam.conformance._dialects import SMART
+from smartcam.conformance.camera._results import Differs, check
+from smartcam.conformance.camera._wire import of_kind
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import MessageId
+
+if TYPE_CHECKING:
+    from smartcam.conformance.camera._session_under_test import CameraUnderTest
+
+UNKNOWN_ID = 0x7F
+"""A message id that is in no table."""
+
+_IGNORED = {"": "SC-A28, MV25, published", "b16": "KB-seq, published", "bid": "ID-b 206, published"}
+_BODIES = {
+    "": "SC-A29 to SC-B34, MV27, MV29, published",
+    "b16": "the bodies of the dialects with 32 bits narrowed, inferred",
+    "bid": "ID-a 226 to 232, ID-b 210 to 221, published",
+}
+
+
+def wrong_magic(camera: CameraUnderTest) -> bytes:
+    """Return a Query whose magic number has every bit turned over."""
+    frame = camera.wire.request(m.Query())
+    size = len(camera.wire.magic)
+    return bytes(byte ^ 0xFF for byte in frame[:size]) + frame[size:]
+
+
+def _ignored(camera: CameraUnderTest, what: str, *data: bytes) -> None:
+    """See that the camera says nothing to these bytes and answers a Query behind them once."""
+    with camera.session() as client:
+        client.fence()
+        mark = len(client.heard)
+        client.write(*data)
+        client.fence()
+        client.listen(camera.options.quiet)
+        came = [one for one in client.heard[mark:] if one.message_id != MessageId.STATUS]
+        results = of_kind(came, MessageId.RESULT_CONTAINER)
+        if len(came) - len(results) != 1:
+            raise Differs(f"no answer to {what}, one to the Query behind it", client.words(mark))
+
+
+@check(_IGNORED, dialects=SMART)
+def unknown_id_is_ignored(camera: CameraUnderTest) -> None:
+    """A message with an unknown id is not answered, and what follows it is."""
+    _ignored(camera, "an unknown id", camera.wire.frame(UNKNOWN_ID, bytes(camera.wire.word)))
+
+
+@check(_IGNORED, dialects=SMART)
+def long_body_is_ignored(camera: CameraUnderTest) -> None:
+    """A Query with a body is not answered, and what follows it is."""
+    body = bytes(camera.wire.word)
+    _ignored(camera, "a Query with a body", camera.wire.frame(MessageId.QUERY_APPLICATION, body))
+
+
+@check(_IGNORED, dialects=SMART)
+def short_body_is_ignored(camera: CameraUnderTest) -> None:
+    """A switch without an id is not answered, and what follows it is."""
+    _ignored(camera, "a switch without an id", camera.wire.frame(MessageId.SWITCH_APPLICATION))
+
+
+@check(_IGNORED, dialects=("handbook", "thesis"), transports=("udp",))
+def wrong_magic_is_ignored(camera: CameraUnderTest) -> None:
+    """A datagram with a wrong magic number is not answered, and what follows it is."""
+    _ignored(camera, "a wrong magic number", wrong_magic(camera))
+
+
+@check(_IGNORED, transports=("udp",))
+def broken_datagram_is_ignored(camera: CameraUnderTest) -> None:
+    """Datagrams that are cut, or whose length is wrong, are not answered."""
+    _ignored(
+        camera,
+        "datagrams that are not one whole frame",
+        camera.wire.frame(MessageId.QUERY_APPLICATION, length=camera.wire.word),
+        camera.wire.request(m.Query())[:-1],
+    )
+
+
+@check(
+    _BODIES,
+    about="every message that came has a known id and the documented length; commands that "
+    "have no answer have none",
+)
+def only_documented_messages_came(camera: CameraUnderTest) -> None:
+    """Messages and their lengths are documented ones."""
+    with camera.session() as client:
+        client.fence()
+    if camera.flaws:
+        raise Differs(
+            "only messages and lengths that are documented",
+            "; ".join(f"{flaw} ({shown})" for flaw, shown in camera.flaws.items()),
+        )

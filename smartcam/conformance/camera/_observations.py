@@ -1,0 +1,361 @@
+"""What is done to the camera once and looked at by several checks: inspections, switches, a reboot.
+
+Each is made at most once for a camera, so that a part on the machine is not inspected twenty times.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+from smartcam.conformance.camera._options import Allow
+from smartcam.conformance.camera._raw_client import EndedError, RawClient
+from smartcam.conformance.camera._results import Differs, NotObserved, Undescribed
+from smartcam.conformance.camera._wire import of_kind
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import MessageId
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.conformance.camera._session_under_test import CameraUnderTest
+    from smartcam.conformance.camera._wire import Heard
+
+T = TypeVar("T")
+
+INSPECTIONS = 3
+"""Inspections that are looked at: an order that changes shows."""
+
+REBOOT_POLL = 0.25
+"""Seconds between two Connects to a camera that restarts, at most."""
+
+
+def _once(observe: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest], T]:
+    """Make an observation at most once for a camera; what it raised is raised again."""
+
+    @functools.wraps(observe)
+    def observed(camera: CameraUnderTest) -> T:
+        return camera.once(observe.__name__, lambda: observe(camera))
+
+    return observed
+
+
+class ObservedRun(NamedTuple):
+    """One trigger and what came of it."""
+
+    sent_at: float  # when it was sent
+    came: list[Heard]  # the frames from then on until the camera waited for the next one
+    under_way: int | None  # status word that was asked for right behind the trigger; ``bid`` only
+    word: int  # size of a number, bytes
+    waiting: int  # mask of Waiting for Trigger
+
+    @property
+    def results(self) -> list[Heard]:
+        """The result containers."""
+        return of_kind(self.came, MessageId.RESULT_CONTAINER)
+
+    def places(self) -> tuple[int | None, int | None, int | None]:
+        """Return the places where Waiting fell, the first result came, and Waiting rose again."""
+        fell = result = rose = None
+        for place, heard in enumerate(self.came):
+            if heard.message_id == MessageId.RESULT_CONTAINER and result is None:
+                result = place
+            elif heard.message_id == MessageId.STATUS:
+                set_ = int.from_bytes(heard.body[: self.word], "little") & self.waiting
+                if not set_ and fell is None:
+                    fell = place
+                elif set_ and fell is not None and rose is None:
+                    rose = place
+        return fell, result, rose
+
+
+@_once
+def inspections(camera: CameraUnderTest) -> list[ObservedRun]:
+    """Trigger a few times, one after the other.
+
+    Raises:
+        NotObserved: nothing may be triggered, or the application runs without triggers.
+        Differs: the camera takes no trigger.
+    """
+    camera.require(Allow.TRIGGER)
+    found: list[ObservedRun] = []
+    with camera.session() as client:
+        for _ in range(INSPECTIONS):
+            camera.ready(client)
+            found.append(_inspect_once(camera, client))
+    times = [one.results[0].at - one.sent_at for one in found if one.results]
+    if times:
+        camera.measured["trigger until result"] = max(times)
+    return found
+
+
+def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
+    mark, under_way = len(client.heard), None
+    waiting, word = camera.wire.bits.waiting, camera.wire.word
+    sent_at = client.say(m.Trigger())
+    if camera.wire.is_bid:
+        client.say(m.GetStatus())
+        answer = client.until(
+            MessageId.STATUS, camera.options.timeout, "an answer to Get status", mark=mark
+        )
+        under_way = camera.wire.numbers(answer.body)[0]
+        _wait_result(camera, client, mark)
+        client.wait_status(
+            lambda status: status & waiting,
+            camera.options.timeout,
+            "a status with Waiting for Trigger",
+        )
+        return ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+    deadline = sent_at + camera.options.timeout
+    while (left := deadline - time.monotonic()) > 0:
+        so_far = ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+        if None not in so_far.places():
+            break
+        inspected = so_far.places()[2] is not None  # without a result so far: one may still come
+        if client.next(min(left, camera.options.quiet) if inspected else left) is None:
+            break
+    return ObservedRun(sent_at, client.heard[mark:], under_way, word, waiting)
+
+
+def _wait_result(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
+    """Wait for a result as long as one may take."""
+    deadline = time.monotonic() + camera.options.timeout
+    while (left := deadline - time.monotonic()) > 0:
+        if of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER):
+            return
+        client.next(left)
+
+
+@_once
+def unasked(camera: CameraUnderTest) -> ObservedRun:
+    """Trigger once and ask for nothing: statuses in it came by themselves.
+
+    For ``bid``, where :func:`inspections` asks. Raises as they do; NotObserved where no result
+    comes.
+    """
+    inspection_time(camera)  # there are results
+    with camera.session() as client:
+        camera.ready(client)
+        mark = len(client.heard)
+        sent_at = client.say(m.Trigger())
+        _wait_result(camera, client, mark)
+        client.listen(camera.patience)
+        seen = ObservedRun(
+            sent_at, client.heard[mark:], None, camera.wire.word, camera.wire.bits.waiting
+        )
+        if not seen.results:
+            raise NotObserved(f"no result came of a trigger: {client.words(mark)}")
+        return seen
+
+
+@_once
+def inspection_time(camera: CameraUnderTest) -> float:
+    """Return the time of the longest inspection, from trigger to result, seconds.
+
+    Raises:
+        NotObserved: no result comes from this application.
+    """
+    inspections(camera)
+    longest = camera.measured.get("trigger until result")
+    if longest is None:
+        raise NotObserved(f"application {camera.application} sends no results")
+    return longest
+
+
+def no_id(camera: CameraUnderTest) -> bool:
+    """Return whether result containers begin without the application's id: perhaps in ``b16``.
+
+    Raises:
+        NotObserved: as :func:`inspection_time`.
+        Undescribed: some have it.
+    """
+    inspection_time(camera)  # there are results
+    if camera.dialect != "b16":
+        return False
+    first = [
+        int.from_bytes(one.results[0].body[: camera.wire.word], "little")
+        for one in inspections(camera)
+        if one.results
+    ]
+    found = camera.application not in first
+    if not found and len(set(first)) > 1:
+        raise Undescribed("the same id in front of each result", str(first))
+    camera.learn_quirk("no_id", on=found)
+    return found
+
+
+# ---------------------------------------------------------------------- too many, or none wanted
+
+
+class DoubleTrigger(NamedTuple):
+    """Two triggers at once and what came of them."""
+
+    results: int  # how many results came
+    rose_at: float | None  # when the status with Overtriggered came, None where none did
+    fell_at: float | None  # when the status without it came
+    text: str  # what came, in words
+
+
+def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
+    """Trigger twice at once and watch Overtriggered rise and fall; raises as :func:`inspections`.
+
+    For cameras whose statuses come by themselves.
+    """
+    takes = inspection_time(camera)
+    bits, rose_at, fell_at = camera.wire.bits, None, None
+    with camera.session() as client:
+        camera.ready(client)
+        mark = len(client.heard)
+        client.say(m.Trigger(), m.Trigger())
+        client.fence()
+        deadline, place = time.monotonic() + 2 * takes + camera.options.quiet, mark
+        while fell_at is None:
+            if place == len(client.heard):
+                left = deadline - time.monotonic()
+                if left <= 0 or client.next(left) is None:
+                    break
+            heard, place = client.heard[place], place + 1
+            if heard.message_id != MessageId.STATUS:
+                continue
+            if not camera.wire.numbers(heard.body)[0] & bits.overtriggered:
+                fell_at = None if rose_at is None else heard.at
+            elif rose_at is None:
+                rose_at = heard.at
+                deadline = rose_at + camera.options.timeout
+        client.listen(takes)
+        results = len(of_kind(client.heard[mark:], MessageId.RESULT_CONTAINER))
+        return DoubleTrigger(results, rose_at, fell_at, client.words(mark))
+
+
+class Stopped(NamedTuple):
+    """A trigger to a stopped camera and what came of it."""
+
+    came: list[Heard]
+    text: str  # what came, in words
+
+
+@_once
+def stopped_trigger(camera: CameraUnderTest) -> Stopped:
+    """Trigger a stopped camera; raises as :func:`inspections`."""
+    camera.require(Allow.RUN | Allow.TRIGGER)
+    takes = inspection_time(camera)
+    with camera.session() as client:
+        camera.stop(client)
+        mark = len(client.heard)
+        client.say(m.Trigger())
+        came = client.listen(takes + camera.options.quiet)
+        return Stopped(came, client.words(mark))
+
+
+# ---------------------------------------------------------------------- switch, reboot
+
+
+class Switch(NamedTuple):
+    """A switch and what came of it."""
+
+    application: int  # the one that was asked for
+    came: list[Heard]  # the frames until the answer and the status that is not busy
+    answer: Heard
+    active: int  # what Query told afterwards
+    seconds: float  # from the request to the answer
+
+
+@_once
+def switch(camera: CameraUnderTest) -> Switch:
+    """Load the other application, of a stopped camera.
+
+    Raises:
+        NotObserved: none was named, or it may not be loaded.
+        Differs: no answer comes.
+    """
+    camera.require(Allow.SWITCH)
+    other = camera.options.other_application
+    if other is None:
+        raise NotObserved("no other application was named: --camera-other-application")
+    with camera.session() as client:
+        if camera.active(client) == other:
+            camera.load(client, camera.application)
+        if camera.active(client) == other:
+            raise NotObserved(f"application {other} is the active one: name another application")
+        camera.stop(client)
+        mark, began = len(client.heard), time.monotonic()
+        answer = client.answer(
+            m.SwitchApplication(application=other), within=camera.options.switch_timeout
+        )
+        took = answer.at - began
+        _wait_not_busy(camera, client, mark)
+        came = client.heard[mark:]
+        camera.measured["switch"] = took
+        return Switch(other, came, answer, camera.active(client), took)
+
+
+def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
+    """Where a status with BUSY came, wait for the one without it."""
+    busy = camera.wire.bits.busy
+    words = camera.wire.statuses(client.heard[mark:])
+    if busy and any(one & busy for one in words) and words[-1] & busy:
+        client.until(
+            lambda one: (
+                one.message_id == MessageId.STATUS and not camera.wire.numbers(one.body)[0] & busy
+            ),
+            camera.options.timeout,
+            "a status without BUSY after the switch",
+        )
+
+
+class Downtime(NamedTuple):
+    """A restart."""
+
+    seconds: float  # from the request to the first answered Connect
+    application: int  # the active one afterwards
+    running: bool  # run mode afterwards
+
+
+@_once
+def downtime(camera: CameraUnderTest) -> Downtime:
+    """Restart the camera and wait until it answers again.
+
+    Raises:
+        NotObserved: that is not allowed.
+        Differs: it does not go away, or does not come back.
+    """
+    camera.require(Allow.REBOOT)
+    with camera.session() as client:
+        began = client.say(m.Reboot())
+        _wait_gone(camera, client)
+    deadline = began + camera.options.reboot_timeout
+    while time.monotonic() < deadline:
+        tried_at = time.monotonic()
+        if _answers(camera):
+            seconds = time.monotonic() - began
+            with camera.session() as client:
+                return Downtime(seconds, camera.active(client), camera.running(client))
+        time.sleep(max(0.0, tried_at + min(REBOOT_POLL, camera.options.quiet) - time.monotonic()))
+    camera.gone = f"it did not come back within {camera.options.reboot_timeout:g} s of a reboot"
+    raise Differs("the camera is back after a reboot", camera.gone)
+
+
+def _wait_gone(camera: CameraUnderTest, client: RawClient) -> None:
+    deadline = time.monotonic() + camera.options.timeout
+    try:
+        while time.monotonic() < deadline:
+            client.say(m.Query())
+            if client.next(camera.patience) is None:
+                return
+    except EndedError:
+        return
+    raise Differs(
+        "the camera restarts: the session ends",
+        f"it still answers after {camera.options.timeout:g} s",
+    )
+
+
+def _answers(camera: CameraUnderTest) -> bool:
+    """Whether a Connect is answered now."""
+    try:
+        with camera.link() as client:
+            client.answer(m.Connect(), within=max(camera.options.quiet, REBOOT_POLL))
+    except (NotObserved, Differs, EndedError):
+        return False
+    return True

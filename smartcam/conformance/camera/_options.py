@@ -1,0 +1,148 @@
+"""What is asked for: the camera, what may be done to it, how long to wait."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+MAX_SECONDS = 3600.0
+"""Seconds that may be waited for one thing at most."""
+
+MAX_INPUT_DATA = 1 << 16
+"""Bytes of input data: it has a container's limit of about 64 kB (HAL 15, published for that
+side)."""
+
+
+class Allow(enum.Flag):
+    """What may be done to a camera.
+
+    ``RUN``, ``TRIGGER`` and ``SWITCH`` are allowed unless it is said otherwise: what they change is
+    put back. The others leave something behind.
+    """
+
+    NOTHING = 0
+    RUN = enum.auto()
+    """Start and stop; put back."""
+    TRIGGER = enum.auto()
+    """Inspect; what hangs on the camera's outputs sees it."""
+    SWITCH = enum.auto()
+    """Load an application; the one of before is loaded again."""
+    CLOCK = enum.auto()
+    """Set the clock; put back to the second."""
+    NUMBER = enum.auto()
+    """Set the number of the next run; it cannot be read, so it cannot be put back."""
+    INPUT = enum.auto()
+    """Send input data; the queue is left empty, or out of step until the application is loaded."""
+    ERRORS = enum.auto()
+    """Reset error bits that stay set; gone is gone."""
+    REBOOT = enum.auto()
+    """Restart; the clock is lost and the numbering begins at 0."""
+
+    @classmethod
+    def read(cls, text: str) -> Allow:
+        """Read a comma list: names add to the three of the beginning, ``nothing`` forgets those.
+
+        Raises:
+            ConfigurationError: a name is unknown.
+        """
+        names = [name.strip().lower() for name in text.split(",") if name.strip()]
+        allowed = cls.RUN | cls.TRIGGER | cls.SWITCH
+        if "nothing" in names:
+            allowed = cls.NOTHING
+        for name in names:
+            if name == "all":
+                allowed |= ~cls.NOTHING
+            elif name.upper() not in cls.__members__:
+                known = ", ".join([*(one.lower() for one in cls.__members__), "all"])
+                raise ConfigurationError(f"--camera-allow: {name!r} is unknown; known are {known}")
+            else:
+                allowed |= cls[name.upper()]
+        return allowed
+
+    @property
+    def names(self) -> list[str]:
+        """Their names, in lower case."""
+        return [one.name.lower() for one in type(self) if one in self and one.name]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConformanceOptions:
+    """What is asked for. Times are seconds.
+
+    Attributes:
+        url: the camera's address; a dialect that it does not name is found out.
+        application: id of the one that may be triggered, None for the one that is active.
+        other_application: id of one that may be loaded beside it, None for none.
+        allow: what may be done to the camera.
+        timeout: how long an answer, a status or a result may take.
+        quiet: how long nothing comes where the camera is silent.
+        switch_timeout: how long it may take to load an application.
+        reboot_timeout: how long a restart may take.
+        sequence_offset: where in the application's results the int32 stands that is the sequence
+            number, counted behind the application's id; None where it is not in them.
+        input_data: bytes that the application takes as input data, None where it takes none.
+
+    Raises:
+        ConfigurationError: a number cannot work.
+    """
+
+    url: str
+    application: int | None = None
+    other_application: int | None = None
+    allow: Allow = Allow.RUN | Allow.TRIGGER | Allow.SWITCH
+    timeout: float = 5.0
+    quiet: float = 0.5
+    switch_timeout: float = 30.0
+    reboot_timeout: float = 180.0
+    sequence_offset: int | None = None
+    input_data: bytes | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("timeout", "quiet", "switch_timeout", "reboot_timeout"):
+            value = getattr(self, name)
+            if not 0 < value <= MAX_SECONDS:
+                raise ConfigurationError(
+                    f"{name} is {value!r}: expected seconds, more than 0 and at most "
+                    f"{MAX_SECONDS:g}"
+                )
+        for name in ("application", "other_application"):
+            value = getattr(self, name)
+            if value is not None and not 1 <= value <= 0xFFFFFFFF:
+                raise ConfigurationError(f"{name} is {value!r}: expected an id, 1 or more")
+        if self.other_application is not None and self.other_application == self.application:
+            raise ConfigurationError(f"both applications are {self.application}: name another one")
+        if self.sequence_offset is not None and not 0 <= self.sequence_offset <= 0xFFFF:
+            raise ConfigurationError(
+                f"sequence_offset is {self.sequence_offset!r}: expected 0 to 65535"
+            )
+        if self.input_data is not None and len(self.input_data) > MAX_INPUT_DATA:
+            raise ConfigurationError(
+                f"input_data has {len(self.input_data)} bytes: {MAX_INPUT_DATA} at most"
+            )
+
+
+def _read_hex(text: str) -> bytes:
+    try:
+        return bytes.fromhex(text)
+    except ValueError as exc:
+        raise ConfigurationError(f"--camera-input: {text!r} is not hex: {exc}") from exc
+
+
+READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "--camera-application": ("application", int),
+    "--camera-other-application": ("other_application", int),
+    "--camera-allow": ("allow", Allow.read),
+    "--camera-timeout": ("timeout", float),
+    "--camera-quiet": ("quiet", float),
+    "--camera-switch-timeout": ("switch_timeout", float),
+    "--camera-reboot-timeout": ("reboot_timeout", float),
+    "--camera-sequence-offset": ("sequence_offset", int),
+    "--camera-input": ("input_data", _read_hex),
+}
+"""Which field an option of the command line is, and what reads it."""

@@ -1,0 +1,312 @@
+"""One way to the camera: a socket, every wait with a deadline, everything written down."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.conformance.camera._results import Differs, NotObserved
+from smartcam.conformance.camera._wire import BadBytesError, Heard, RawDialect
+from smartcam.exceptions import hex_excerpt
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import MessageId
+
+if TYPE_CHECKING:
+    from collections import deque
+    from collections.abc import Callable
+    from typing import Self
+
+MAX_HEARD = 1 << 24
+"""Bytes of bodies that one client keeps: 256 of the largest results; more end the experiment."""
+
+MAX_TRAIL = 60
+"""Lines of what went over the wire that a report shows: the last ones."""
+
+FAREWELL = 0.2
+"""Seconds that the camera has to close its side after a Disconnect."""
+
+LOOK_AGAIN = 0.01
+"""Seconds between two requests for a status that does not come by itself."""
+
+
+class EndedError(Exception):
+    """The camera has ended the link, or nothing is there any more."""
+
+
+@dataclass(eq=False)
+class RawClient:
+    """A TCP connection or a UDP socket; a context manager.
+
+    Leaving it says Disconnect where there may be a session, and closes the socket.
+
+    Raises:
+        OSError: no connection.
+    """
+
+    wire: RawDialect
+    _address: tuple[str, int]
+    _tcp: bool
+    _timeout: float  # seconds for the connection, and for an answer
+    _quiet: float  # seconds of silence that count as no answer
+    _trail: deque[str]  # where everything that passes is written down
+    _on_change: Callable[[], None]  # before something goes out that changes the camera's state
+
+    def __post_init__(self) -> None:
+        self.heard: list[Heard] = []  # every frame that came, in order
+        self.status: int | None = None  # the last status word, None where none came
+        self.ended: bool = False  # the camera has ended the link
+        self._began = time.monotonic()
+        self._buffer = b""
+        self._kept = 0
+        self._may_have_session = False
+        self._socket = self._open()
+
+    def _open(self) -> socket.socket:
+        if self._tcp:
+            opened = socket.create_connection(self._address, timeout=self._timeout)
+            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return opened
+        found = socket.getaddrinfo(*self._address, type=socket.SOCK_DGRAM)
+        family, kind, proto, _, where = found[0]
+        opened = socket.socket(family, kind, proto)
+        try:
+            opened.connect(where)
+        except OSError:
+            opened.close()
+            raise
+        return opened
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the session where there may be one, and close the socket; bounded."""
+        with contextlib.suppress(OSError, EndedError), self._socket:
+            if self.ended:
+                return
+            if self._may_have_session:
+                self._write(self.wire.request(m.Disconnect()))
+            if self._tcp:
+                # a socket that is closed with unread bytes sends a reset, which may overtake
+                self._socket.shutdown(socket.SHUT_WR)
+                deadline = time.monotonic() + FAREWELL
+                while (left := deadline - time.monotonic()) > 0:
+                    self._socket.settimeout(left)
+                    if not self._socket.recv(1 << 16):
+                        break
+
+    # ------------------------------------------------------------------ out
+
+    def say(self, *messages: m.Message) -> float:
+        """Send requests, in one write on TCP and a datagram each on UDP; return when.
+
+        Raises:
+            EndedError: the link is down.
+        """
+        for message in messages:
+            if isinstance(message, m.Connect):
+                self._may_have_session = True
+            elif isinstance(message, m.Disconnect):
+                self._may_have_session = False
+            elif isinstance(message, _CHANGES):
+                self._on_change()
+        return self.write(*[self.wire.request(message) for message in messages])
+
+    def write(self, *data: bytes) -> float:
+        """Send bytes, whatever they are; as :meth:`say`."""
+        for one in data:
+            self._note(">", self.wire.spell_request(one))
+        at = time.monotonic()
+        for one in [b"".join(data)] if self._tcp else data:
+            self._write(one)
+        return at
+
+    def _write(self, data: bytes) -> None:
+        if self.ended:
+            raise EndedError("the camera has ended the link")
+        self._socket.settimeout(self._timeout)
+        try:
+            self._socket.sendall(data)
+        except OSError as exc:
+            raise self._end(exc) from exc
+
+    # ------------------------------------------------------------------ in
+
+    def next(self, within: float) -> Heard | None:
+        """Return the next frame, None where none comes ``within`` so many seconds.
+
+        Raises:
+            EndedError: the camera ends the link.
+            Differs: it sends what makes no frame.
+        """
+        deadline = time.monotonic() + within
+        while True:
+            heard = self._cut()
+            if heard is not None:
+                return heard
+            left = deadline - time.monotonic()
+            if left <= 0 or not self._receive(left):
+                return None
+
+    def _cut(self) -> Heard | None:
+        if not self._buffer:
+            return None
+        try:
+            found = self.wire.cut(self._buffer)
+            if not self._tcp and (found is None or found[2] != len(self._buffer)):
+                raise BadBytesError(
+                    f"a datagram is not one whole frame: {hex_excerpt(self._buffer)}"
+                )
+        except BadBytesError as exc:
+            self._note("<", hex_excerpt(self._buffer))
+            self._buffer = b""
+            raise Differs(f"frames of dialect {self.wire.dialect.name}", str(exc)) from exc
+        if found is None:
+            return None
+        message_id, body, size = found
+        self._buffer = self._buffer[size:]
+        heard = Heard(time.monotonic(), message_id, body)
+        self._note("<", self.wire.spell(heard))
+        self._kept += len(body)
+        if self._kept > MAX_HEARD:
+            raise NotObserved(f"the camera sent more than {MAX_HEARD} bytes meanwhile")
+        self.heard.append(heard)
+        if message_id == MessageId.STATUS and len(body) >= self.wire.word:
+            self.status = self.wire.numbers(body)[0]
+        return heard
+
+    def _receive(self, within: float) -> bool:
+        if self.ended:
+            raise EndedError("the camera has ended the link")
+        self._socket.settimeout(within)
+        try:
+            data = self._socket.recv(1 << 17)
+        except TimeoutError:
+            return False
+        except OSError as exc:
+            raise self._end(exc) from exc
+        if self._tcp and not data:
+            raise self._end(None)
+        self._buffer += data
+        return True
+
+    def _end(self, exc: OSError | None) -> EndedError:
+        self.ended = True
+        how = f"the camera has ended the link: {exc or 'it is closed'}"
+        self._note("!", how)
+        return EndedError(how)
+
+    def _note(self, mark: str, text: str) -> None:
+        self._trail.append(f"{time.monotonic() - self._began:8.3f} {mark} {text}")
+
+    # ------------------------------------------------------------------ waits
+
+    def until(
+        self, fits: Callable[[Heard], object] | int, within: float, expected: str, *, mark: int = -1
+    ) -> Heard:
+        """Return the first frame that fits, of those that came behind ``mark`` or come now.
+
+        Args:
+            fits: its id, or whether it is the one.
+            within: seconds from now.
+            expected: what a difference says.
+            mark: a length of :attr:`heard`; default: only what comes now.
+
+        Raises:
+            Differs: it does not come in time.
+            EndedError: the camera ends the link.
+        """
+        is_it = fits if callable(fits) else lambda heard: heard.message_id == fits
+        first = len(self.heard) if mark < 0 else mark
+        for heard in self.heard[first:]:
+            if is_it(heard):
+                return heard
+        deadline = time.monotonic() + within
+        while (left := deadline - time.monotonic()) > 0:
+            heard_now = self.next(left)
+            if heard_now is not None and is_it(heard_now):
+                return heard_now
+        raise Differs(f"{expected} within {within:g} s", self.words(first))
+
+    def answer(self, request: m.Message, *, within: float | None = None) -> Heard:
+        """Send a request and return its answer, which has its id; raises as :meth:`until`."""
+        message_id = self.wire.dialect.message_id(request)
+        mark = len(self.heard)
+        self.say(request)
+        within = self._timeout if within is None else within
+        return self.until(message_id, within, f"an answer to {type(request).__name__}", mark=mark)
+
+    def trigger(self, expected: str = "a result", *, within: float | None = None) -> Heard:
+        """Send a trigger and return the next result; raises as :meth:`until`."""
+        mark = len(self.heard)
+        self.say(m.Trigger())
+        within = self._timeout if within is None else within
+        return self.until(MessageId.RESULT_CONTAINER, within, expected, mark=mark)
+
+    def fence(self) -> list[Heard]:
+        """Send a Query and return what came before its answer: all that was on its way.
+
+        Raises:
+            Differs: the Query is not answered.
+            EndedError: the camera ends the link.
+        """
+        mark = len(self.heard)
+        self.answer(m.Query())
+        return self.heard[mark:-1]
+
+    def listen(self, seconds: float) -> list[Heard]:
+        """Return the frames that come in so many seconds; an end of the link ends it."""
+        mark, deadline = len(self.heard), time.monotonic() + seconds
+        with contextlib.suppress(EndedError):
+            while (left := deadline - time.monotonic()) > 0:
+                self.next(left)
+        return self.heard[mark:]
+
+    def words(self, first: int = 0) -> str:
+        """Describe the frames from a place of :attr:`heard` on, for a difference."""
+        shown = [self.wire.spell(one) for one in self.heard[first:]]
+        if len(shown) > 5:
+            shown = [*shown[:4], f"{len(shown) - 4} more"]
+        end = ["the end of the link"] if self.ended else []
+        return "; ".join(shown + end) or "nothing"
+
+    # ------------------------------------------------------------------ the status
+
+    def look(self) -> int:
+        """Return the status word as it is now: asked for where it can be, else the last one.
+
+        Raises:
+            NotObserved: none came since Connect.
+            Differs: a request is not answered.
+        """
+        if self.wire.is_bid:
+            self.say(m.GetStatus())
+        self.fence()
+        if self.status is None:
+            raise NotObserved("the camera has told no status")
+        return self.status
+
+    def wait_status(self, fits: Callable[[int], object], within: float, expected: str) -> int:
+        """Wait for a status and return it; raises as :meth:`until` and :meth:`look`."""
+        deadline = time.monotonic() + within
+        word = self.look()
+        while not fits(word):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise Differs(f"{expected} within {within:g} s", f"the status stays {word:#x}")
+            if self.wire.is_bid:
+                self.listen(LOOK_AGAIN)
+                word = self.look()
+            else:
+                self.next(left)
+                word = word if self.status is None else self.status
+        return word
+
+
+_CHANGES = (m.Start, m.Stop, m.SwitchApplication, m.Reboot)

@@ -1,0 +1,206 @@
+"""What came of it: for people, as YAML for a scenario, and as JSON."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import smartcam
+from smartcam.conformance.camera._results import CameraFinding, Check, CheckOutcome, Question
+from smartcam.emulator._bvs.quirks import Quirks
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from smartcam.conformance.camera._session_under_test import CameraUnderTest
+
+SAME_TIME = 0.2
+"""Part by which a measured time may differ from a quirk's default and still be the same."""
+
+SAME_SECONDS = 0.02
+"""Seconds by which it may."""
+
+
+class CameraReport:
+    """Everything that was found about one camera.
+
+    Args:
+        camera: the camera.
+
+    Attributes:
+        camera: the camera.
+        findings: what came of each check and question, in order.
+    """
+
+    def __init__(self, camera: CameraUnderTest) -> None:
+        self.findings: list[CameraFinding] = []
+        self.camera: CameraUnderTest = camera
+
+    def add(self, finding: CameraFinding) -> None:
+        """Add what came of a check or question; of one that is done again the last counts."""
+        self.findings = [one for one in self.findings if one.item.name != finding.item.name]
+        self.findings.append(finding)
+
+    # ------------------------------------------------------------------ what is in it
+
+    @property
+    def url(self) -> str:
+        """The camera's address; dialect and quirks are pinned as they were found."""
+        return self.camera.address.url
+
+    @property
+    def differing(self) -> list[CameraFinding]:
+        """The findings in which the camera is not the documented one."""
+        return [one for one in self.findings if one.failed]
+
+    @property
+    def quirks(self) -> dict[str, Any]:
+        """The settings of the emulator that describe the camera, as far as they were observed."""
+        return {
+            one.item.quirk: one.value
+            for one in self.findings
+            if isinstance(one.item, Question)
+            and one.item.quirk is not None
+            and one.outcome is CheckOutcome.OBSERVED
+        }
+
+    def __getitem__(self, name: str) -> CameraFinding:
+        """Return the finding of one check or question.
+
+        Raises:
+            KeyError: it was not done.
+        """
+        for one in self.findings:
+            if one.item.name == name:
+                return one
+        raise KeyError(name)
+
+    # ------------------------------------------------------------------ as text
+
+    def text(self) -> str:
+        """Return it for people."""
+        lines = [*self._head(), *self._differences(), *self._answers(), *self._unseen()]
+        return "\n".join([*lines, "", *self.yaml().splitlines(), ""])
+
+    def _head(self) -> list[str]:
+        camera, before = self.camera, self.camera.before
+        lines = [f"camera: {self.url}"]
+        if before is not None:
+            run = "in run mode" if before.running else "stopped"
+            lines.append(f"found with application {before.application}, {run}; left so")
+        if camera.left:
+            lines[-1] = f"NOT LEFT AS IT WAS: {camera.left}"
+        if camera.gone:
+            lines.append(f"THE CAMERA IS GONE: {camera.gone}")
+        count = Counter(one.outcome for one in self.findings if isinstance(one.item, Check))
+        lines.append(
+            f"checks: {count[CheckOutcome.AS_DOCUMENTED]} as documented, "
+            f"{count[CheckOutcome.DIFFERS]} not, {count[CheckOutcome.NOT_OBSERVED]} not observed"
+        )
+        if camera.measured:
+            times = ", ".join(f"{name} {1000 * s:.1f} ms" for name, s in camera.measured.items())
+            lines.append(f"times: {times}")
+        return lines
+
+    def _differences(self) -> list[str]:
+        lines: list[str] = []
+        for one in self.differing:
+            lines += [
+                f"  {one.item.name}: {one.item.about}",
+                f"    source:   {one.source}, {one.grade}",
+                f"    expected: {one.expected}",
+                f"    came:     {one.came}",
+                *(f"      {row}" for row in one.wire),
+            ]
+        return ["", "differs from the documented device:", *lines] if lines else []
+
+    def _answers(self) -> list[str]:
+        lines = [
+            f"  {one.item.name}: {_plain(one.value)}  ({one.item.about}{_decides(one)})"
+            for one in self.findings
+            if one.outcome is CheckOutcome.OBSERVED
+        ]
+        return ["", "open questions, answered:", *lines] if lines else []
+
+    def _unseen(self) -> list[str]:
+        reasons: dict[str, list[str]] = {}
+        for one in self.findings:
+            if one.outcome is CheckOutcome.NOT_OBSERVED:
+                reasons.setdefault(one.text, []).append(one.item.name)
+        lines: list[str] = []
+        for why, names in reasons.items():
+            lines.append(f"  because {why}:")
+            lines += textwrap.wrap(
+                ", ".join(names),
+                96,
+                initial_indent="    ",
+                subsequent_indent="    ",
+                break_on_hyphens=False,
+            )
+        return ["", "not observed:", *lines] if lines else []
+
+    def yaml(self) -> str:
+        """Return the quirks as a part of a scenario file; what was not observed is a comment."""
+        lines: list[str] = []
+        for one in self.findings:
+            item = one.item
+            if not isinstance(item, Question) or item.quirk is None:
+                continue
+            if one.outcome is CheckOutcome.OBSERVED:
+                note = "  # as in the emulator" if _is_default(item.quirk, one.value) else ""
+                lines.append(f"  {item.quirk}: {_plain(one.value)}{note}")
+            elif one.outcome is not CheckOutcome.NOT_APPLICABLE:
+                what = "no setting fits" if one.failed else "not observed"
+                lines.append(f"  # {item.quirk}: {what}")
+        if all(line.startswith("  #") for line in lines):
+            return "\n".join(["quirks: {}", *lines])
+        return "\n".join(["quirks:", *lines])
+
+    # ------------------------------------------------------------------ as JSON
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        camera, before = self.camera, self.camera.before
+        return {
+            "smartcam": smartcam.__version__,
+            "url": self.url,
+            "transport": camera.transport,
+            "dialect": camera.known_dialect or None,
+            "before": None if before is None else before._asdict(),
+            "left": camera.left or None,
+            "gone": camera.gone or None,
+            "allowed": camera.options.allow.names,
+            "measured_seconds": {name: round(s, 6) for name, s in camera.measured.items()},
+            "quirks": self.quirks,
+            "checks": [one.as_json() for one in self.findings if isinstance(one.item, Check)],
+            "questions": [one.as_json() for one in self.findings if isinstance(one.item, Question)],
+        }
+
+    def write(self, path: str) -> None:
+        """Write it to a file as JSON.
+
+        Raises:
+            ConfigurationError: the file cannot be written.
+        """
+        try:
+            Path(path).write_text(json.dumps(self.as_json(), indent=2) + "\n", encoding="utf-8")
+        except OSError as exc:
+            raise ConfigurationError(f"--camera-report {path}: {exc}") from exc
+
+
+def _plain(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _decides(finding: CameraFinding) -> str:
+    documents = finding.item.documents
+    return f"; {', '.join(documents)}" if documents else ""
+
+
+def _is_default(quirk: str, value: object) -> bool:
+    default = Quirks.model_fields[quirk].default
+    if isinstance(default, float) and isinstance(value, float):
+        return abs(value - default) <= max(SAME_SECONDS, SAME_TIME * default)
+    return bool(value == default)

@@ -1,0 +1,220 @@
+"""Checks: how a session begins and ends, and what a camera says outside of one."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from smartcam.conformance._dialects import SMART
+from smartcam.conformance.camera._observations import inspection_time
+from smartcam.conformance.camera._options import Allow
+from smartcam.conformance.camera._raw_client import EndedError
+from smartcam.conformance.camera._results import Differs, NotObserved, check
+from smartcam.conformance.camera._wire import of_kind
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import MessageId
+
+if TYPE_CHECKING:
+    from smartcam.conformance.camera._session_under_test import CameraUnderTest
+    from smartcam.conformance.camera._wire import Heard
+
+ON_THE_WAY = 0.02
+"""Seconds that what was said before a Disconnect may be on its way at least."""
+
+
+BETWEEN_PIECES = 0.005
+"""Seconds between the bytes of a message that comes in pieces, so that each has a segment."""
+
+_NARROWED = "the bodies of the dialects with 32 bits narrowed, inferred"
+
+
+@check({"": "SC-A29, published", "b16": _NARROWED, "bid": "ID-a 226, published"})
+def connect_is_answered(camera: CameraUnderTest) -> None:
+    """Connect is answered with the protocol version, 1."""
+    began = time.monotonic()
+    try:
+        try:
+            with camera.link() as client:
+                answer = client.answer(m.Connect())
+        except (Differs, EndedError):
+            # the first attempt after an old session may fail (T 3.1.4, published)
+            with camera.link() as client:
+                client.say(m.Disconnect())
+                answer = client.answer(m.Connect())
+    except (Differs, EndedError, NotObserved) as exc:
+        camera.gone = str(exc)
+        came = exc.came if isinstance(exc, Differs) else str(exc)
+        raise Differs("an answer to Connect", came) from exc
+    camera.measured["connect"] = answer.at - began
+    numbers = camera.wire.numbers(answer.body)
+    coded = camera.wire.is_bid or (camera.dialect == "b16" and len(answer.body) == 4)
+    expected = (0, 1) if coded else (1,)
+    size = len(expected) * camera.wire.word
+    if numbers != expected or len(answer.body) != size:
+        raise Differs(
+            f"the version 1{' behind the code 0' if coded else ''}, {size} bytes",
+            camera.wire.spell(answer),
+        )
+
+
+@check({"": "SC-A28, SC-A30, published", "b16": "SC-C40, published"}, dialects=SMART)
+def status_follows_connect(camera: CameraUnderTest) -> None:
+    """A status comes after the answer to Connect."""
+    with camera.link() as client:
+        client.answer(m.Connect())
+        status = client.until(
+            MessageId.STATUS, camera.options.timeout, "a status after the answer to Connect", mark=0
+        )
+        flaw = camera.wire.flaw(status)
+        if flaw is not None:
+            raise Differs("a status as documented", f"{flaw}: {camera.wire.spell(status)}")
+
+
+@check("SC-A30, SC-B33, published", dialects=("handbook", "thesis"))
+def endian_field_is_0(camera: CameraUnderTest) -> None:
+    """The second word of the status is 0: result containers are little endian."""
+    with camera.session() as client:
+        status = of_kind(client.heard, MessageId.STATUS)[0]
+    if camera.wire.numbers(status.body)[1:2] != (0,):
+        raise Differs("the endian field 0: little endian", camera.wire.spell(status))
+
+
+@check({"": "SC-B34, published", "b16": _NARROWED, "bid": "ID-b 216, published"})
+def query_is_answered(camera: CameraUnderTest) -> None:
+    """Query is answered with the id of the active application."""
+    with camera.session() as client:
+        answer = client.answer(m.Query())
+    numbers = camera.wire.numbers(answer.body)
+    coded = camera.wire.dialect.coded
+    if camera.wire.flaw(answer) or not numbers[-1] or (coded and numbers[0] != 2):
+        code = "the code 2 and " if coded else ""
+        raise Differs(f"{code}the id of an application, 1 or more", camera.wire.spell(answer))
+
+
+@check("SC-A28, SC-C40, published")
+def silent_before_connect(camera: CameraUnderTest) -> None:
+    """Before Connect neither results nor statuses come."""
+    with camera.link() as client:
+        if client.listen(camera.options.quiet):
+            raise Differs("nothing before Connect", client.words())
+
+
+@check("no document, inferred")
+def deaf_before_connect(camera: CameraUnderTest) -> None:
+    """Requests before Connect are ignored."""
+    with camera.link() as client:
+        client.say(m.Query())
+        if client.listen(camera.options.quiet):
+            raise Differs("no answer to a Query before Connect", client.words())
+
+
+@check({"": "SC-A28, SC-A29, published", "b16": "KB-msg, published"}, documents=("C3",))
+def silent_after_disconnect(camera: CameraUnderTest) -> None:
+    """After Disconnect nothing comes, of a smart camera not even an answer to it."""
+    with camera.session() as client:
+        client.fence()
+        mark = len(client.heard)
+        client.say(m.Disconnect())
+        came = _without_answer(camera, client.listen(camera.options.quiet))
+        if came:
+            raise Differs("nothing after Disconnect", client.words(mark))
+
+
+@check("no document, inferred")
+def deaf_after_disconnect(camera: CameraUnderTest) -> None:
+    """Requests after Disconnect are ignored."""
+    with camera.session() as client:
+        client.fence()
+        mark = len(client.heard)
+        client.say(m.Disconnect())
+        client.say(m.Query())
+        if _without_answer(camera, client.listen(camera.options.quiet)):
+            raise Differs("no answer to a Query after Disconnect", client.words(mark))
+
+
+def _without_answer(camera: CameraUnderTest, came: list[Heard]) -> list[Heard]:
+    """Return the frames without the answer to Disconnect that ``bid`` may give (C3)."""
+    if not camera.wire.is_bid:
+        return came
+    return [one for one in came if one.message_id != MessageId.DISCONNECT]
+
+
+@check("SC-A29, published", needs=Allow.TRIGGER)
+def no_result_after_disconnect(camera: CameraUnderTest) -> None:
+    """The result of a trigger before Disconnect does not come after it."""
+    takes = inspection_time(camera)
+    with camera.session() as client:
+        camera.ready(client)
+        mark = len(client.heard)
+        client.say(m.Trigger())
+        ended_at = client.say(m.Disconnect())
+        came = client.listen(takes + camera.options.quiet)
+        grace = max(ON_THE_WAY, 2 * camera.measured.get("query", 0.0))
+        results = of_kind(came, MessageId.RESULT_CONTAINER)
+        if any(one.at - ended_at > grace for one in results):
+            raise Differs("no result after Disconnect", client.words(mark))
+    if results:
+        raise NotObserved("the result was on its way already")
+
+
+@check("T 3.1.1, published")
+def disconnect_without_session_is_harmless(camera: CameraUnderTest) -> None:
+    """A Disconnect without a session does no harm."""
+    with camera.link() as client:
+        client.say(m.Disconnect())
+        try:
+            client.answer(m.Connect())
+        except EndedError as exc:
+            raise Differs("a session after a Disconnect without one", str(exc)) from exc
+
+
+@check("no document, inferred")
+def state_survives_session(camera: CameraUnderTest) -> None:
+    """Application and run mode stay when a session ends."""
+    with camera.session() as client:
+        was = (camera.active(client), camera.running(client))
+    with camera.session() as client:
+        now = (camera.active(client), camera.running(client))
+    if was != now:
+        raise Differs(f"application and run mode as before: {was}", str(now))
+
+
+@check("SC-A28, MV24, published", transports=("udp",))
+def newcomer_wins(camera: CameraUnderTest) -> None:
+    """The Connect of a second client ends the session of the first."""
+    with camera.session() as first, camera.link() as second:
+        second.answer(m.Connect())
+        mark = len(first.heard)
+        first.write(camera.wire.request(m.Query()))
+        if first.listen(camera.options.quiet):
+            raise Differs("silence for the client that was there before", first.words(mark))
+        second.fence()
+
+
+@check("SC-C40, derived", transports=("tcp",))
+def messages_share_a_segment(camera: CameraUnderTest) -> None:
+    """Several requests in one segment are all answered."""
+    with camera.session() as client:
+        mark = len(client.heard)
+        client.say(m.Query(), m.Query(), m.Query())
+        client.until(
+            lambda _: len(of_kind(client.heard[mark:], MessageId.QUERY_APPLICATION)) == 3,
+            camera.options.timeout,
+            "three answers to three Queries in one segment",
+        )
+
+
+@check("SC-C40, derived", transports=("tcp",))
+def a_message_may_come_in_pieces(camera: CameraUnderTest) -> None:
+    """A request that comes byte by byte is answered."""
+    with camera.session() as client:
+        mark = len(client.heard)
+        for byte in camera.wire.request(m.Query()):
+            client.write(bytes([byte]))
+            client.listen(BETWEEN_PIECES)
+        client.until(
+            MessageId.QUERY_APPLICATION,
+            camera.options.timeout,
+            "an answer to a Query that is sent byte by byte",
+            mark=mark,
+        )

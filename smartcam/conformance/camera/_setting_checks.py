@@ -1,0 +1,311 @@
+"""Checks: switching applications, the clock, the sequence number, input data, a restart."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING
+
+from smartcam.conformance._dialects import SMART
+from smartcam.conformance.camera._observations import downtime, inspection_time, no_id, switch
+from smartcam.conformance.camera._options import Allow
+from smartcam.conformance.camera._results import Differs, NotObserved, check
+from smartcam.conformance.camera._wire import of_kind
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import MessageId
+
+if TYPE_CHECKING:
+    from smartcam.conformance.camera._raw_client import RawClient
+    from smartcam.conformance.camera._session_under_test import CameraUnderTest
+    from smartcam.conformance.camera._wire import Heard
+
+UNKNOWN_APPLICATION = 0xFFFD
+"""An id that no application has, in all probability; it fits 16 bits."""
+
+SECONDS_APART = timedelta(seconds=3)
+"""How far a clock may be off right after it was set: what the way and the next full second take."""
+
+A_DATE = datetime(2016, 6, 25, 10, 11, 12, tzinfo=UTC)
+"""The one of the published examples (MV30, ID-b 218). The camera has no time zone."""
+
+
+# ---------------------------------------------------------------------- switching
+
+_NARROWED = "the bodies of the dialects with 32 bits narrowed, inferred"
+_SWITCH = {"": "SC-B34, published", "b16": _NARROWED, "bid": "ID-a 229, published"}
+
+
+@check(_SWITCH, needs=Allow.SWITCH)
+def application_0_is_refused(camera: CameraUnderTest) -> None:
+    """A switch to the id 0 is refused, and the active application stays."""
+    _refuses(camera, 0)
+
+
+@check(_SWITCH, needs=Allow.SWITCH)
+def unknown_application_is_refused(camera: CameraUnderTest) -> None:
+    """A switch to an id that no application has is refused, and the active one stays."""
+    _refuses(camera, UNKNOWN_APPLICATION)
+
+
+def _refuses(camera: CameraUnderTest, application: int) -> None:
+    with camera.session() as client:
+        code = 0x1A if camera.wire.dialect.coded else 1
+        active = camera.active(client)
+        camera.stop(client)
+        answer = client.answer(m.SwitchApplication(application=application))
+        if camera.wire.numbers(answer.body) != (code, active):
+            raise Differs(
+                f"the code {code:#x} and the application that stays active, {active}",
+                camera.wire.spell(answer),
+            )
+        if camera.active(client) != active:
+            raise Differs(f"application {active} stays active", client.words())
+
+
+@check(_SWITCH, needs=Allow.SWITCH)
+def switch_loads_the_application(camera: CameraUnderTest) -> str:
+    """A switch is answered when it is done, with the id that is active then."""
+    seen = switch(camera)
+    if camera.wire.numbers(seen.answer.body) != (0, seen.application):
+        raise Differs(f"the code 0 and the id {seen.application}", camera.wire.spell(seen.answer))
+    if seen.active != seen.application:
+        raise Differs(
+            f"application {seen.application} is active", f"Query tells application {seen.active}"
+        )
+    return f"{seen.seconds:.3f} s"
+
+
+@check("SC-B33, published", needs=Allow.SWITCH, dialects=SMART)
+def busy_during_a_switch(camera: CameraUnderTest) -> None:
+    """BUSY is set during a switch."""
+    seen = switch(camera)
+    busy = camera.wire.bits.busy
+    words = camera.wire.statuses(seen.came)
+    if not any(word & busy for word in words) or words[-1] & busy:
+        shown = "; ".join(map(camera.wire.spell, seen.came))
+        raise Differs("a status with BUSY during the switch, and one without it behind", shown)
+
+
+@check(
+    {"": "no document, inferred", "bid": "ID-a 229, ID-b 216, published"},
+    about="during a switch a second one is not answered and Query tells the old application; "
+    "a BVS ID answers both with Busy",
+    needs=Allow.SWITCH,
+)
+def second_switch_meanwhile(camera: CameraUnderTest) -> None:
+    """Ask for a second switch, and for the active application, while the first is under way."""
+    other = switch(camera).application
+    with camera.session() as client:
+        active = camera.active(client)
+        if active == other:
+            camera.load(client, camera.application)
+            active = camera.active(client)
+        camera.stop(client)
+        mark = len(client.heard)
+        request = m.SwitchApplication(application=other)
+        client.say(request, request, m.Query())
+        first = client.until(
+            MessageId.QUERY_APPLICATION,
+            camera.options.switch_timeout,
+            "an answer to a Query during a switch",
+            mark=mark,
+        )
+        done = (0, other)
+        client.until(
+            lambda one: (
+                camera.wire.numbers(one.body) == done
+                and one.message_id == MessageId.SWITCH_APPLICATION
+            ),
+            camera.options.switch_timeout,
+            "the answer to the first switch",
+            mark=mark,
+        )
+        client.listen(camera.options.quiet)
+        _judge_second(camera, client, mark, first, active)
+
+
+def _judge_second(
+    camera: CameraUnderTest, client: RawClient, mark: int, query: Heard, active: int
+) -> None:
+    switched = of_kind(client.heard[mark:], MessageId.SWITCH_APPLICATION)
+    answers = [camera.wire.numbers(one.body) for one in switched]
+    told = camera.wire.numbers(query.body)
+    if camera.wire.is_bid:
+        if told != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:
+            raise Differs(
+                f"the code 0x16 and 0 to the Query, 0x16 and {active} to the second switch",
+                client.words(mark),
+            )
+    elif told[-1] != active or len(answers) != 1:
+        raise Differs(
+            f"the id of before, {active}, and no answer to the second switch", client.words(mark)
+        )
+
+
+# ---------------------------------------------------------------------- clock
+
+
+def _read_clock(camera: CameraUnderTest, client: RawClient) -> datetime:
+    answer = client.answer(m.GetClock())
+    numbers = camera.wire.numbers(answer.body)
+    if camera.wire.dialect.coded:
+        code, numbers = numbers[0], numbers[1:]
+        if code != 6:
+            raise Differs("the code 6", camera.wire.spell(answer))
+    try:
+        year, month, day, hour, minute, second = numbers
+        return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+    except ValueError as exc:
+        raise Differs("year, month, day, hour, minute, second", camera.wire.spell(answer)) from exc
+
+
+def _set_clock(camera: CameraUnderTest, client: RawClient, when: datetime) -> None:
+    request = m.SetClock(
+        year=when.year,
+        month=when.month,
+        day=when.day,
+        hour=when.hour,
+        minute=when.minute,
+        second=when.second,
+    )
+    _tell(camera, client, request, (0,))
+
+
+def _tell(
+    camera: CameraUnderTest, client: RawClient, request: m.Request, code: tuple[int, ...]
+) -> None:
+    """Send a request that a BVS ID acknowledges and a smart camera does not answer."""
+    if not camera.wire.is_bid:
+        message_id = camera.wire.dialect.message_id(request)
+        client.say(request)
+        if of_kind(client.fence(), message_id):
+            raise Differs(f"no answer to {type(request).__name__}", client.words())
+        return
+    answer = client.answer(request)
+    if camera.wire.numbers(answer.body) != code:
+        raise Differs(f"the code {code[0]:#x}", camera.wire.spell(answer))
+
+
+@check({"": "MV29, published", "b16": _NARROWED, "bid": "ID-b 218, published"})
+def clock_is_told(camera: CameraUnderTest) -> str:
+    """Get the time stamp is answered with a date and a time."""
+    with camera.session() as client:
+        return f"{_read_clock(camera, client):%Y-%m-%d %H:%M:%S}"
+
+
+@check(
+    {"": "MV29, MV30, published", "b16": _NARROWED, "bid": "ID-a 231, published"}, needs=Allow.CLOCK
+)
+def clock_is_set(camera: CameraUnderTest) -> None:
+    """The clock goes on from the time that is set."""
+    with camera.session() as client:
+        was, began = _read_clock(camera, client), time.monotonic()
+        try:
+            _set_clock(camera, client, A_DATE)
+            now = _read_clock(camera, client)
+        finally:
+            _set_clock(camera, client, was + timedelta(seconds=time.monotonic() - began))
+        if not A_DATE <= now < A_DATE + SECONDS_APART:
+            raise Differs(f"{A_DATE:%Y-%m-%d %H:%M:%S} or a moment later", f"{now:%c}")
+
+
+@check({"": "MV30, published", "bid": "ID-a 52, derived"}, needs=Allow.CLOCK)
+def impossible_date_is_harmless(camera: CameraUnderTest) -> None:
+    """A time that is none is dropped or converted; a BVS ID refuses it."""
+    request = m.SetClock(year=2016, month=13, day=32, hour=25, minute=61, second=61)
+    with camera.session() as client:
+        was, began = _read_clock(camera, client), time.monotonic()
+        try:
+            _tell(camera, client, request, (0x10,))
+            _read_clock(camera, client)  # which is a date
+        finally:
+            _set_clock(camera, client, was + timedelta(seconds=time.monotonic() - began))
+
+
+# ---------------------------------------------------------------------- number, input, reboot
+
+
+def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
+    """Trigger once and return the four bytes of the sequence number in the result.
+
+    Raises:
+        NotObserved: it is not known where it stands, or no result comes.
+    """
+    offset = camera.options.sequence_offset
+    if offset is None:
+        raise NotObserved(
+            "it is not known where the sequence number stands in a result: --camera-sequence-offset"
+        )
+    camera.once_waiting(client)
+    result = client.trigger()
+    begin = offset + (0 if "no_id" in camera.wire.dialect.quirks else camera.wire.word)
+    field = result.body[begin : begin + 4]
+    if len(field) < 4:
+        raise NotObserved(f"a result has no four bytes at {offset}: {camera.wire.spell(result)}")
+    return field
+
+
+@check(
+    {"": "SC-C50, inferred", "b16": "SC-C50, published"},
+    needs=Allow.NUMBER | Allow.TRIGGER,
+    dialects=SMART,
+    documents=("C6",),
+)
+def sequence_number_is_set(camera: CameraUnderTest) -> None:
+    """Set sequence number is the number of the next run; the run behind has one more."""
+    number = 0x01020304
+    no_id(camera)  # which tells where the number stands
+    little, big = number.to_bytes(4, "little"), number.to_bytes(4, "big")
+    with camera.session() as client:
+        camera.ready(client)
+        client.write(camera.wire.frame(MessageId.SET_SEQUENCE_NUMBER, little))
+        first = next_number(camera, client)
+        second = next_number(camera, client)
+    if camera.dialect == "b16" and first == big:
+        return  # the question big_endian_number tells it
+    following = (number + 1).to_bytes(4, "little")
+    if (first, second) != (little, following):
+        raise Differs(
+            f"{little.hex(' ')} and, in the run behind, {following.hex(' ')}",
+            f"{first.hex(' ')} and {second.hex(' ')}",
+        )
+
+
+@check(
+    {"": "SC-A30, SC-B33, MV30, published", "bid": "ID-a 232, ID-b 220, published"},
+    needs=Allow.INPUT | Allow.TRIGGER,
+)
+def input_data_is_taken(camera: CameraUnderTest) -> None:
+    """Input data before each trigger keeps containers and inspections in step."""
+    data = camera.options.input_data
+    if data is None:
+        raise NotObserved("it is not known what input data the application takes: --camera-input")
+    takes = inspection_time(camera)
+    bits = camera.wire.bits
+    with camera.session() as client:
+        camera.ready(client)
+        mark = len(client.heard)
+        for _ in range(2):  # what the bit says of the time before is over then
+            _tell(camera, client, m.SetInput(data=data), (0,))
+            camera.once_waiting(client)
+            mark = len(client.heard)
+            within = takes + camera.options.timeout
+            client.trigger("a result of a trigger with input data", within=within)
+        if client.look() & bits.input_container:
+            raise Differs(
+                "no Input Container where each trigger had its input data", client.words(mark)
+            )
+
+
+@check("MV31, published", needs=Allow.REBOOT, dialects=SMART, documents=("C9",))
+def reboot_restarts_the_camera(camera: CameraUnderTest) -> str:
+    """0x43 restarts the camera: the session ends, and it comes back."""
+    return f"{downtime(camera).seconds:.1f} s"
+
+
+@check("no document, inferred", needs=Allow.REBOOT, dialects=SMART)
+def stopped_after_a_reboot(camera: CameraUnderTest) -> None:
+    """A camera that has restarted is stopped."""
+    seen = downtime(camera)
+    if seen.running:
+        raise Differs("the last application, stopped", f"application {seen.application} runs")

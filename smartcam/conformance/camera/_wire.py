@@ -1,0 +1,199 @@
+"""Frames as bytes: the requests from the dialect's table, what comes read by code of its own.
+
+What is judged here is also what the library's own codecs rest on, so only the header's shape and
+the ids are taken from the table; numbers are read out of the bytes below.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import hex_excerpt
+from smartcam.protocols._bvs import MessageId
+from smartcam.protocols._framed.framing import Frame as LibraryFrame
+from smartcam.protocols.messages import Sender
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols.messages import Message
+
+MAX_BODY = 1 << 20
+"""Bytes of a body: the camera sends about 64 kB at most (HAL 15, published)."""
+
+
+_REFUSALS = frozenset({(0x10,), (0x13,), (0x16,), (0x1A,)})
+"""Codes of BVS ID that stand alone (ID-a 52, published)."""
+
+
+class BadBytesError(Exception):
+    """What came is no frame of this dialect; the text says why."""
+
+
+class Heard(NamedTuple):
+    """One frame of the camera."""
+
+    at: float  # when its last byte came, time.monotonic()
+    message_id: int
+    body: bytes  # the bytes behind the header
+
+
+def of_kind(frames: Iterable[Heard], message_id: int) -> list[Heard]:
+    """Return the frames that have an id."""
+    return [one for one in frames if one.message_id == message_id]
+
+
+@dataclass(frozen=True, slots=True)
+class Bits:
+    """What a status word says, as masks; 0 where no bit says it.
+
+    Source: SC-A30, SC-B33 (published) for smart cameras; ID-b 210 and the example of ID-a 227
+    (published and derived) for BVS ID.
+    """
+
+    waiting: int
+    overtriggered: int
+    running: int = 0
+    busy: int = 0
+    ready: int = 0
+    input_container: int = 0
+
+
+_SMART_BITS = Bits(waiting=0x200, overtriggered=0x100, running=0x80, busy=0x10, input_container=4)
+BITS: Mapping[str, Bits] = {
+    "handbook": _SMART_BITS,
+    "thesis": _SMART_BITS,
+    "b16": _SMART_BITS,
+    "bid": Bits(waiting=0x001, overtriggered=0x100, ready=0x20),
+}
+"""By dialect."""
+
+
+class RawDialect:
+    """One dialect on the wire, its quirks included."""
+
+    def __init__(self, dialect: FramedDialect) -> None:
+        self.dialect: FramedDialect = dialect
+        self.bits: Bits = BITS[dialect.name]
+        self.word: int = 4 if dialect.word == "I" else 2  # bytes of an ordinary number
+
+    @property
+    def magic(self) -> bytes:
+        """What a frame begins with, nothing in the dialects with 16 bits."""
+        return self.dialect.header.magic
+
+    @property
+    def is_bid(self) -> bool:
+        """Whether it is the dialect of BVS ID."""
+        return self.dialect.name == "bid"
+
+    # ------------------------------------------------------------------ out
+
+    def request(self, message: Message) -> bytes:
+        """Return a request's bytes, as the table has it."""
+        return self.dialect.encode(message)
+
+    def frame(self, message_id: int, body: bytes = b"", *, length: int | None = None) -> bytes:
+        """Return any frame; ``length`` is what the length field says of its body, if not so."""
+        return self.dialect.header.pack(message_id, len(body) if length is None else length) + body
+
+    # ------------------------------------------------------------------ in
+
+    def cut(self, buffer: bytes) -> tuple[int, bytes, int] | None:
+        """Return the first frame as id, body and size; None while it is not all there.
+
+        Raises:
+            BadBytesError: these bytes begin none.
+        """
+        magic, word = self.magic, self.word
+        if not magic.startswith(buffer[: len(magic)]):
+            raise BadBytesError(
+                f"no frame of {self.dialect.name} begins with {hex_excerpt(buffer)}: "
+                f"expected {magic.hex(' ')}"
+            )
+        begin = len(magic) + 2 * word
+        if len(buffer) < begin:
+            return None
+        first = int.from_bytes(buffer[len(magic) : len(magic) + word], "little")
+        second = int.from_bytes(buffer[len(magic) + word : begin], "little")
+        message_id, length = (second, first) if magic else (first, second)
+        length -= 4 if self.dialect.name == "thesis" else 0  # it counts the message id
+        if not 0 <= length <= MAX_BODY:
+            raise BadBytesError(f"a frame announces {length} bytes: {hex_excerpt(buffer[:begin])}")
+        end = begin + length
+        return (message_id, buffer[begin:end], end) if end <= len(buffer) else None
+
+    def numbers(self, body: bytes) -> tuple[int, ...]:
+        """Return a body as ordinary numbers; bytes that are left over are not among them."""
+        code = "I" if self.word == 4 else "H"
+        count = len(body) // self.word
+        return struct.unpack_from(f"<{count}{code}", body)
+
+    def statuses(self, frames: Iterable[Heard]) -> list[int]:
+        """Return the status words among frames."""
+        bodies = (one.body for one in of_kind(frames, MessageId.STATUS))
+        return [int.from_bytes(body[: self.word], "little") for body in bodies]
+
+    # ------------------------------------------------------------------ in words
+
+    def spell(self, heard: Heard) -> str:
+        """Return a frame of the camera in words and hex, for people."""
+        return self._spell(Sender.CAMERA, heard.message_id, heard.body)
+
+    def spell_request(self, data: bytes) -> str:
+        """Describe what was sent in words and hex; bytes that are no frame in hex only."""
+        try:
+            found = self.cut(data)
+        except BadBytesError:
+            found = None
+        if found is None or found[2] != len(data):
+            return hex_excerpt(data)
+        return self._spell(Sender.CLIENT, found[0], found[1], data)
+
+    def _spell(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
+        spelled = self.dialect.spell(sender, LibraryFrame(message_id, body))
+        said = ", ".join(f"{name}={value}" for name, value in (spelled.fields or {}).items())
+        shown = f"{spelled.message}({said})" if len(said) <= 100 else spelled.message
+        if not self.dialect.knows(sender, message_id):
+            shown = f"id {message_id:#04x}"
+        return f"{shown}: {hex_excerpt(raw or spelled.data)}"
+
+    def flaw(self, heard: Heard) -> str | None:
+        """Return the undocumented property of a frame of the camera, None where there is none."""
+        if self.is_bid and self.numbers(heard.body) in _REFUSALS:
+            return None  # a refusal may be nothing but its code, whatever was asked
+        size = self._sizes().get(heard.message_id)
+        if size is None:
+            return f"message {heard.message_id:#04x} is not one of a camera's"
+        least, exact = size
+        if len(heard.body) < least or (exact and len(heard.body) != least):
+            some = "" if exact else " or more"
+            name = MessageId(heard.message_id).name
+            return f"{name} has {len(heard.body)} bytes of body: expected {least}{some}"
+        return None
+
+    def _sizes(self) -> Mapping[int, tuple[int, bool]]:
+        """Return the length of each body of a camera in bytes, and whether it is exact."""
+        coded = self.dialect.coded
+        word, code = self.word, self.word if coded else 0
+        table: dict[int, tuple[int, bool]] = {
+            MessageId.CONNECT: (code + word, True),
+            MessageId.STATUS: (2 * word if self.magic else word, True),
+            MessageId.RESULT_CONTAINER: (0 if "no_id" in self.dialect.quirks else word, False),
+            MessageId.QUERY_APPLICATION: (code + word, True),
+            MessageId.SWITCH_APPLICATION: (2 * word, True),
+            MessageId.GET_CLOCK: (code + 6 * word, True),
+        }
+        if self.is_bid:
+            acknowledged = (
+                MessageId.DISCONNECT,
+                MessageId.RESET_ERRORS,
+                MessageId.SET_CLOCK,
+                MessageId.SET_INPUT_DATA,
+                MessageId.TRIGGER,
+            )
+            table |= dict.fromkeys(acknowledged, (word, True))
+        return table

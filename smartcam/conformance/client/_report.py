@@ -1,0 +1,91 @@
+"""What was found of a client, for people: in a failed test, and at the end of a run."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.conformance.client._checks import Grade
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Self
+
+    from smartcam.conformance.client._checks import ClientCheck
+    from smartcam.conformance.client._runs import ClientRun
+
+
+class ClientFinding(NamedTuple):
+    """What a client did against a rule."""
+
+    check: str
+    grade: str  # ``must`` or ``should``
+    camera: str  # dialect and transport
+    scene: str  # what was special about the camera
+    task: str  # what the client had to do
+    wrong: str  # what was wrong
+    expects: str  # what the documents make a client do
+    source: str  # where that stands
+    wire: tuple[str, ...]  # what went over the wire, one line each
+    said: str  # what the client printed
+
+    def __str__(self) -> str:
+        """Return it as lines."""
+        lines = [
+            f"{self.check} ({self.grade}; {self.camera}): {self.wrong}",
+            f"  task: {self.task}; camera: {self.scene}",
+            f"  expected: {self.expects}",
+            f"  source: {self.source} (docs/sources.md)",
+            "  on the wire (> from the client):",
+            *(f"    {line}" for line in self.wire or ("nothing",)),
+        ]
+        if self.said:
+            lines += ["  the client said:", *(f"    {line}" for line in self.said.splitlines())]
+        return "\n".join(lines)
+
+    def as_json(self) -> str:
+        """Return it as one line of JSON."""
+        return json.dumps(self._asdict())
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read a finding from the line of :meth:`as_json`."""
+        fields: dict[str, Any] = json.loads(text)
+        return cls(**{**fields, "wire": tuple(fields["wire"])})
+
+
+def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
+    """Judge a run of a check's scene; return the finding, None where all is well."""
+    wrong = check.rule(run)
+    if wrong is None:
+        return None
+    said = "; ".join(filter(None, (run.outcome.error, run.outcome.said)))
+    return ClientFinding(
+        check=check.name,
+        grade=check.grade.value,
+        camera=f"{run.dialect.label}, {run.task.transport}",
+        scene=run.scene.about,
+        task=str(run.task),
+        wrong=wrong,
+        expects=check.expects,
+        source=check.source,
+        wire=tuple(run.lines),
+        said=said,
+    )
+
+
+def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
+    """Write findings into pytest's report.
+
+    What must be is shown in full by its failed test, so here it is a line; what should be is shown
+    in full.
+    """
+    reporter.section("smartcam: the client")
+    for grade in Grade:
+        some = [one for one in findings if one.grade == grade.value]
+        if not some:
+            continue
+        reporter.write_line(f"{grade.value}: {len(some)}")
+        for one in some:
+            full = grade is Grade.SHOULD
+            reporter.write_line(str(one) if full else f"{one.check} ({one.camera}): {one.wrong}")

@@ -1,0 +1,210 @@
+"""Rules: what a client has to do, looked up in what it said and in what it gave.
+
+Each takes a :class:`~smartcam.conformance.client._runs.ClientRun` and returns what was wrong, in
+words, or None.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam.conformance._dialects import SMART
+from smartcam.conformance.client._scenes import read_container
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols.messages import Request, Sender
+
+if TYPE_CHECKING:
+    from smartcam.conformance.client._runs import ClientRun, Said
+
+GRACE = 0.05
+"""Seconds that a status takes to the client at most: what it says meanwhile it says without it."""
+
+
+def _wrong_results(run: ClientRun) -> str | None:
+    """Return the first mistake in the results that it gave; it may have given too few."""
+    scene, sent, last = run.scene, run.sent_turns, -1
+    for number, data in enumerate(run.outcome.results, 1):
+        what = f"result {number}, {data[:32].hex(' ') or 'empty'},"
+        content = read_container(data)
+        if content is None:
+            return f"{what} is {len(data)} bytes long; the containers have 8 behind the id"
+        application, turn = content
+        if application != scene.application:
+            return f"{what} is of application {application}, not of {scene.application}"
+        if turn not in sent:
+            return f"{what} was never sent"
+        if turn in scene.stale:
+            return f"{what} is of an inspection that was under way before the client's trigger"
+        if turn == last:
+            return f"{what} is of the same inspection as the one before"
+        if turn < last:
+            return f"{what} is of an earlier inspection than the one before"
+        last = turn
+    if len(run.outcome.results) > scene.wanted:
+        return f"it gave {len(run.outcome.results)} results, {scene.wanted} were wanted"
+    return None
+
+
+def _end(run: ClientRun) -> str:
+    error = run.outcome.error
+    return "it says that all is well" if error is None else f"it failed: {error}"
+
+
+def ends(run: ClientRun) -> str | None:
+    """The client ends in time, with the right results or with an error."""
+    outcome = run.outcome
+    if not outcome.ended:
+        return f"it was still under way after {run.timeout:g} s"
+    wrong = _wrong_results(run)
+    if wrong is None and outcome.error is None and len(outcome.results) < run.scene.wanted:
+        count = len(outcome.results)
+        return f"it says that all is well, and gave {count} of {run.scene.wanted} results"
+    return wrong
+
+
+def fails(run: ClientRun) -> str | None:
+    """The client ends in time, with an error and without a result."""
+    outcome = run.outcome
+    if outcome.ended and (outcome.results or outcome.error is None):
+        count = len(outcome.results)
+        return f"{_end(run)}, and gave {count} result{'s' if count != 1 else ''}"
+    return ends(run)
+
+
+def gives_results(run: ClientRun) -> str | None:
+    """The client gives exactly the results that its task is about."""
+    wrong = ends(run)
+    if wrong is None and run.outcome.error is not None:
+        return _end(run)
+    if wrong is None and len(run.outcome.results) < run.scene.wanted:
+        return f"it gave {len(run.outcome.results)} of {run.scene.wanted} results"
+    return wrong
+
+
+def sends_whole_messages(run: ClientRun) -> str | None:
+    """Everything that the client says is a message of the dialect."""
+    for _, one in run.requests:
+        if one.error is not None and "came in state" in one.error:
+            continue  # a message, at the wrong time
+        if one.error is not None or one.message is None:
+            return f"the camera ignores {one.hex or 'it'}: {one.error or 'no such message'}"
+    return None
+
+
+def connects_first(run: ClientRun) -> str | None:
+    """The client says nothing but Connect, and Disconnect before it, until it is answered."""
+    answered: set[str] = set()
+    for one in run.said:
+        if isinstance(one.message, m.ConnectAnswer):
+            answered.add(one.peer)
+        elif (
+            one.sender is Sender.CLIENT
+            and one.peer not in answered
+            and not isinstance(one.message, (m.Connect, m.Disconnect))
+        ):
+            return f"{_name(one)} came before Connect was answered"
+    if not answered:
+        return "it did not connect"
+    return None
+
+
+def disconnects(run: ClientRun) -> str | None:
+    """The client's last word is Disconnect."""
+    last: dict[str, Said] = {}
+    for one in run.said:
+        if one.sender is Sender.CLIENT:
+            last[one.peer] = one
+    if not last:
+        return "it did not connect"
+    left = [one for one in last.values() if not isinstance(one.message, m.Disconnect)]
+    return f"its last word was {_name(left[0])}" if left else None
+
+
+def asks_one_at_a_time(run: ClientRun) -> str | None:
+    """The client has one request of a kind open at a time: answers do not say whose they are."""
+    open_requests: set[tuple[str, type[m.Message]]] = set()
+    for one in run.said:
+        message = one.message
+        if isinstance(message, Request) and message.answer and run.dialect.answers(type(message)):
+            key = (one.peer, message.answer)
+            if key in open_requests:
+                return f"{_name(one)} came although the one before was not answered yet"
+            open_requests.add(key)
+        elif message is not None:
+            open_requests.discard((one.peer, type(message)))
+    return None
+
+
+def triggers_as_told(run: ClientRun) -> str | None:
+    """The client sends as many triggers as its task says."""
+    count = sum(isinstance(one.message, m.Trigger) for _, one in run.requests)
+    if count != run.scene.wanted:
+        return f"it sent {count} triggers, {run.scene.wanted} were asked for"
+    return None
+
+
+def never_triggers(run: ClientRun) -> str | None:
+    """The client does not trigger an application that runs by itself."""
+    count = sum(isinstance(one.message, m.Trigger) for _, one in run.requests)
+    return f"it sent {count} triggers" if count else None
+
+
+def triggers_when_waiting(run: ClientRun) -> str | None:
+    """The client triggers while the last status that was sent has Waiting for Trigger."""
+    for place, one in run.requests:
+        if isinstance(one.message, m.Trigger):
+            status = run.status_before(place)
+            if status is None or Status.WAITING_FOR_TRIGGER not in status:
+                shown = "no status had been sent" if status is None else f"the status was {status}"
+                return f"Trigger came when {shown}"
+    return None
+
+
+def stops_first(run: ClientRun) -> str | None:
+    """The client stops the application before it loads another."""
+    running = run.scene.running
+    for _, one in run.requests:
+        if isinstance(one.message, (m.Start, m.Stop)):
+            running = isinstance(one.message, m.Start)
+        elif isinstance(one.message, m.SwitchApplication):
+            if running and run.dialect.name in SMART:
+                return f"{_name(one)} came while the application ran"
+            return None
+    return "it did not send SwitchApplication"
+
+
+def waits_for_switch(run: ClientRun) -> str | None:
+    """The client gives no command between SwitchApplication and its answer."""
+    switching: Said | None = None
+    for one in run.said:
+        if isinstance(one.message, m.SwitchApplication):
+            switching = one
+        elif isinstance(one.message, m.SwitchAnswer):
+            return None
+        elif switching is not None and _is_command(one):
+            seconds = one.time - switching.time
+            return f"{_name(one)} came {seconds:.3f} s after SwitchApplication, before its answer"
+    return None if switching is not None else "it did not send SwitchApplication"
+
+
+def is_quiet_while_busy(run: ClientRun) -> str | None:
+    """The client gives no command while the last status that was sent has BUSY."""
+    since: float | None = None
+    for one in run.said:
+        if isinstance(one.message, m.StatusReport) and not one.lost:
+            busy = Status.BUSY in one.message.status
+            since = None if not busy else one.time if since is None else since
+        elif since is not None and _is_command(one) and one.time - since > GRACE:
+            return f"{_name(one)} came {one.time - since:.3f} s after BUSY was told"
+    return None
+
+
+def _is_command(one: Said) -> bool:
+    """Whether it makes the camera do something; questions and the session's end do not."""
+    harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
+    return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
+
+
+def _name(one: Said) -> str:
+    return one.hex if one.message is None else type(one.message).__name__

@@ -1,0 +1,216 @@
+"""One task in one scene: what the client made of it, and what went over the wire."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple, cast
+
+from smartcam.conformance.client._scenes import APPLICATIONS, Scene, read_container
+from smartcam.conformance.client._tasks import Client, Outcome, Task
+from smartcam.emulator import EmulatedCamera
+from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols.messages import ResultContainer, Sender, StatusReport
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from smartcam.emulator import LogEntry
+    from smartcam.models import Status
+    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols.messages import Message
+
+SETTLING = 0.3
+"""Seconds that the camera gets to hear the end of a client that has ended: loopback is faster."""
+
+MAX_LINES = 40
+"""Lines of the wire that a finding shows: the last ones."""
+
+
+class Said(NamedTuple):
+    """Something that went over the wire."""
+
+    time: float  # seconds since the scene began
+    sender: Sender  # whose it is
+    peer: str  # address and port of the client
+    message: Message | None  # what it is; None for bytes that make no message of the dialect
+    text: str  # the message with its fields, ``?`` for none
+    hex: str  # the frame as it passed, or the bytes
+    error: str | None = None  # why the camera ignored it, None where it did not
+    lost: bool = False  # it did not pass
+
+    def __str__(self) -> str:
+        """Return it as a line: seconds, direction, message, bytes."""
+        mark = ">" if self.sender is Sender.CLIENT else "<"
+        note = f"  (ignored: {self.error})" if self.error else "  (lost)" if self.lost else ""
+        data = self.hex if len(self.hex) <= 120 else self.hex[:120] + "..."
+        return f"{self.time:7.3f} {mark} {self.text}  {data}{note}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClientRun:
+    """A task that was done, or not.
+
+    Attributes:
+        scene: the camera.
+        task: the task.
+        dialect: as it was spoken.
+        outcome: what the client says.
+        said: what went over the wire, in the order in which the camera saw it.
+        timeout: seconds that the client had.
+    """
+
+    scene: Scene
+    task: Task
+    dialect: FramedDialect
+    outcome: Outcome
+    said: tuple[Said, ...]
+    timeout: float
+
+    @property
+    def requests(self) -> Iterator[tuple[int, Said]]:
+        """The client's messages, with their places in ``said``."""
+        return ((n, one) for n, one in enumerate(self.said) if one.sender is Sender.CLIENT)
+
+    @property
+    def sent_turns(self) -> list[int]:
+        """Turns of the results that really came from the application, in order."""
+        found: list[int] = []
+        for one in self.said:
+            if isinstance(one.message, ResultContainer) and not one.lost:
+                content = read_container(one.message.data)
+                if content is not None and content[0] == self.scene.application:
+                    found.append(content[1])
+        return found
+
+    def status_before(self, place: int) -> Status | None:
+        """Return the last status that the camera had sent before a place, None for none."""
+        for one in reversed(self.said[:place]):
+            if isinstance(one.message, StatusReport) and not one.lost:
+                return one.message.status
+        return None
+
+    @property
+    def lines(self) -> list[str]:
+        """The last of what went over the wire, for people."""
+        left_out = len(self.said) - MAX_LINES
+        lines = [str(one) for one in self.said[-MAX_LINES:]]
+        return [f"... {left_out} before" if left_out > 0 else "", *lines][left_out <= 0 :]
+
+
+async def perform(
+    client: Client,
+    scene: Scene,
+    *,
+    dialect: str = "handbook",
+    transport: str = "tcp",
+    timeout: float = 30.0,
+) -> ClientRun:
+    """Have a client do its task in a scene.
+
+    Args:
+        client: the client.
+        scene: the camera and the task.
+        dialect: what the camera speaks.
+        transport: ``tcp`` or ``udp``.
+        timeout: seconds that the client has.
+
+    Raises:
+        ConfigurationError: the client cannot be started.
+
+    Cancellation: camera and client are ended.
+    """
+    async with EmulatedCamera(
+        APPLICATIONS,
+        builtins=False,
+        name=scene.name,
+        dialect=dialect,
+        transport=cast('Literal["tcp", "udp"]', transport),
+        active=scene.active,
+        running=scene.running,
+        quirks=dict(scene.quirks),
+    ) as camera:
+        camera.inject(*scene.faults(camera.spoken))
+        task = Task(
+            verb=scene.verb,
+            number=scene.number,
+            url=camera.url,
+            host=camera.host,
+            port=camera.port,
+            transport=transport,
+            dialect=dialect,
+        )
+        began = camera.clock.now
+        outcome = await client.perform(task, timeout)
+        await _settle(camera)
+        said = tuple(_said(camera.spoken, one, began) for one in _merged(camera.log))
+    return ClientRun(
+        scene=scene,
+        task=task,
+        dialect=camera.spoken,
+        outcome=outcome,
+        said=said,
+        timeout=timeout,
+    )
+
+
+async def _settle(camera: EmulatedCamera) -> None:
+    """Wait until the camera has heard what the client said last."""
+    end = time.monotonic() + SETTLING
+    seen = -1
+    while time.monotonic() < end:
+        # each turn of the loop takes datagrams and deliveries that are there already
+        for _ in range(5):
+            await asyncio.sleep(0)
+        if not camera.links or (camera.transport == "udp" and len(camera.log) == seen):
+            return
+        seen = len(camera.log)
+        await asyncio.sleep(0.01)
+
+
+def _merged(log: Iterable[LogEntry]) -> list[LogEntry]:
+    """Join the entry of a whole frame that is ignored with the one that says why."""
+    merged: list[LogEntry] = []
+    for one in log:
+        before = merged[-1] if merged else None
+        if (
+            one.error is not None
+            and before is not None
+            and before.direction == one.direction
+            and before.peer == one.peer
+            and before.message_id is not None
+            and before.error is None
+            and before.hex == one.hex
+        ):
+            merged[-1] = before._replace(error=one.error)
+        else:
+            merged.append(one)
+    return merged
+
+
+def _said(dialect: FramedDialect, entry: LogEntry, began: float) -> Said:
+    data = entry.wire
+    if data is None and entry.message_id is not None:
+        payload = bytes.fromhex(entry.hex)
+        data = dialect.encode_frame(Frame(entry.message_id, payload)).hex(" ")
+    return Said(
+        entry.time - began,
+        Sender.CLIENT if entry.direction == "in" else Sender.CAMERA,
+        entry.peer,
+        entry.message,
+        _text(dialect, entry.message),
+        entry.hex if data is None else data,
+        entry.error,
+        entry.wire == "" or (entry.fault or "").endswith(("not sent", "connection ended")),
+    )
+
+
+def _text(dialect: FramedDialect, message: Message | None) -> str:
+    if message is None:
+        return "?"
+    fields: list[str] = []
+    for name in dialect.fields(type(message)):
+        value: object = getattr(message, name)
+        fields.append(f"{name}={value.hex() if isinstance(value, bytes) else value}")
+    return f"{type(message).__name__}({', '.join(fields)})"

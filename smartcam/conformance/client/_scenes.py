@@ -1,0 +1,288 @@
+"""Scenes: a camera with its trouble, and the task that a client gets there."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from smartcam.conformance._dialects import EVERY_DIALECT, SMART
+from smartcam.emulator import faults as f
+from smartcam.protocols._framed.framing import Frame
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from smartcam.conformance.client._tasks import Verb
+    from smartcam.emulator._generators import Run
+    from smartcam.emulator.faults._base import BaseFault
+    from smartcam.protocols._framed.dialect import FramedDialect
+
+APPLICATION, OTHER, FREE_RUNNING, MISSING = 21, 3, 9, 99
+"""The application that is loaded at first, one to switch to, one that sends results by itself, and
+an id that no application has."""
+
+WAIT = 0.25
+"""Seconds that something is held back; a client's time-outs are longer."""
+
+LONG = 1.0
+"""Seconds of BUSY behind a switch's answer: a client that starts slowly must come into it, too."""
+
+STATUS_GO = 0x280
+"""Running and Waiting for Trigger."""
+
+_CONTAINER = struct.Struct("<ii")
+
+
+def container(application: int, turn: int) -> bytes:
+    """Return the data of a result: the application that made it, and its how many-th run it was."""
+    return _CONTAINER.pack(application, turn)
+
+
+def read_container(data: bytes) -> tuple[int, int] | None:
+    """Return application and turn of a result's data, None where it is no such data."""
+    if len(data) != _CONTAINER.size:
+        return None
+    application, turn = _CONTAINER.unpack(data)
+    return application, turn
+
+
+def _application(number: int, **other: Any) -> dict[str, Any]:
+    def values(run: Run) -> dict[str, int]:
+        return {"application": number, "turn": run.turn}
+
+    return {
+        "id": number,
+        "layout": "application: int32, turn: int32",
+        "generator": values,
+        "load_time": 0.1,
+        "processing_time": 0.02,
+        **other,
+    }
+
+
+APPLICATIONS: tuple[dict[str, Any], ...] = (
+    _application(APPLICATION),
+    _application(OTHER),
+    _application(FREE_RUNNING, rate=50.0, processing_time=0.005),
+)
+"""What is stored on the camera."""
+
+
+def _none(dialect: FramedDialect) -> Sequence[BaseFault]:
+    return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """A camera, and what a client shall do with it.
+
+    Attributes:
+        name: of the scene.
+        about: what is special about it, for people.
+        verb: of the task.
+        number: of the task.
+        active: the application that is loaded at first.
+        running: whether it is in run mode.
+        faults: the trouble, in a dialect.
+        quirks: of the camera.
+        stale: turns of the application that the client did not trigger.
+        dialects: in which it makes sense.
+        transports: over which it makes sense.
+    """
+
+    name: str
+    about: str
+    verb: Verb = "trigger"
+    number: int | None = None
+    active: int = APPLICATION
+    running: bool = True
+    faults: Callable[[FramedDialect], Sequence[BaseFault]] = _none
+    quirks: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    stale: frozenset[int] = frozenset()
+    dialects: tuple[str, ...] = EVERY_DIALECT
+    transports: tuple[str, ...] = ("tcp", "udp")
+
+    @property
+    def wanted(self) -> int:
+        """How many results the task is about."""
+        return 1 if self.verb == "switch" else self.number or 1
+
+    @property
+    def application(self) -> int:
+        """Whose results they are."""
+        return self.number or 0 if self.verb == "switch" else self.active
+
+
+def _unknown_messages(dialect: FramedDialect) -> Sequence[BaseFault]:
+    data = dialect.encode_frame(Frame(0x77, b"new in this firmware"))
+    # not before the answer to Connect: until then the camera says nothing (SC-A28, published)
+    between = ("StatusReport", "QueryAnswer", "ResultContainer")
+    return [f.Insert(data=data, on=one, where="before", times=None) for one in between]
+
+
+def _unknown_bits(dialect: FramedDialect) -> Sequence[BaseFault]:
+    offset = dialect.header.size  # the status word's lowest byte
+    return [f.Corrupt(on="StatusReport", offset=offset, xor=0x40, times=None)]
+
+
+def _other_result(dialect: FramedDialect) -> Sequence[BaseFault]:
+    fields: dict[str, int | str] = {"application": MISSING, "data": container(MISSING, 0).hex()}
+    return [f.Insert(message="ResultContainer", fields=fields, on="ResultContainer")]
+
+
+def _status_between(dialect: FramedDialect) -> Sequence[BaseFault]:
+    fields: dict[str, int | str] = {"status": STATUS_GO}
+    return [f.Insert(message="StatusReport", fields=fields, on="QueryAnswer", times=None)]
+
+
+def _bytes(dialect: FramedDialect) -> Sequence[BaseFault]:
+    longest = dialect.header.size + 16
+    return [f.Split(after=after, pause=0.001, times=None) for after in range(1, longest)]
+
+
+def _bomb(dialect: FramedDialect) -> Sequence[BaseFault]:
+    header = dialect.header
+    number = dialect.encode_frame(Frame(0x20, b""))[: len(header.magic)]
+    size = b"\xff" * (4 if header.code == "I" else 2)
+    code = (0x20).to_bytes(len(size), "little")
+    data = number + (code + size if header.id_first else size + code)
+    return [f.Insert(data=data, on="ResultContainer", where="instead", times=None)]
+
+
+def _always(*faults: BaseFault) -> Callable[[FramedDialect], Sequence[BaseFault]]:
+    return lambda dialect: faults
+
+
+GARBAGE = bytes(range(0x9B, 0xDB))
+"""Bytes that begin no frame: as a 16-bit header they announce 40,348 bytes."""
+
+_BROKEN: tuple[tuple[str, str, BaseFault], ...] = (
+    (
+        "overtriggered",
+        "every trigger is dropped, Overtriggered is set",
+        f.Overtrigger(count=1_000_000),
+    ),
+    ("no_result", "no inspection sends a result", f.Drop(on="ResultContainer", times=None)),
+    ("busy_for_ever", "BUSY never falls", f.BusyForEver()),
+    ("no_connect_answer", "Connect is not answered", f.Drop(on="ConnectAnswer", times=None)),
+    ("no_query_answer", "Query is not answered", f.Drop(on="QueryAnswer", times=None)),
+    ("nothing_listens", "the port is closed", f.Refuse(seconds=3600)),
+    (
+        "closed",
+        "the camera closes the connection at each trigger",
+        f.Close(on="Trigger", times=None),
+    ),
+    (
+        "reset",
+        "the camera resets the connection at each trigger",
+        f.Reset(on="Trigger", times=None),
+    ),
+    (
+        "half_open",
+        "nothing is heard of the camera any more from a trigger on",
+        f.HalfOpen(on="Trigger", times=None),
+    ),
+    (
+        "cut_result",
+        "the connection ends in the middle of a result",
+        f.Truncate(on="ResultContainer", keep=9, times=None),
+    ),
+)
+"""Scenes in which nothing but a fault is special."""
+
+SCENES: Mapping[str, Scene] = {
+    scene.name: scene
+    for scene in (
+        Scene(name="trigger", about="nothing goes wrong"),
+        Scene(name="trigger_3", about="nothing goes wrong", number=3),
+        Scene(name="switch", about="nothing goes wrong", verb="switch", number=OTHER),
+        Scene(name="watch", about="nothing goes wrong", verb="watch", number=5, active=9),
+        Scene(
+            name="byte_by_byte",
+            about="each byte comes by itself",
+            faults=_bytes,
+            transports=("tcp",),
+        ),
+        Scene(
+            name="coalesced",
+            about="messages come together in one segment",
+            faults=_always(f.Coalesce(count=2, seconds=0.05, times=None)),
+            number=3,
+            transports=("tcp",),
+        ),
+        Scene(
+            name="inspection_under_way",
+            about="a sensor has triggered the camera right before the client's trigger",
+            faults=_always(f.LateResult(seconds=WAIT), f.DigitalInput(on="Connect", when="before")),
+            stale=frozenset({0}),
+        ),
+        Scene(
+            name="result_of_another",
+            about="a result of another application comes first",
+            faults=_other_result,
+        ),
+        Scene(
+            name="sent_twice",
+            about="the first inspection sends its result twice",
+            faults=_always(f.ExtraResult()),
+            number=3,
+        ),
+        Scene(
+            name="status_between",
+            about="a status comes between a Query and its answer",
+            faults=_status_between,
+        ),
+        Scene(
+            name="unknown_messages",
+            about="messages with an id that nobody knows come in between",
+            faults=_unknown_messages,
+        ),
+        Scene(
+            name="unknown_bits",
+            about="the status has a bit set that has no name",
+            faults=_unknown_bits,
+        ),
+        Scene(
+            name="busy_after_switch",
+            about="BUSY is still set when the switch is answered",
+            faults=_always(f.BusyForEver(seconds=LONG, on="SwitchApplication", when="after")),
+            verb="switch",
+            number=OTHER,
+            dialects=SMART,
+        ),
+        Scene(
+            name="late_switch_answer",
+            about="the switch is answered after BUSY has fallen",
+            faults=_always(f.Delay(on="SwitchAnswer", seconds=WAIT, overtaken=True)),
+            verb="switch",
+            number=OTHER,
+        ),
+        Scene(
+            name="refused_switch",
+            about="no application has the id",
+            verb="switch",
+            number=MISSING,
+        ),
+        Scene(
+            name="stopped",
+            about="the application does not run",
+            running=False,
+            dialects=SMART,
+        ),
+        *(Scene(name=name, about=about, faults=_always(fault)) for name, about, fault in _BROKEN),
+        Scene(
+            name="garbage",
+            about="bytes that make no frame come in place of each result",
+            faults=_always(
+                f.Insert(data=GARBAGE, on="ResultContainer", where="instead", times=None)
+            ),
+        ),
+        Scene(
+            name="length_bomb",
+            about="a header announces as many bytes as it can, and they never come",
+            faults=_bomb,
+        ),
+    )
+}
+"""All scenes by their names."""

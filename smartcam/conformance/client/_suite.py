@@ -1,0 +1,171 @@
+"""The suite: a test for each check, to be inherited or to be run from the shell."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import pytest
+
+from smartcam.conformance._pytest_options import PROPERTY
+from smartcam.conformance.client._checks import CHECKS, ClientCheck, Grade
+from smartcam.conformance.client._report import judge
+from smartcam.conformance.client._runs import ClientRun, perform
+from smartcam.conformance.client._tasks import Client, CommandClient, FunctionClient
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols._bvs import BVS
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable, Sequence
+
+    from smartcam.conformance.client._tasks import Task
+
+MAX_SECONDS = 3600
+"""Seconds that a task may be given at most."""
+
+_RUNS: pytest.StashKey[dict[tuple[type, str, str, str], ClientRun]] = pytest.StashKey()
+
+
+class ClientOptions(NamedTuple):
+    """What the options say of the client."""
+
+    command: str | None = None  # ``--client-command``, None where it is not given
+    dialects: tuple[str, ...] | None = None  # ``--client-dialect``, names with commas between them
+    transports: tuple[str, ...] | None = None  # ``--client-transport``, the same
+    timeout: float | None = None  # ``--client-timeout``, seconds
+
+
+def read_options(config: Any) -> ClientOptions:
+    """Read the options from pytest's ``config``; none is given where no plugin has them.
+
+    Raises:
+        pytest.UsageError: a value cannot be.
+    """
+    timeout = config.getoption("--client-timeout", default=None)
+    if timeout is not None and not 0 < timeout <= MAX_SECONDS:
+        raise pytest.UsageError(
+            f"--client-timeout: {timeout:g} s; more than 0 and at most {MAX_SECONDS} s are expected"
+        )
+    return ClientOptions(
+        config.getoption("--client-command", default=None),
+        _names(config, "--client-dialect", tuple(BVS.dialects)),
+        _names(config, "--client-transport", ("tcp", "udp")),
+        timeout,
+    )
+
+
+def _names(config: Any, option: str, known: Sequence[str]) -> tuple[str, ...] | None:
+    text: str | None = config.getoption(option, default=None)
+    if text is None:
+        return None
+    found = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in found:
+        if name not in known:
+            raise pytest.UsageError(f"{option}: {name!r}; known are {', '.join(known)}")
+    return found or None
+
+
+class ClientConformance:
+    """Tests of a client: each check in each dialect over each transport that it claims.
+
+    Inherit from it and say how the client is run: a :attr:`command`, or override :meth:`perform`.
+    The tests are synchronous and need no other plugin. What a test with grade "should" finds does
+    not fail it; the plugin ``smartcam`` shows it at the end.
+
+    Attributes:
+        command: program and arguments, see :class:`~smartcam.conformance.client.CommandClient`;
+            ``--client-command`` where it is None.
+        dialects: those that the client speaks.
+        transports: those that it can.
+        timeout: seconds that a task may take. A client's own time-outs must end within it.
+    """
+
+    command: ClassVar[str | Sequence[str] | None] = None
+    dialects: ClassVar[tuple[str, ...]] = ("handbook",)
+    transports: ClassVar[tuple[str, ...]] = ("tcp",)
+    timeout: ClassVar[float] = 30.0
+
+    def perform(self, task: Task) -> Iterable[bytes] | Awaitable[Iterable[bytes]]:
+        """Do a task; override it for a client in Python, plain or asynchronous.
+
+        It runs in a thread of its own, an asynchronous one in a loop of its own.
+
+        Args:
+            task: what to do.
+
+        Returns:
+            The data of the results, in order, each without the application's id.
+
+        Raises:
+            NotImplementedError: the client cannot do such a task; its tests are skipped.
+            Exception: whatever says that the client has failed.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def pytest_generate_tests(cls, metafunc: pytest.Metafunc) -> None:
+        """Make a test of each check for each camera that it is about."""
+        if "client_case" not in metafunc.fixturenames:
+            return
+        options = read_options(metafunc.config)
+        cases = [
+            pytest.param((check, dialect, transport), id=f"{dialect}-{transport}-{check.name}")
+            for dialect in options.dialects or cls.dialects
+            for transport in options.transports or cls.transports
+            for check in CHECKS
+            if check.applies(dialect, transport)
+        ]
+        metafunc.parametrize("client_case", cases)
+
+    def client(self, config: pytest.Config) -> Client | None:
+        """Return the client that is judged, None where nothing says which one."""
+        if type(self).perform is not ClientConformance.perform:
+            return FunctionClient(self.perform)
+        command = self.command or read_options(config).command
+        return None if command is None else CommandClient(command)
+
+    def test_client(
+        self,
+        client_case: tuple[ClientCheck, str, str],
+        request: pytest.FixtureRequest,
+        record_property: Callable[[str, object], None],
+    ) -> None:
+        """Have the client do the check's task, and judge what it did."""
+        check, dialect, transport = client_case
+        run = self._run(check, dialect, transport, request.config)
+        if not run.outcome.supported:
+            reason = f": {run.outcome.said}" if run.outcome.said else ""
+            pytest.skip(f'the client cannot do the task "{run.task}"{reason}')
+        finding = judge(check, run)
+        if finding is None:
+            return
+        record_property(PROPERTY, finding.as_json())
+        if check.grade is Grade.MUST:
+            pytest.fail(str(finding), pytrace=False)
+
+    def _run(
+        self, check: ClientCheck, dialect: str, transport: str, config: pytest.Config
+    ) -> ClientRun:
+        """Return a run of the check's scene; several checks look at one."""
+        runs = config.stash.setdefault(_RUNS, {})
+        key = (type(self), check.scene.name, dialect, transport)
+        if key not in runs:
+            runs[key] = self._perform(check, dialect, transport, config)
+        return runs[key]
+
+    def _perform(
+        self, check: ClientCheck, dialect: str, transport: str, config: pytest.Config
+    ) -> ClientRun:
+        timeout = read_options(config).timeout or self.timeout
+        try:
+            client = self.client(config)
+            if client is None:
+                pytest.skip(
+                    "no client: pytest --pyargs smartcam.conformance.client --client-command "
+                    '"./mine {host} {port} {task}"'
+                )
+            return asyncio.run(
+                perform(client, check.scene, dialect=dialect, transport=transport, timeout=timeout)
+            )
+        except ConfigurationError as exc:
+            pytest.fail(str(exc), pytrace=False)

@@ -1,0 +1,342 @@
+"""What a client is asked to do, and the ways to have it done: a command, or a Python function.
+
+A command gets the task as arguments and prints one line for each result: the bytes of the result
+container behind the application's id as hex, or a JSON object that has them as ``data`` or ``raw``.
+It ends with 0 where it has done the task, with 77 where it cannot do such a task at all, and with
+anything else where it failed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import json
+import os
+import shlex
+import signal
+import threading
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable, Sequence
+
+    Perform: TypeAlias = "Callable[[Task], Iterable[bytes] | Awaitable[Iterable[bytes]]]"
+
+UNSUPPORTED = 77
+"""Exit code of a command that cannot do such a task: what automake's tests mean by "skipped"."""
+
+MAX_OUTPUT = 1 << 20
+"""Bytes of a command's output that are read; a client that prints more has failed."""
+
+SHOWN = 2000
+"""Characters of a command's output that a report shows."""
+
+DYING = 2.0
+"""Seconds that a client which was told to end has for it."""
+
+Verb = Literal["trigger", "switch", "watch"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """What a client shall do; each one in a session of its own.
+
+    - ``trigger [N]``: connect, trigger the active application once, or N times one after the other,
+      print each result, disconnect.
+    - ``switch ID``: connect, have application ID loaded and running, trigger once, print the
+      result, disconnect.
+    - ``watch N``: connect, print the next N results that come by themselves, disconnect.
+
+    Attributes:
+        verb: which of these.
+        number: N or ID; None for one trigger.
+        url: the camera's address as smartcam has it, its dialect pinned.
+        host: where it is.
+        port: its port.
+        transport: ``tcp`` or ``udp``.
+        dialect: which one it speaks.
+    """
+
+    verb: Verb
+    number: int | None = None
+    url: str
+    host: str
+    port: int
+    transport: str
+    dialect: str
+
+    @property
+    def words(self) -> list[str]:
+        """The task as arguments of a command."""
+        return [self.verb, *([] if self.number is None else [str(self.number)])]
+
+    def __str__(self) -> str:
+        """Return it as a command gets it."""
+        return " ".join(self.words)
+
+
+class Outcome(NamedTuple):
+    """What a client has made of a task.
+
+    Attributes:
+        results: those that it gave, in order.
+        error: what it said of its failure; None where it says that all is well.
+        ended: whether it came to an end in time.
+        supported: whether it can do such a task at all.
+        seconds: how long it took.
+        said: what else it printed, shortened.
+    """
+
+    results: tuple[bytes, ...] = ()
+    error: str | None = None
+    ended: bool = True
+    supported: bool = True
+    seconds: float = 0.0
+    said: str = ""
+
+
+class Client(ABC):
+    """A client as it is judged: something that does tasks."""
+
+    @abstractmethod
+    async def perform(self, task: Task, timeout: float) -> Outcome:
+        """Have a task done.
+
+        Args:
+            task: what to do.
+            timeout: seconds, then the client is ended.
+
+        Returns:
+            What came of it; a client that fails, or does not end, is no error here.
+
+        Raises:
+            ConfigurationError: the client cannot even be started.
+        """
+
+
+class FunctionClient(Client):
+    """A client behind a Python function, in a thread of its own.
+
+    Args:
+        function: takes a task, returns the results' bytes; plain or asynchronous. It raises
+            NotImplementedError for a task that it cannot do, any other exception where it failed.
+            Returning from it means that all is well.
+    """
+
+    def __init__(self, function: Perform) -> None:
+        self._function = function
+
+    async def perform(self, task: Task, timeout: float) -> Outcome:
+        """Have a task done, see :meth:`Client.perform`.
+
+        A plain function that does not end is left behind in its thread, which does not keep the
+        process alive; an asynchronous one is cancelled.
+        """
+        worker = _Worker(self._function, task)
+        began = time.monotonic()
+        worker.start()
+        try:
+            async with asyncio.timeout(timeout):
+                await asyncio.shield(worker.done)
+        except TimeoutError:
+            worker.cancel()
+            await asyncio.wait({worker.done}, timeout=DYING if worker.cancellable else 0)
+            return Outcome(ended=False, seconds=time.monotonic() - began)
+        return worker.outcome._replace(seconds=time.monotonic() - began)
+
+
+class _Worker:
+    """Runs a function in a daemon thread; an asynchronous one in a loop of its own."""
+
+    def __init__(self, function: Perform, task: Task) -> None:
+        self.done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.outcome = Outcome()
+        self.cancellable = inspect.iscoroutinefunction(function)
+        self._function = function
+        self._task = task
+        self._inside: tuple[asyncio.AbstractEventLoop, asyncio.Task[Any]] | None = None
+        self._home = asyncio.get_running_loop()
+        self._thread = threading.Thread(target=self._run, name=f"client: {task}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def cancel(self) -> None:
+        inside = self._inside
+        if inside is not None:
+            with contextlib.suppress(RuntimeError):  # its loop is closed already
+                inside[0].call_soon_threadsafe(inside[1].cancel)
+
+    def _run(self) -> None:
+        try:
+            self.outcome = Outcome(results=self._results())
+        except NotImplementedError as exc:
+            self.outcome = Outcome(supported=False, said=str(exc))
+        except BaseException as exc:  # noqa: BLE001 - whatever a client raises is its failure
+            self.outcome = Outcome(error=f"{type(exc).__name__}: {exc}"[:SHOWN])
+        with contextlib.suppress(RuntimeError):  # nobody waits any more
+            self._home.call_soon_threadsafe(self._tell)
+
+    def _tell(self) -> None:
+        if not self.done.done():
+            self.done.set_result(None)
+
+    def _results(self) -> tuple[bytes, ...]:
+        if self.cancellable:
+            given = asyncio.run(self._await_it())
+        else:
+            given = cast("Iterable[bytes]", self._function(self._task))
+        return tuple(bytes(one) for one in given)
+
+    async def _await_it(self) -> Iterable[bytes]:
+        current = asyncio.current_task()
+        if current is not None:
+            self._inside = (asyncio.get_running_loop(), current)
+        return await cast("Awaitable[Iterable[bytes]]", self._function(self._task))
+
+
+class CommandClient(Client):
+    """A client behind a command, in any language.
+
+    Args:
+        command: the program and its arguments. ``{host}``, ``{port}``, ``{url}``, ``{transport}``,
+            ``{dialect}`` and ``{task}`` are replaced; an argument that is ``{task}`` alone becomes
+            the task's words: ``trigger``, or ``switch`` and ``3``. A text is split as a shell does.
+        cwd: folder to run it in; default the present one.
+
+    Raises:
+        ConfigurationError: it has no place for the task or for the camera's address.
+    """
+
+    def __init__(self, command: str | Sequence[str], cwd: str | None = None) -> None:
+        try:
+            self._template = shlex.split(command) if isinstance(command, str) else list(command)
+        except ValueError as exc:
+            raise ConfigurationError(f"client command {command!r}: {exc}") from exc
+        self._cwd = cwd
+        text = " ".join(self._template)
+        if "{task}" not in text or not ("{url}" in text or "{port}" in text):
+            raise ConfigurationError(
+                f"client command {text!r}: it needs {{task}}, and {{url}} or {{host}} and {{port}}"
+            )
+
+    def arguments(self, task: Task) -> list[str]:
+        """Return program and arguments for a task."""
+        values = {
+            **{name: str(getattr(task, name)) for name in ("url", "host", "port")},
+            **{name: str(getattr(task, name)) for name in ("transport", "dialect")},
+            "task": str(task),
+        }
+        result: list[str] = []
+        for argument in self._template:
+            if argument == "{task}":
+                result += task.words
+                continue
+            for name, value in values.items():
+                argument = argument.replace("{" + name + "}", value)
+            result.append(argument)
+        return result
+
+    async def perform(self, task: Task, timeout: float) -> Outcome:
+        """Have a task done, see :meth:`Client.perform`.
+
+        A command that does not end is killed, with all that it has started where the system can.
+        """
+        arguments, began = self.arguments(task), time.monotonic()
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *arguments,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                cwd=self._cwd,
+                start_new_session=True,
+            )
+        except OSError as exc:
+            raise ConfigurationError(f"client command {arguments[0]!r}: {exc.strerror}") from exc
+        try:
+            async with asyncio.timeout(timeout):
+                out, err = await _read(process)
+        except TimeoutError:
+            return Outcome(ended=False, seconds=time.monotonic() - began)
+        finally:
+            await _end(process)
+        seconds, said = time.monotonic() - began, _shorten(err)
+        if process.returncode == UNSUPPORTED:
+            return Outcome(supported=False, seconds=seconds, said=said)
+        try:
+            results, error = read_results(out), None
+        except ValueError as exc:
+            results, error = (), str(exc)
+        if process.returncode:
+            error = f"exit code {process.returncode}"
+        return Outcome(results, error, seconds=seconds, said=said)
+
+
+async def _read(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:
+    async def all_of(stream: asyncio.StreamReader | None) -> bytes:
+        data = b""
+        while stream is not None and (more := await stream.read(1 << 16)):
+            data += more[: MAX_OUTPUT - len(data)]
+        return data
+
+    out, err = await asyncio.gather(all_of(process.stdout), all_of(process.stderr))
+    await process.wait()
+    return out, err
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    """Kill what still runs, and close the pipes."""
+    if process.returncode is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(DYING):
+            await process.wait()
+    transport = getattr(process, "_transport", None)  # the only way to close pipes that others hold
+    if transport is not None:
+        transport.close()
+
+
+def _shorten(data: bytes) -> str:
+    text = data.decode(errors="replace").strip()
+    return text if len(text) <= SHOWN else text[:SHOWN] + "..."
+
+
+def read_results(output: bytes) -> tuple[bytes, ...]:
+    """Read what a command printed: one result a line, empty lines aside.
+
+    Raises:
+        ValueError: a line is none.
+    """
+    results: list[bytes] = []
+    for number, line in enumerate(output.decode(errors="replace").splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            results.append(_read_line(line.strip()))
+        except (ValueError, TypeError) as exc:
+            raise ValueError(
+                f"line {number} of its output is no result: {line[:80]!r}; expected hex, or a JSON "
+                'object with "data" or "raw"'
+            ) from exc
+    return tuple(results)
+
+
+def _read_line(line: str) -> bytes:
+    if line[0] not in '{"':
+        return bytes.fromhex(line)
+    value: Any = json.loads(line)
+    if isinstance(value, dict):
+        fields = cast("dict[str, Any]", value)
+        value = fields.get("data", fields.get("raw"))
+    return bytes.fromhex(value)

@@ -1,0 +1,270 @@
+"""One examination: what was asked for, the camera, and what was seen of it so far."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+
+from smartcam.client import SmartCamera
+from smartcam.doctor._findings import Exit, Finding, Severity
+from smartcam.exceptions import InterpretationError
+from smartcam.interpreters._base import Interpreter, Reader, run
+from smartcam.layout import Layout
+from smartcam.models import CameraEvent, Result, Status, StatusChanged
+from smartcam.observers import Observer
+from smartcam.settings import CameraSettings, parse_address
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from datetime import datetime
+
+    from smartcam.exceptions import SmartCamError
+    from smartcam.models import ByteOrder
+    from smartcam.observers import TraceEntry
+    from smartcam.settings import Address, CameraOptions
+
+T = TypeVar("T")
+
+MAX_KEPT = 1000
+"""Statuses and arrival times kept: at 300 results a second those of the default 3 seconds."""
+
+MAX_CONTAINERS = 32
+"""Result containers kept, to be compared with the layout: 2 MB of the largest."""
+
+
+def called(application: int | None) -> str:
+    """Return the application's name for texts; not every camera has ids for all of them."""
+    return (
+        "the application"
+        if application is None or application < 0
+        else f"application {application}"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoctorOptions:
+    """What was asked for.
+
+    Attributes:
+        application: id that is expected to be active, None for any.
+        interpreter: how results are to be read, None where nothing was said.
+        y_down: the camera's y axis points down.
+        trigger: triggers may be sent, and ``application`` may be loaded for them.
+        timeout: seconds for each step, None for the defaults.
+        seconds: how long the camera is watched.
+        count: triggers.
+    """
+
+    application: int | None = None
+    interpreter: Interpreter | None = None
+    y_down: bool = False
+    trigger: bool = False
+    timeout: float | None = None
+    seconds: float = 3.0
+    count: int = 10
+
+    def step(self, default: float) -> float:
+        """Return the bound of a step, seconds."""
+        return default if self.timeout is None else self.timeout
+
+
+class Witness(Observer):
+    """Sees what the camera sends and keeps the last of it.
+
+    Attributes:
+        statuses: those that differ from the one before.
+        results: how many came.
+        arrivals: loop times of the last ones.
+        containers: the last results; each value is a :class:`Reading` where an interpreter was
+            given.
+        unreadable: why the first result could not be given to an interpreter: an endian field
+            that is neither little nor big, cells that are not the layout's.
+    """
+
+    def __init__(self) -> None:
+        self.statuses: deque[Status] = deque(maxlen=MAX_KEPT)
+        self.arrivals: deque[float] = deque(maxlen=MAX_KEPT)
+        self.containers: deque[Result] = deque(maxlen=MAX_CONTAINERS)
+        self.results: int = 0
+        self.unreadable: InterpretationError | None = None
+
+    def on_state(self, event: CameraEvent) -> None:
+        """Keep a status."""
+        if isinstance(event, StatusChanged):
+            self.statuses.append(event.status)
+
+    def on_result(self, result: Result) -> None:
+        """Keep a result."""
+        self._arrived()
+        self.containers.append(result)
+
+    def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
+        """Keep why a result could not be given to an interpreter."""
+        if isinstance(error, InterpretationError):
+            self._arrived()
+            self.unreadable = self.unreadable or error
+
+    def forget_arrivals(self) -> None:
+        """Count results anew."""
+        self.results = 0
+        self.arrivals.clear()
+
+    def _arrived(self) -> None:
+        self.results += 1
+        self.arrivals.append(asyncio.get_running_loop().time())
+
+
+class Diagnosis(NamedTuple, Generic[T]):
+    """One of several things that may be wrong; the first that fits is it."""
+
+    fits: Callable[[T], bool]  # whether it is this one, by what was seen
+    text: str  # what to say, with fields to be filled in
+    cure: str  # what to do, the same
+    exit_code: Exit = Exit.NO_SESSION  # of the finding
+
+
+@dataclass(eq=False)
+class FrameObserver(Observer):
+    """Gives every frame to a function."""
+
+    _trace: Callable[[TraceEntry], None]
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        """Give it."""
+        self._trace(entry)
+
+
+class Reading(NamedTuple):
+    """A result container's bytes and what an interpreter made of them."""
+
+    data: bytes
+    byte_order: ByteOrder  # of their numbers
+    error: InterpretationError | None  # why they do not fit, None where they do
+
+
+class Keeper(Interpreter):
+    """Reads as another interpreter does, and gives a :class:`Reading` whether they fit or not.
+
+    The layout's sequence number is no more than a field to it: setting the number of the next run
+    would change something on the camera.
+
+    Args:
+        inner: the other one.
+    """
+
+    def __init__(self, inner: Interpreter) -> None:
+        layout = inner.layout
+        if layout is not None and layout.sequence_field is not None:
+            layout = Layout(layout.text.replace("@sequence", ""), lenient=layout.lenient)
+        super().__init__(layout)
+        self.inner: Interpreter = inner
+
+    def interpret(self, reader: Reader) -> Reading:
+        """Return the bytes, and the error if there is one."""
+        order = reader.context.byte_order
+        try:
+            run(self.inner, Reader(reader.data, reader.context, self.inner.layout))
+        except InterpretationError as exc:
+            return Reading(reader.data, order, exc)
+        return Reading(reader.data, order, None)
+
+
+@dataclass(slots=True)
+class Examination:
+    """An examination under way."""
+
+    options: DoctorOptions  # what was asked for
+    address: Address  # where the camera is; what was found out is pinned
+    trace: Callable[[TraceEntry], None] | None  # called with every frame
+    witness: Witness  # sees what it sends
+    stack: AsyncExitStack = field(default_factory=AsyncExitStack)  # what is undone at the end
+    # an application that is loaded for the triggers, and goes back
+    borrowed: AsyncExitStack = field(default_factory=AsyncExitStack)
+    camera: SmartCamera | None = None  # the client, None before the session
+    connected_at: float = 0.0  # loop time of the session
+    wants_trigger: bool = False  # whether triggers are still wanted
+    may_trigger: bool = False  # whether the camera waits for them
+    check: str = ""  # name of the check that runs
+    # findings that were not handed out yet
+    pending: list[Finding] = field(default_factory=list[Finding])
+
+    def say(
+        self,
+        severity: Severity,
+        text: str,
+        cure: str = "",
+        *,
+        exit_code: Exit = Exit.DONE,
+        check: str = "",
+        **details: Any,
+    ) -> None:
+        """Report a finding of the present check; arguments as :class:`~smartcam.doctor.Finding`."""
+        self.pending.append(
+            Finding(
+                check=check or self.check,
+                severity=severity,
+                text=text,
+                cure=cure,
+                details=details,
+                exit_code=exit_code,
+            )
+        )
+
+    def fail(
+        self, text: str, cure: str = "", *, exit_code: Exit = Exit.NO_SESSION, **details: Any
+    ) -> None:
+        """Report an error."""
+        self.say("error", text, cure, exit_code=exit_code, **details)
+
+    def take(self) -> list[Finding]:
+        """Return the findings since the last call."""
+        taken, self.pending = self.pending, []
+        return taken
+
+    @property
+    def patient(self) -> SmartCamera:
+        """The camera in a session.
+
+        LookupError: there is none; checks that use it come behind the one that connects.
+        """
+        if self.camera is None:
+            raise LookupError("there is no session")
+        return self.camera
+
+    @property
+    def host_and_port(self) -> str:
+        """Where the camera is, for texts."""
+        host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
+        return f"{host}:{self.address.port}"
+
+    def pin(self, url: str) -> None:
+        """Take over transport and dialect of a URL; a login, which no URL shows, stays."""
+        found = parse_address(url)
+        self.address = self.address._replace(
+            scheme=found.scheme, dialect=found.dialect, quirks=found.quirks
+        )
+
+    def make_camera(self) -> SmartCamera:
+        """Return a client that takes the camera once and never takes it back.
+
+        Raises ConfigurationError: a time-out is none.
+        """
+        asked = self.options
+        options: CameraOptions = {
+            "reconnect": None,
+            "connect_timeout": asked.step(10.0),
+            "request_timeout": asked.step(5.0),
+            "switch_timeout": asked.step(10.0),
+            "y_down": asked.y_down,
+        }
+        if asked.interpreter is not None:
+            options["interpret_as"] = Keeper(asked.interpreter)
+        settings = CameraSettings.make(self.address.url, None, options)
+        settings = settings.model_copy(update={"address": self.address})
+        frames = [FrameObserver(self.trace)] if self.trace is not None else []
+        camera = SmartCamera(settings, observers=[self.witness, *frames])
+        self.stack.push_async_callback(camera.close)
+        return camera

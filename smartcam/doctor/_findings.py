@@ -1,0 +1,78 @@
+"""What an examination says: findings, their severities, and the exit code of the worst."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+Severity = Literal["ok", "hint", "warning", "error"]
+
+SEVERITIES: tuple[Severity, ...] = ("ok", "hint", "warning", "error")
+"""From the best to the worst."""
+
+
+class Exit(enum.IntEnum):
+    """The exit codes that findings can have."""
+
+    DONE = 0
+    """Only hints and warnings, if anything."""
+    NO_SESSION = 3
+    """There is no session, or it broke."""
+    RAN_OUT = 4
+    """A wait in a session ran out."""
+    REFUSED = 5
+    """The camera refused, is stopped, or has a System Error."""
+    UNREADABLE = 6
+    """A result is not interpretable."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One thing that was found out.
+
+    Attributes:
+        check: which check found it.
+        severity: ``ok``: as it should be, or only said; ``hint``: something to know or to try;
+            ``warning``: it works, and something is wrong; ``error``: it does not work.
+        text: what was found, in plain words.
+        cure: what to do, empty where nothing is to be done.
+        details: the same for programs; times in seconds.
+        exit_code: what a command that ends with it returns; 0 for all but errors.
+    """
+
+    check: str
+    severity: Severity
+    text: str
+    cure: str = ""
+    details: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    exit_code: Exit = Exit.DONE
+
+
+def summary(findings: Iterable[Finding]) -> Finding:
+    """Return the sum of findings, as one of ``check="summary"``.
+
+    It has the severity and the exit code of the worst; of several that are equally bad the first
+    decides, since the checks go from the ground up and what follows may come of it.
+    """
+    all_found = list(findings)
+    counts: dict[str, int] = {
+        name: sum(one.severity == name for one in all_found) for name in SEVERITIES
+    }
+    ranks = [SEVERITIES.index(one.severity) for one in all_found]
+    worst = all_found[ranks.index(max(ranks))] if all_found else None
+    words = [
+        f"{count} {name}{'s' if count > 1 else ''}"
+        for name, count in reversed(counts.items())
+        if count and name != "ok"
+    ]
+    return Finding(
+        check="summary",
+        severity=worst.severity if worst is not None else "ok",
+        text=", ".join(words) or "nothing is wrong",
+        details=counts,
+        exit_code=worst.exit_code if worst is not None else Exit.DONE,
+    )

@@ -1,0 +1,284 @@
+"""Checks of what results hold: does the layout fit, and do the values look like SI."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.doctor._context import called
+from smartcam.doctor._findings import Exit
+from smartcam.exceptions import hex_excerpt
+from smartcam.interpreters._localizations import LocalizationsInterpreter
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from smartcam.doctor._context import Examination, Reading
+    from smartcam.exceptions import InterpretationError
+    from smartcam.interpreters._base import Interpreter
+    from smartcam.layout import Field, Layout
+    from smartcam.models import ByteOrder, Result
+
+MAX_ROWS = 40
+"""Rows of a dump: a screen."""
+
+
+# ---------------------------------------------------------------------- the layout
+
+
+class DumpRow(NamedTuple):
+    """One field of a container as the layout has it, beside the bytes that stand there.
+
+    Attributes:
+        offset: of its first byte, from the start of the container's data.
+        field: its name and type.
+        hex: the bytes that are there, at most 32.
+        value: what they mean; what is missing, or too many.
+    """
+
+    offset: int
+    field: str
+    hex: str
+    value: Any
+
+
+def aligned(
+    layout: Layout, data: bytes, order: ByteOrder = "little", *, around: int = 0
+) -> list[DumpRow]:
+    """Return a container's bytes beside a layout's fields, whether they fit or not.
+
+    ``data``: what came, behind the application id. ``order``: of the bytes of a number. ``around``:
+    an offset that must be among the rows: where records repeat, those long before it are left out.
+    """
+    rows: list[DumpRow] = []
+    end = 0
+    for offset, name, field in _places(layout, len(data), around):
+        if len(rows) >= MAX_ROWS:
+            rows.append(DumpRow(offset, "...", "", ""))
+            return rows
+        end = offset + field.size
+        raw = data[offset:end]
+        label = f"{name}: {str(field).partition(': ')[2]}"
+        missing = field.size - len(raw)
+        value = (
+            f"{missing} of {field.size} bytes are missing" if missing else _value(field, raw, order)
+        )
+        rows.append(DumpRow(offset, label, raw[:32].hex(" "), value))
+    if len(data) > end:
+        rows.append(
+            DumpRow(
+                end,
+                "(no field)",
+                data[end : end + 32].hex(" "),
+                f"{len(data) - end} bytes too many",
+            )
+        )
+    return rows
+
+
+def _places(layout: Layout, size: int, around: int) -> Iterator[tuple[int, str, Field]]:
+    """Yield offset, name and field of everything that the layout has in ``size`` bytes."""
+    offset = 0
+    for field in layout.head:
+        yield offset, field.name, field
+        offset += field.size
+    record, repeat = layout.size, layout.repeat
+    there = max(0, math.ceil((size - offset) / record))
+    count = 1 if repeat is None else repeat if isinstance(repeat, int) else there
+    first = min(max(0, (around - offset) // record - 1), max(0, count - 1))
+    for number in range(first, count):
+        begin = offset + number * record
+        for field in layout.fields:
+            yield begin, field.name if repeat is None else f"[{number}].{field.name}", field
+            begin += field.size
+
+
+def _value(field: Field, raw: bytes, order: ByteOrder) -> Any:
+    if field.type == "string":
+        return raw.partition(b"\0")[0].decode(errors="replace")
+    return struct.unpack((">" if order == "big" else "<") + field.wire.code, raw)[0]
+
+
+def _size_text(layout: Layout) -> str:
+    head, repeat = layout.head_size, layout.repeat
+    if repeat is None:
+        return f"{layout.size} bytes"
+    front = f"{head} bytes and " if head else ""
+    if isinstance(repeat, int):
+        return f"{head + repeat * layout.size} bytes"
+    return f"{front}whole records of {layout.size} bytes"
+
+
+async def look_at_results(exam: Examination) -> None:
+    """Check ``layout`` and ``values``: the results that came, against ``--interpret-as``."""
+    containers, interpreter = list(exam.witness.containers), exam.options.interpreter
+    unreadable = exam.witness.unreadable
+    if unreadable is not None:
+        exam.fail(
+            f"a result came that cannot be read: {unreadable}",
+            "Compare it with what the camera is told to send; smartcam watch and --trace show it.",
+            exit_code=Exit.UNREADABLE,
+        )
+    elif not containers and interpreter is not None:
+        exam.say(
+            "hint",
+            "no result came, so the layout was not compared with one",
+            "With --trigger, or while the application runs free, there are results.",
+        )
+    elif containers and interpreter is None:
+        sizes = sorted({len(result.raw) for result in containers})
+        exam.say(
+            "ok",
+            f"{len(containers)} results looked at, of {_listed(sizes)} bytes: "
+            f"{hex_excerpt(containers[0].raw)}; --interpret-as compares them with a layout",
+            sizes=sizes,
+            first=containers[0].raw,
+        )
+    elif interpreter is not None:
+        _compare(exam, interpreter, containers)
+
+
+def _compare(exam: Examination, interpreter: Interpreter, containers: list[Result]) -> None:
+    """Tell the first result that does not fit, or that all do and what their values look like."""
+    readings: list[Reading] = [result.value for result in containers]
+    for result, reading in zip(containers, readings, strict=True):
+        if reading.error is not None:
+            _say_misfit(exam, interpreter, result, reading, reading.error)
+            return
+    fit = "were read" if interpreter.layout is None else f"fit the layout '{interpreter.layout}'"
+    exam.say("ok", f"{len(readings)} results {fit}", results=len(readings))
+    if interpreter.layout is not None:
+        # there integers are metres and radians, too; elsewhere they may count pixels
+        integers = isinstance(interpreter, LocalizationsInterpreter)
+        _look_at_values(exam, interpreter.layout, readings, integers=integers)
+
+
+def _listed(sizes: Sequence[int]) -> str:
+    shown = ", ".join(map(str, sizes[:8]))
+    return shown + (" ..." if len(sizes) > 8 else "")
+
+
+def _say_misfit(
+    exam: Examination,
+    interpreter: Interpreter,
+    result: Result,
+    reading: Reading,
+    error: InterpretationError,
+) -> None:
+    layout, raw = interpreter.layout, reading.data
+    details: dict[str, Any] = {
+        "application": result.application,
+        "offset": error.offset,
+        "received": len(raw),
+        "raw": raw,
+    }
+    text = f"a result of {called(result.application)} does not fit the layout: {error}"
+    if layout is not None:
+        details["expected"] = _size_text(layout)
+        details["dump"] = aligned(layout, raw, reading.byte_order, around=error.offset)
+        text += f". The layout has {_size_text(layout)}, {len(raw)} came"
+    exam.fail(
+        text,
+        'Compare it with the "send results" tool, field by field: which one is missing, of another '
+        "type, or of another width? All fields behind a wrong one are shifted.",
+        exit_code=Exit.UNREADABLE,
+        **details,
+    )
+
+
+# ---------------------------------------------------------------------- the values
+
+
+class _Plausible(NamedTuple):
+    """What a field without a unit may be."""
+
+    quantity: str  # what it measures
+    names: re.Pattern[str]  # which fields do, by their name
+    most: float  # the largest magnitude that is plausible, SI
+    text: str  # what a larger one looks like
+    unit: str  # what to write behind the type then
+    reason: str  # why the limit
+
+
+def _named(words: str) -> re.Pattern[str]:
+    """Return a pattern of words in a field's name, parted by underscores or digits."""
+    return re.compile(rf"(?:^|[_\d])(?:{words})(?:$|[_\d])", re.IGNORECASE)
+
+
+PLAUSIBLE: tuple[_Plausible, ...] = (
+    _Plausible(
+        "angle",
+        _named("theta|phi|psi|angle|rotation|orientation|roll|pitch|yaw"),
+        2 * math.pi + 1e-6,
+        "degrees",
+        "deg",
+        "cameras give angles of half a turn to either side, or of one turn",
+    ),
+    _Plausible(
+        "length",
+        _named("x|y|z|width|height|length|distance|diameter|radius"),
+        5.0,
+        "millimetres (or pixels)",
+        "mm",
+        "a camera's field of view is below two metres, a robot's reach below five",
+    ),
+    _Plausible(
+        "ratio",
+        _named("quality|score"),
+        1.0 + 1e-6,
+        "percent",
+        "percent",
+        "they go from 0 to 1",
+    ),
+)
+"""The limits that a value must exceed to be called implausible; the first row that names it."""
+
+NONSENSE = (1e-20, 1e20)
+"""Reals beyond, zero apart, are hardly measured by anything: they are bytes of something else."""
+
+
+def _look_at_values(
+    exam: Examination, layout: Layout, readings: list[Reading], *, integers: bool
+) -> None:
+    """Give a hint for each field without a unit whose values are not plausible in SI."""
+    found: dict[str, float] = {}  # largest magnitude by field
+    nonsense: dict[str, float] = {}
+    fields = [f for f in layout.fields if f.wire.is_number and (integers or not f.wire.is_integer)]
+    for reading in readings:
+        for record in layout.parse_records(reading.data, reading.byte_order):
+            for field in fields:
+                value = abs(float(getattr(record, field.name)))
+                if value and not field.wire.is_integer and not NONSENSE[0] < value < NONSENSE[1]:
+                    nonsense.setdefault(field.name, value)
+                elif field.unit is None:
+                    found[field.name] = max(value, found.get(field.name, 0.0))
+    for name, value in nonsense.items():
+        exam.say(
+            "hint",
+            f"{name} has values such as {value:g}, which nothing measures",
+            "A field before it is missing or has another type, so that all behind it are shifted; "
+            "or the camera sends no real number there.",
+            check="values",
+            field=name,
+            value=value,
+        )
+    for name, value in found.items():
+        rule = next((one for one in PLAUSIBLE if one.names.search(name)), None)
+        if rule is not None and value > rule.most:
+            kind = next(field for field in fields if field.name == name)
+            exam.say(
+                "hint",
+                f"{name} goes up to {value:g}: as {_SI[rule.quantity]} that is not plausible, it "
+                f"looks like {rule.text}",
+                f"Write {name}: {kind.type_text} {rule.unit} in the layout, and the value comes "
+                "in SI.",
+                check="values",
+                field=name,
+                value=value,
+                most=rule.most,
+            )
+
+
+_SI = {"angle": "radians", "length": "metres", "ratio": "a ratio from 0 to 1"}

@@ -1,0 +1,354 @@
+"""Checks on the way to a session, and why one that was there is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import re
+import socket
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client.handshake import load_protocol
+from smartcam.doctor._context import Diagnosis
+from smartcam.doctor._findings import Exit
+from smartcam.doctor._probing import trials
+from smartcam.doctor._timing import figures
+from smartcam.exceptions import (
+    ConnectFailedError,
+    ProtocolError,
+    ResponseTimeoutError,
+)
+from smartcam.protocols._base import Transport
+
+if TYPE_CHECKING:
+    from smartcam.client import SmartCamera
+    from smartcam.doctor._context import Examination
+    from smartcam.doctor._probing import CameraAnswer, Trial
+    from smartcam.exceptions import SmartCamError
+
+CONNECTS = 5
+"""Sessions made one after the other, so that the connect time has a spread."""
+
+CONNECTS_WITHIN = 3.0
+"""Seconds after which no further one is begun: on a slow link one or two must do."""
+
+KNOCK_TIMEOUT = 1.0
+"""Seconds for a bare TCP connection, to tell a camera that is away from one that hung up."""
+
+KNOCK_AFTER = 0.25
+"""Seconds before that: what goes down closes its connections a moment before its port."""
+
+SOON = 10.0
+"""Seconds: a session that is lost so soon after its Connect was probably taken, as the client's
+own rule has it (see :mod:`smartcam._client.supervisor`)."""
+
+
+# ---------------------------------------------------------------------- the name
+
+
+async def resolve(exam: Examination) -> None:
+    """Check ``name``: what the host resolves to."""
+    host, port = exam.address.host, exam.address.port
+    loop = asyncio.get_running_loop()
+    limit = exam.options.step(10.0)
+    try:
+        async with asyncio.timeout(limit):
+            found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as exc:
+        why = exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)
+        why = why or f"no name server answers within {limit:g} s"
+        exam.fail(
+            f"the name {host!r} does not resolve: {why}",
+            "Look for a slip in the name, or give the camera's IP address instead of a name. "
+            "Names need a DNS server, or an entry in this machine's hosts file.",
+            host=host,
+        )
+        return
+    addresses = sorted({str(info[4][0]) for info in found})
+    if addresses != [host]:
+        text = f"{host} is {', '.join(addresses)}"
+        exam.say("ok", text, host=host, addresses=addresses)
+
+
+# ---------------------------------------------------------------------- the session
+
+
+async def connect(exam: Examination) -> None:
+    """Check ``session``: make one, then some more for the spread of the connect time."""
+    loop = asyncio.get_running_loop()
+    pinned = exam.address.dialect is not None
+    begin = loop.time()
+    try:
+        camera = await exam.make_camera().open()
+    except ConnectFailedError as exc:
+        answered = await _diagnose(exam, exc)
+        if answered is None:
+            return
+        camera, times, begin = answered, list[float](), loop.time()
+    else:
+        times = [loop.time() - begin]
+    exam.pin(camera.url)
+    first = times[0] if times and not pinned else None
+    try:
+        while len(times) < CONNECTS and loop.time() - begin < CONNECTS_WITHIN:
+            await camera.close()
+            one_begin = loop.time()
+            camera = await exam.make_camera().open()
+            times.append(loop.time() - one_begin)
+    except ConnectFailedError as exc:
+        exam.fail(
+            f"a session was made, and another one right after it was not: {exc}",
+            "A camera that is connected to again and again must answer each time. Look for "
+            "another client, and at cable and power.",
+            connected=len(times),
+        )
+        return
+    exam.camera, exam.connected_at = camera, loop.time()
+    if first is not None and len(times) > 1:
+        del times[0]  # it had the search for the dialect in it
+    _say_session(exam, camera, first, times)
+
+
+def _say_session(
+    exam: Examination, camera: SmartCamera, first: float | None, times: list[float]
+) -> None:
+    measured = figures(times)
+    link, dialect = exam.address.scheme, exam.address.dialect
+    search = "" if first is None else f"; the first, which found the dialect, {1e3 * first:.1f} ms"
+    exam.say(
+        "ok",
+        f"a camera answers by {link}://, dialect {dialect}, protocol version "
+        f"{camera.protocol_version}; {measured.times} connects: {measured}{search}",
+        "" if first is None else f"Use {camera.url} from now on: it says what was found out.",
+        url=camera.url,
+        protocol_version=camera.protocol_version,
+        connect_time=measured._asdict(),
+    )
+
+
+# ---------------------------------------------------------------------- no session
+
+
+def _is_errno(trial: Trial, *numbers: int) -> bool:
+    """Whether one of these errors of the system is behind it; a name has several addresses."""
+    error = trial.error
+    if error is not None and isinstance(error.__cause__, OSError):
+        error = error.__cause__
+    if not isinstance(error, OSError):
+        return False
+    found = {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
+    return not found.isdisjoint(numbers)
+
+
+_ERRNO = re.compile(r"\[Errno (\d+)\]")
+
+
+_UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
+
+_CURE_SILENT = (
+    "Is the camera's interface set to {other} instead of {this}? Does it speak another dialect? "
+    "Does another client hold it? Is {port} the port of its process interface (36701 by "
+    "default)?"
+)
+
+_REASONS: tuple[Diagnosis[Trial], ...] = (
+    Diagnosis(
+        lambda trial: _is_errno(trial, errno.ECONNREFUSED),
+        "nothing listens at {where}: {said}",
+        "Look at the port (36701 by default), and whether the camera's process interface is "
+        "switched on. A camera that has just been switched on needs about half a minute.",
+    ),
+    Diagnosis(
+        lambda trial: _is_errno(trial, *_UNREACHABLE),
+        "there is no way to {where}: {said}",
+        "Look at the address, at this machine's network and mask, the cable and the camera's "
+        "power: both must be in one network, or have a route.",
+    ),
+    Diagnosis(
+        lambda trial: not trial.opened and isinstance(trial.error, TimeoutError),
+        "nobody answers at {where}, not even with a refusal: {said}",
+        "Wrong address, no power, another network, or a firewall that drops what comes. Does the "
+        "camera answer a ping from this machine?",
+    ),
+    Diagnosis(
+        lambda trial: not trial.opened,
+        "no connection to {where}: {said}",
+        "Look at the address, this machine's network and the camera's.",
+    ),
+    Diagnosis(
+        lambda trial: trial.hung_up,
+        "{where} takes the connection and hangs up without a word: {said}",
+        "It may serve another client and refuse newcomers: end the other one. Or it is no "
+        "camera, or something else listens at this port.",
+    ),
+    Diagnosis(
+        lambda trial: isinstance(trial.error, ProtocolError),
+        "what {where} answers is no camera's language: {said}",
+        "Something else listens there, or a camera with a dialect that smartcam does not know. "
+        "smartcam probe shows every byte.",
+    ),
+    Diagnosis(
+        lambda trial: trial.received > 0,
+        "{where} answers, and no session comes of it: {step}: {said}",
+        "Something else listens there, or the camera's answers get lost. smartcam probe shows "
+        "every byte.",
+    ),
+    Diagnosis(
+        lambda trial: trial.transport == Transport.UDP.value,
+        "nothing comes back from {where}: {said}; UDP does not tell whether anybody is there",
+        "Look at address, cable and power. " + _CURE_SILENT,
+    ),
+    Diagnosis(
+        lambda trial: True,
+        "{where} takes the connection and says nothing: {step}: {said}",
+        _CURE_SILENT,
+    ),
+)
+"""The first that fits one of the tries is it: bytes that came tell more than silence. Filled in are
+``where``, ``said`` (the try's outcome), ``step``, ``this``, ``other`` and ``port``."""
+
+
+async def _diagnose(exam: Examination, failure: ConnectFailedError) -> SmartCamera | None:
+    """Say why there is no session; return a camera where another way leads to one."""
+    own, found = exam.address, await _try_all(exam)
+    answer = found[-1].answer
+    if answer is None:
+        _say_no_session(exam, found, None)
+        return None
+    exam.pin(answer.url)
+    if exam.address.scheme == own.scheme and own.dialect in {None, exam.address.dialect}:
+        exam.say(
+            "warning",
+            f"no session at first ({failure}), and one a moment later",
+            "Once is no harm: the client tries again. If it happens often, look for another "
+            "client.",
+            attempts=list(failure.attempts),
+        )
+    else:
+        _say_no_session(exam, found, answer)
+    try:
+        return await exam.make_camera().open()
+    except ConnectFailedError as exc:
+        exam.fail(f"and it is gone again: {exc}")
+        return None
+
+
+async def _try_all(exam: Examination) -> list[Trial]:
+    """Return every try, up to the one that is answered."""
+    timeout = exam.options.step(10.0)
+    tries = trials(exam.address, timeout=timeout, trace=exam.trace)
+    async with contextlib.aclosing(tries):
+        return [trial async for trial in tries]
+
+
+def _say_no_session(exam: Examination, found: list[Trial], answer: CameraAnswer | None) -> None:
+    own = found[0].address
+    kind, trial = _reason(found, pinned=own.dialect is not None)
+    words = {
+        "where": f"{exam.host_and_port} ({trial.transport.upper()})",
+        "said": trial.outcome,
+        "step": trial.step,
+        "this": trial.transport.upper(),
+        "other": "UDP" if trial.transport == "tcp" else "TCP",
+        "port": str(own.port),
+    }
+    if answer is not None:
+        cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
+    else:
+        others = [one for one in found if one is not trial]
+        also = f" Also tried: {_folded(others)}." if others else ""
+        cure = kind.cure.format(**words) + also
+    exam.fail(
+        kind.text.format(**words),
+        cure,
+        tries=[str(one) for one in found],
+        frames=[one.frames for one in found],
+        answers_at=answer.url if answer is not None else None,
+    )
+
+
+def _reason(found: list[Trial], *, pinned: bool) -> tuple[Diagnosis[Trial], Trial]:
+    """Return the reason why the URL gives no session, and the try that shows it."""
+    first = found[0]
+    own = [
+        trial
+        for trial in found
+        if trial.transport == first.transport and (trial.dialect == first.dialect or not pinned)
+    ]
+    return next((kind, trial) for kind in _REASONS for trial in own if kind.fits(trial))
+
+
+def _folded(found: list[Trial]) -> str:
+    """Return tries in one line; dialects of a transport with the same outcome together."""
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for trial in found:
+        key = (trial.transport.upper(), trial.step, trial.outcome)
+        groups.setdefault(key, []).append(trial.dialect)
+    return "; ".join(
+        f"{', '.join(dialects)} over {transport}: {step}: {outcome}"
+        for (transport, step, outcome), dialects in groups.items()
+    )
+
+
+# ---------------------------------------------------------------------- a session lost
+
+
+async def explain_loss(exam: Examination, error: SmartCamError) -> None:
+    """Say why a session is over; takes the camera from nobody.
+
+    A client that makes a new session and loses it again knows that it was taken
+    (ConnectionTakenError), at the price of taking the camera back once. This does not: whether the
+    camera is still there is tried with a bare TCP connection. It is a Connect that takes a session
+    over, not a connection (inferred).
+    """
+    age = asyncio.get_running_loop().time() - exam.connected_at
+    cause = error.__cause__
+    details: dict[str, Any] = {"after": age, "error": str(error)}
+    exam.check = "lost"
+    closed = isinstance(cause, OSError) and not isinstance(cause, TimeoutError)
+    schemes = load_protocol(exam.address.protocol).schemes
+    udp = schemes[exam.address.scheme] is Transport.UDP
+    if isinstance(cause, ProtocolError):
+        exam.fail(
+            f"the camera sent something that is no message, and the session was given up: {cause}",
+            "Another dialect? A device in between? smartcam probe and --trace show the bytes.",
+            **details,
+        )
+    elif closed and not udp and await _knock(exam):
+        soon = ", soon after its Connect" if age < SOON else ""
+        exam.fail(
+            f"the camera ended the session after {age:.1f} s{soon}, and still takes connections: "
+            "another client has most probably taken it",
+            "Find the other one: a copy of your program, a PLC, the maker's software, a forgotten "
+            "smartcam watch. A camera serves one client, and the newcomer wins.",
+            check="taken",
+            **details,
+        )
+    elif closed:
+        exam.fail(
+            f"the session broke after {age:.1f} s, and the camera takes no connection now: {error}",
+            "It restarts, or lost its power or its network. Look at its lamps and its cable, and "
+            "try again in half a minute.",
+            **details,
+        )
+    else:
+        taken = " Over UDP a client from which another took the camera is told nothing."
+        exam.fail(
+            f"the camera fell silent after {age:.1f} s: {error}",
+            "Look at cable, switch and power, and for another client." + (taken if udp else ""),
+            exit_code=Exit.RAN_OUT if isinstance(error, ResponseTimeoutError) else Exit.NO_SESSION,
+            **details,
+        )
+
+
+async def _knock(exam: Examination) -> bool:
+    """Whether something takes a TCP connection there."""
+    await asyncio.sleep(KNOCK_AFTER)
+    try:
+        async with asyncio.timeout(KNOCK_TIMEOUT):
+            _, writer = await asyncio.open_connection(exam.address.host, exam.address.port)
+    except (OSError, UnicodeError):
+        return False
+    writer.transport.abort()
+    return True

@@ -1,0 +1,306 @@
+"""Checks that look and ask, and change nothing: status, application, run state, clock."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.doctor._context import Diagnosis, called
+from smartcam.doctor._findings import Exit
+from smartcam.doctor._timing import Figures, figures
+from smartcam.exceptions import InterpretationError, ResponseTimeoutError
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from smartcam.doctor._context import Examination, Witness
+    from smartcam.doctor._findings import Severity
+
+QUERIES = 30
+"""Requests for the round-trip time: enough for a median, done in a moment."""
+
+QUERIES_WITHIN = 3.0
+"""Seconds after which no further one is sent: on a slow link fewer must do."""
+
+SLOW = 0.05
+"""Seconds of round trip from which on a hint is given: on a local network it takes milliseconds."""
+
+MAX_SEEN = 1000
+"""Statuses kept while watching; the last ones."""
+
+CLOCK_MAY_DIFFER = timedelta(minutes=1)
+"""A camera's clock is set by hand or by a client; a minute is what a day or two make of it."""
+
+
+# ---------------------------------------------------------------------- status
+
+
+class _Complaint(NamedTuple):
+    """A status bit that says something is wrong."""
+
+    bit: Status
+    severity: Severity
+    text: str
+    cure: str
+    exit_code: Exit = Exit.DONE
+
+
+_CONDITIONS = (
+    _Complaint(
+        Status.SYSTEM_ERROR,
+        "error",
+        "the camera reports a System Error: it does not work until it is restarted",
+        "Switch it off and on (or camera.reboot() in Python). If it comes back, its log and the "
+        "maker's support are next.",
+        Exit.REFUSED,
+    ),
+    _Complaint(
+        Status.OVERHEAT,
+        "warning",
+        "the camera is too hot; inspections may get worse",
+        "Cool it: a mount that takes the heat away, more air, less light time, fewer images.",
+    ),
+    _Complaint(
+        Status.INPUT_CONTAINER,
+        "warning",
+        "input data and inspections are out of step: more containers than inspections (one was "
+        "dropped), or fewer (one was used again)",
+        "Send one container for each trigger: camera.trigger(input=...) does. Loading the "
+        "application again empties the camera's queue.",
+    ),
+    _Complaint(
+        Status.OVERTRIGGERED,
+        "hint",
+        "the camera has just dropped a trigger: it came while it could not take it",
+        "Trigger more slowly, or from one place only: a sensor or a program.",
+    ),
+    _Complaint(
+        Status.SIMULATION_MODE,
+        "hint",
+        "the camera takes its images from files, not from its sensor",
+        "Choose the sensor as the image source, on the camera's pages.",
+    ),
+)
+
+_STICKY = " The bit stays set until the errors are reset: await camera.reset_errors()."
+
+
+async def look_at_status(exam: Examination) -> None:
+    """Check ``status``: the bits that say that something is wrong."""
+    camera = exam.patient
+    capable = camera.capabilities
+    status = await camera.query_status() if capable.get_status else camera.status
+    wrong = [one for one in _CONDITIONS if one.bit in status]
+    for one in wrong:
+        sticky = one.bit is Status.OVERTRIGGERED and capable.reset_errors
+        cure = one.cure + (_STICKY if sticky else "")
+        exam.say(one.severity, one.text, cure, exit_code=one.exit_code, status=status)
+    if not wrong:
+        exam.say("ok", f"no fault is reported: {status}", status=status)
+
+
+# ---------------------------------------------------------------------- round trip
+
+
+async def measure_round_trip(exam: Examination) -> None:
+    """Check ``round trip``: the time from a Query to its answer."""
+    camera, loop = exam.patient, asyncio.get_running_loop()
+    begin, times = loop.time(), list[float]()
+    while len(times) < QUERIES and loop.time() - begin < QUERIES_WITHIN:
+        sent_at = loop.time()
+        await camera.query_application()
+        times.append(loop.time() - sent_at)
+    measured = figures(times)
+    slow = measured.median > SLOW
+    text = f"{measured.times} requests: {measured}"
+    exam.say(
+        "hint" if slow else "ok",
+        f"{text}; that is slow for a local network" if slow else text,
+        "Look at what is between: Wi-Fi, VPN, a busy switch, a busy machine." if slow else "",
+        round_trip=measured._asdict(),
+    )
+
+
+# ---------------------------------------------------------------------- run state
+
+
+_RUN_STATES: tuple[Diagnosis[list[Status]], ...] = (
+    Diagnosis(
+        lambda seen: _is_stopped(seen[-1]),
+        "{application} is stopped, so no result comes",
+        "Start it: smartcam start '{url}', or await camera.start(), or name the application "
+        "(smartcam trigger --application, connect(application=...)), which starts it.",
+        Exit.REFUSED,
+    ),
+    Diagnosis(
+        lambda seen: all(Status.BUSY in one for one in seen),
+        "the camera is BUSY, all {seconds:g} s long",
+        "It loads an application, or somebody works on its pages. If it stays so for minutes, "
+        "restart it.",
+        Exit.RAN_OUT,
+    ),
+    Diagnosis(
+        lambda seen: True,
+        "{application} runs, does not wait for a trigger, and sent nothing in {seconds:g} s",
+        'It runs free without a "send results" tool, or an inspection takes longer than that: '
+        "watch longer (--seconds), or look at the application on the camera.",
+        Exit.RAN_OUT,
+    ),
+)
+"""Those in which no result comes."""
+
+
+async def watch(exam: Examination) -> None:
+    """Check ``run state``: stopped, busy, waiting for triggers, or running free.
+
+    A camera that waits for a trigger is watched only where none will be sent.
+    """
+    camera, witness, seconds = exam.patient, exam.witness, exam.options.seconds
+    application, status = camera.active_application, camera.status
+    if Status.SYSTEM_ERROR in status:
+        return  # that was told, and explains everything
+    settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
+    seen = [status] if settled else await _watch(exam, seconds)
+    details: dict[str, Any] = {"application": application, "status": camera.status}
+    stopped = _is_stopped(seen[-1])  # perhaps while it was watched
+    if any(_waits(one) for one in seen) and not stopped:
+        exam.may_trigger = True
+        came = f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
+        text = f"{called(application)} runs and waits for triggers{came}"
+        exam.say("ok", text, **details, **_rate(witness))
+    elif witness.results and not stopped:
+        _say_free(exam, details)
+    else:
+        state = next(state for state in _RUN_STATES if state.fits(seen))
+        exam.fail(
+            state.text.format(application=called(application), seconds=seconds),
+            state.cure.format(url=camera.url),
+            exit_code=state.exit_code,
+            **details,
+        )
+
+
+def _say_free(exam: Examination, details: dict[str, Any]) -> None:
+    witness, rate = exam.witness, _rate(exam.witness)
+    text = f"{called(exam.patient.active_application)} runs free: {witness.results} results "
+    text += f"in {exam.options.seconds:g} s"
+    if rate:
+        text += f", {rate['results_per_second']:.1f} a second; between two: {_intervals(witness)}"
+    wanted = exam.wants_trigger
+    exam.say(
+        "error" if wanted else "ok",
+        text + ("; a trigger to it would get no result" if wanted else ""),
+        "Take its results with camera.results() or smartcam watch; or have the application "
+        "triggered, on the camera."
+        if wanted
+        else "",
+        exit_code=Exit.RAN_OUT if wanted else Exit.DONE,
+        **details,
+        **rate,
+    )
+
+
+async def _watch(exam: Examination, seconds: float) -> list[Status]:
+    """Return every status of so many seconds, the present one first."""
+    seen: deque[Status] = deque(maxlen=MAX_SEEN)
+
+    def note(status: Status) -> bool:
+        seen.append(status)
+        return False
+
+    exam.witness.forget_arrivals()
+    # held while it watches: results are made where somebody takes them
+    async with exam.patient.results(max_queue=1):
+        with contextlib.suppress(ResponseTimeoutError):
+            await exam.patient.wait_status(note, timeout=seconds)
+    return list(seen)
+
+
+def _intervals(witness: Witness) -> Figures:
+    return figures([after - before for before, after in pairwise(witness.arrivals)])
+
+
+def _rate(witness: Witness) -> dict[str, Any]:
+    """Return rate and spread of results that came by themselves; nothing for a single one."""
+    arrivals = witness.arrivals
+    if len(arrivals) < 2:
+        return {}
+    span = arrivals[-1] - arrivals[0]
+    return {
+        "results": witness.results,
+        "results_per_second": (len(arrivals) - 1) / span if span else 0.0,
+        "interval": _intervals(witness)._asdict(),
+    }
+
+
+def _is_stopped(status: Status) -> bool:
+    return not status & (Status.RUNNING | Status.BUSY | Status.WAITING_FOR_TRIGGER)
+
+
+def _waits(status: Status) -> bool:
+    return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
+
+
+# ---------------------------------------------------------------------- clock
+
+
+async def look_at_clock(exam: Examination) -> None:
+    """Check ``clock``: whether it shows this machine's time, local or UTC.
+
+    It carries no time zone, and a restart loses it.
+
+    Source: BVS ID guide p. 231 (published); for the others inferred.
+    """
+    camera = exam.patient
+    if not camera.capabilities.get_clock:
+        exam.say("ok", f"{camera.capabilities.dialect} has no message for a clock")
+        return
+    try:
+        shown = await camera.get_clock()
+    except InterpretationError as exc:
+        exam.say("warning", f"the camera's clock is no date: {exc.got}", _SET_CLOCK)
+        return
+    except ResponseTimeoutError as exc:
+        exam.say(
+            "warning",
+            f"the camera does not tell its clock: {exc}",
+            "Nothing but the clock depends on it. The session was given up for it.",
+        )
+        return
+    now = datetime.now(UTC)
+    local = now.astimezone().replace(tzinfo=None)
+    clocks = {"local time": shown - local, "UTC": shown - now.replace(tzinfo=None)}
+    zone, off = min(clocks.items(), key=lambda item: abs(item[1]))
+    text = f"the camera's clock shows {shown:%Y-%m-%d %H:%M:%S}"
+    details: dict[str, Any] = {
+        "clock": shown,
+        "seconds_off": off.total_seconds(),
+        "compared_with": zone,
+    }
+    if abs(off) <= CLOCK_MAY_DIFFER:
+        exam.say("ok", f"{text}, which is this machine's {zone}", **details)
+        return
+    behind = "behind" if off < timedelta(0) else "ahead of"
+    exam.say(
+        "warning",
+        f"{text}, {_rounded(abs(off))} {behind} this machine's "
+        f"{zone}; it carries no time zone, and a restart of the camera loses it",
+        _SET_CLOCK,
+        **details,
+    )
+
+
+def _rounded(off: timedelta) -> str:
+    """Return it in whole seconds, in whole days where it is more than a week."""
+    if off > timedelta(days=7):
+        return f"{off.days} days"
+    return str(timedelta(seconds=round(off.total_seconds())))
+
+
+_SET_CLOCK = (
+    "await camera.set_clock(datetime.now()) after each restart of the camera, or an NTP server in "
+    "its settings where it has them. Results of smartcam carry this machine's time."
+)

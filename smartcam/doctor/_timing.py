@@ -1,0 +1,47 @@
+"""Times in figures: minimum, median, 99th percentile and jitter."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+class Figures(NamedTuple):
+    """Figures of a row of times; seconds.
+
+    Attributes:
+        times: how many.
+        min: the shortest.
+        median: the one in the middle.
+        p99: the 99th percentile by nearest rank: the longest where there are 100 or fewer.
+        jitter: mean of the absolute differences of successive times; 0 for a single one.
+    """
+
+    times: int
+    min: float
+    median: float
+    p99: float
+    jitter: float
+
+    def __str__(self) -> str:
+        """Return them as text, in milliseconds."""
+        low, middle, high, jitter = (f"{1e3 * one:.1f}" for one in self[1:])
+        return f"min {low}, median {middle}, p99 {high} ms, jitter {jitter} ms"
+
+
+def figures(times: Sequence[float]) -> Figures:
+    """Return the figures of one time or more, in the order in which they were taken."""
+    ordered = sorted(times)
+    steps = [abs(after - before) for before, after in pairwise(times)]
+    return Figures(
+        len(times),
+        ordered[0],
+        statistics.median(ordered),
+        ordered[math.ceil(0.99 * len(ordered)) - 1],
+        statistics.fmean(steps) if steps else 0.0,
+    )

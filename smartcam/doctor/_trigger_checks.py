@@ -1,0 +1,167 @@
+"""Checks about the application that is wanted, and the triggers, where they are allowed."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from smartcam.doctor._context import called
+from smartcam.doctor._findings import Exit
+from smartcam.doctor._timing import figures
+from smartcam.exceptions import (
+    CommandRejectedError,
+    InterpretationError,
+    LinkError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from smartcam.doctor._context import Examination
+
+
+async def look_at_application(exam: Examination) -> None:
+    """Check ``application``: whether the wanted one is active; loaded for triggers only.
+
+    The protocol has no way to ask whether an application is there but to load it.
+    """
+    camera, wanted = exam.patient, exam.options.application
+    active = await camera.query_application()
+    details: dict[str, Any] = {"active": active, "wanted": wanted}
+    if wanted is None or (wanted == active and not exam.wants_trigger):
+        exam.say("ok", f"{called(active)} is active", **details)
+    elif wanted == 0:
+        exam.wants_trigger = False  # of another application than the one that is meant
+        exam.fail(
+            f"no application has the id 0; {called(active)} is active",
+            "Name another id: the camera's pages show them.",
+            exit_code=Exit.REFUSED,
+            **details,
+        )
+    elif exam.wants_trigger:
+        await _borrow(exam, active, wanted)
+    else:
+        exam.say(
+            "warning",
+            f"{called(active)} is active, not {wanted}; whether the camera has {wanted} cannot "
+            "be known without loading it",
+            f"smartcam switch '{camera.url}' {wanted} loads it. With --trigger the doctor loads "
+            "it, and the one before again afterwards.",
+            **details,
+        )
+
+
+async def _borrow(exam: Examination, active: int, wanted: int) -> None:
+    camera = exam.patient
+    details: dict[str, Any] = {"active": active, "wanted": wanted}
+    exam.wants_trigger = False  # until it is the one that is meant
+    try:
+        await exam.borrowed.enter_async_context(camera.application(wanted))
+    except CommandRejectedError as exc:
+        exam.fail(
+            f"the camera has no application {wanted}: {exc}",
+            "Look up the id on the camera's pages. The camera refuses a damaged one, too.",
+            exit_code=Exit.REFUSED,
+            **details,
+        )
+        return
+    exam.wants_trigger = True
+    text = f"application {wanted} is loaded and runs, for the triggers"
+    exam.say("ok", text, **details)
+
+
+async def give_back(exam: Examination) -> None:
+    """Have the application and the run state back that were there before the triggers."""
+    try:
+        await exam.borrowed.aclose()
+    except LinkError:
+        raise
+    except SmartCamError as exc:
+        exam.say(
+            "warning",
+            f"the camera did not go back to how it was: {exc}",
+            "Look with smartcam status, and load or start with smartcam switch and start.",
+        )
+
+
+# ---------------------------------------------------------------------- triggers
+
+
+async def trigger(exam: Examination) -> None:
+    """Check ``trigger``: send some, one after the other; the first without a result ends it."""
+    if not (exam.wants_trigger and exam.may_trigger):
+        return
+    camera, loop, options = exam.patient, asyncio.get_running_loop(), exam.options
+    times: list[float] = []
+    begin = ended = loop.time()
+    async with camera.results(max_queue=1):
+        for _ in range(options.count):
+            exam.witness.statuses.clear()
+            sent_at = loop.time()
+            try:
+                result = await camera.trigger(timeout=options.step(5.0))
+            except LinkError:
+                raise
+            except InterpretationError:
+                break  # the check of the layout tells it
+            except SmartCamError as exc:
+                _say_failed(exam, exc, len(times))
+                break
+            ended = loop.time()
+            times.append(ended - sent_at if result.latency is None else result.latency)
+    if not times:
+        return
+    measured = figures(times)
+    rate = len(times) / max(ended - begin, sum(times))
+    text = f"{measured.times} triggers to their results: {measured}; {rate:.1f} results a second"
+    exam.say("ok", text, trigger_time=measured._asdict(), results_per_second=rate)
+    extra = camera.statistics().extra_results
+    if extra:
+        exam.say(
+            "hint",
+            f"{extra} results more than triggers came: the application sends several for each",
+            "Tell the client how many: camera.trigger(results_per_trigger=...).",
+            extra_results=extra,
+        )
+
+
+def _say_failed(exam: Examination, error: SmartCamError, done: int) -> None:
+    which = f"trigger {done + 1}"
+    if not isinstance(error, TriggerTimeoutError):
+        exam.fail(
+            f"{which} gave no result: {error}",
+            "docs/troubleshooting.md has what stands behind this error.",
+            exit_code=Exit.REFUSED,
+            error=type(error).__name__,
+        )
+        return
+    story = [Status.WAITING_FOR_TRIGGER in status for status in exam.witness.statuses]
+    fell = False in story
+    rose = fell and True in story[story.index(False) :]
+    patience = exam.options.step(5.0)
+    if rose:
+        text = (
+            f"{which} was inspected and nothing was sent: Waiting for Trigger fell and rose again, "
+            f"and no result came within {patience:g} s"
+        )
+        cure = (
+            'The application has no "send results" tool, or sends to another interface: add one '
+            "for the process interface, on the camera."
+        )
+    elif fell:
+        text = f"the inspection of {which} was not done within {patience:g} s"
+        cure = "Give it more time: --timeout, or trigger(timeout=...)."
+    elif not exam.patient.capabilities.status_by_itself:
+        text = f"{which} was taken, and no result came within {patience:g} s"
+        cure = (
+            'Does the application send results to the process interface ("send results", '
+            '"Outputs")? Does an inspection take longer than that (--timeout)?'
+        )
+    else:
+        text = f"{which} was not taken: the camera went on waiting for a trigger"
+        cure = (
+            "It is set to another trigger source (a sensor, an encoder): look at the application's "
+            "camera settings. Over UDP the trigger may have been lost."
+        )
+    exam.fail(text, cure, exit_code=Exit.RAN_OUT, error=type(error).__name__, inspected=rose)

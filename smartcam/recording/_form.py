@@ -1,0 +1,427 @@
+"""The form of a recording: which topics there are, what their messages hold, and both ways to JSON.
+
+Each camera has four topics, ``/CAMERA/frames``, ``results``, ``events`` and ``errors``. A message
+is a JSON object with the field names of the public models; a field that is None is left out, since
+viewers such as Foxglove take a field's type from the schema and know no "or null". The schemas
+keep to the types that Foxglove reads (``type`` is one word everywhere).
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
+
+from smartcam.exceptions import MissingExtraError
+from smartcam.models import (
+    ApplicationChanged,
+    CameraEvent,
+    Connected,
+    Disconnected,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+    jsonable,
+)
+from smartcam.observers import TraceEntry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+FORMAT = "1"
+"""Version of the form; a reader refuses another one."""
+
+PROFILE = "x-smartcam"
+"""Profile in the file's header."""
+
+FILE_METADATA = "smartcam"
+"""Name of the metadata record about the file: ``format``, ``version`` (of smartcam), ``began``."""
+
+CAMERA_METADATA = "smartcam.camera"
+"""Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and what else was
+told; a later one goes before an earlier one."""
+
+MAX_MESSAGE = 1 << 26
+"""Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
+room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
+
+MAX_VALUES = 3_000_000
+"""Commas and opening brackets of a message, written or read: each may become an object that takes
+a hundred times its room. A container of 1 MiB with a field a byte has two million."""
+
+MAX_CAMERAS = 10_000
+"""Cameras in a file: their facts are kept while it is read."""
+
+MAX_NAME = 1000
+"""Characters of a camera's name: a client takes 200, and HOST:PORT has fewer than 300."""
+
+EPOCH = datetime.fromtimestamp(0, UTC)
+
+
+class RecordedError(NamedTuple):
+    """Something went wrong while it was recorded: what ``Observer.on_error`` is told.
+
+    Attributes:
+        camera: name of the camera.
+        at: when the recorder was told, UTC.
+        error: name of the exception's class.
+        text: what it says.
+        triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
+    """
+
+    camera: str
+    at: datetime
+    error: str
+    text: str
+    triggered_at: datetime | None
+
+
+Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError
+"""What a recording holds."""
+
+
+class Kind(NamedTuple):
+    """One kind of message."""
+
+    topic: str  # last part of its topic
+    schema: str  # name of its schema
+    about: str  # what it is, for the schema
+    properties: Mapping[str, Any]  # the schema's, by field
+    required: tuple[str, ...]  # fields that are always there
+    to_json: Callable[[Any], dict[str, Any]]  # makes the object of an item
+    # makes the item of an object; raises whatever comes where it does not fit
+    from_json: Callable[[dict[str, Any]], Item]
+
+    @property
+    def json_schema(self) -> dict[str, Any]:
+        """The JSON Schema of its messages."""
+        return {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": self.schema,
+            "description": self.about,
+            "type": "object",
+            "properties": dict(self.properties),
+            "required": list(self.required),
+        }
+
+
+def load_extra(name: str) -> Any:
+    """Import a module of the extra ``record``.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as exc:
+        raise MissingExtraError(
+            f'recordings need {name.partition(".")[0]}: pip install "smartcam[record]"',
+            extra="record",
+        ) from exc
+
+
+def nanoseconds(at: datetime) -> int:
+    """Return a time as MCAP has it: nanoseconds since 1970, UTC; never negative."""
+    return max(0, (at - EPOCH) // timedelta(microseconds=1) * 1000)
+
+
+def count_values(data: bytes) -> int:
+    """Return the number of values of a message, roughly, and hold it against the bounds.
+
+    Raises:
+        ValueError: it goes beyond one.
+    """
+    if len(data) > MAX_MESSAGE:
+        raise ValueError(f"a message of {len(data)} bytes, expected {MAX_MESSAGE} at most")
+    values = data.count(b",") + data.count(b"{") + data.count(b"[")
+    if values > MAX_VALUES:
+        raise ValueError(f"a message of {values} values, expected {MAX_VALUES} at most")
+    return values
+
+
+def message_fields(data: bytes) -> dict[str, Any]:
+    """Return the object that a message is.
+
+    Raises:
+        ValueError: it is none.
+    """
+    parsed: Any = json.loads(data)
+    if not isinstance(parsed, dict):
+        raise ValueError(f"a message is a {type(parsed).__name__}, expected an object")  # noqa: TRY004
+    return cast("dict[str, Any]", parsed)
+
+
+def topic_of(camera: str, kind: str) -> str:
+    """Return the topic of a camera's messages of one kind."""
+    return f"/{camera}/{KINDS[kind].topic}"
+
+
+# ---------------------------------------------------------------------- to JSON
+
+
+def _object(value: object) -> dict[str, Any]:
+    """Return an item's fields as JSON, without those that are None."""
+    fields: dict[str, Any] = jsonable(value)
+    return {name: field for name, field in fields.items() if field is not None}
+
+
+def _event_object(event: CameraEvent) -> dict[str, Any]:
+    fields = _object(event)
+    previous = fields.pop("previous", None)
+    if previous is not None:
+        name = "previous_status" if isinstance(event, StatusChanged) else "previous_application"
+        fields[name] = previous
+    return {"event": type(event).__name__, **fields}
+
+
+# ---------------------------------------------------------------------- from JSON
+
+
+T = TypeVar("T")
+
+
+def _get(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """Return a field that must be there.
+
+    Raises:
+        ValueError: it is not there, or something else.
+    """
+    value = _optional(fields, name, kind)
+    if value is None:
+        raise ValueError(f"{name}: nothing is there, expected {kind.__name__}")
+    return value
+
+
+def _optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
+    """Return a field that may be missing."""
+    value: object = fields.get(name)
+    if value is None:
+        return None
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{name}: {value!r:.60} came, expected {kind.__name__}")
+    return value
+
+
+def _camera_name(fields: Mapping[str, Any]) -> str:
+    name = _get(fields, "camera", str)
+    if len(name) > MAX_NAME:
+        raise ValueError(f"camera: a name of {len(name)} characters, expected {MAX_NAME} at most")
+    return name
+
+
+def _time(text: str) -> datetime:
+    at = datetime.fromisoformat(text)
+    if at.tzinfo is None:
+        raise ValueError(f"the time {text!r:.60} has no time zone")
+    return at.astimezone(UTC)
+
+
+def _when_of(fields: Mapping[str, Any], name: str) -> datetime:
+    return _time(_get(fields, name, str))
+
+
+def _optional_when(fields: Mapping[str, Any], name: str) -> datetime | None:
+    text = _optional(fields, name, str)
+    return None if text is None else _time(text)
+
+
+def status_of(names: object) -> Status:
+    """Return the status of its bits' names; a bit without a name stands there as ``0x40``.
+
+    Raises:
+        ValueError: they are no names of bits.
+    """
+    bits = 0
+    for name in cast("list[object]", names) if isinstance(names, list) else [names]:
+        if not isinstance(name, str):
+            raise ValueError(f"status: {names!r:.60} came, expected names of bits")  # noqa: TRY004
+        if name.startswith("0x") and len(name) <= _BIT_DIGITS:
+            bits |= int(name, 16)
+        elif name in Status.__members__:
+            bits |= Status[name].value
+        else:
+            raise ValueError(f"status: {name!r:.60} is the name of no bit")
+    return Status(bits)
+
+
+_BIT_DIGITS = len("0x") + 16  # 64 bits: the vendor's 32 and 32 of ours
+
+
+def _frame(fields: dict[str, Any]) -> TraceEntry:
+    direction, data = _get(fields, "direction", str), _get(fields, "hex", str)
+    if direction not in {">", "<", "!"}:
+        raise ValueError(f"direction: {direction!r:.60} came, expected >, < or !")
+    bytes.fromhex(data)
+    return TraceEntry(
+        _when_of(fields, "at"),
+        _camera_name(fields),
+        direction,
+        _optional(fields, "message_id", int),
+        _get(fields, "message", str),
+        cast("dict[str, Any] | None", _optional(fields, "fields", dict)),
+        data,
+    )
+
+
+def _result(fields: dict[str, Any]) -> Result:
+    latency = fields.get("latency")
+    if latency is not None and not (type(latency) in {int, float} and math.isfinite(latency)):
+        raise ValueError(f"latency: {latency!r:.60} came, expected seconds")
+    return Result(
+        _camera_name(fields),
+        _get(fields, "application", int),
+        _optional(fields, "sequence", int),
+        _get(fields, "number", int),
+        _optional_when(fields, "triggered_at"),
+        _when_of(fields, "received_at"),
+        latency,
+        bytes.fromhex(_get(fields, "raw", str)),
+        fields.get("value"),
+    )
+
+
+def _event(fields: dict[str, Any]) -> CameraEvent:
+    camera, at = _camera_name(fields), _when_of(fields, "at")
+    match _get(fields, "event", str):
+        case "Connected":
+            return Connected(camera=camera, at=at, url=_get(fields, "url", str))
+        case "Reconnected":
+            return Reconnected(camera=camera, at=at, url=_get(fields, "url", str))
+        case "Disconnected":
+            return Disconnected(
+                camera=camera,
+                at=at,
+                reason=_get(fields, "reason", str),
+                expected=_get(fields, "expected", bool),
+            )
+        case "StatusChanged":
+            before = fields.get("previous_status")
+            return StatusChanged(
+                camera=camera,
+                at=at,
+                status=status_of(_get(fields, "status", list)),
+                previous=None if before is None else status_of(before),
+            )
+        case "ApplicationChanged":
+            return ApplicationChanged(
+                camera=camera,
+                at=at,
+                application=_get(fields, "application", int),
+                previous=_optional(fields, "previous_application", int),
+            )
+        case _:
+            return CameraEvent(camera=camera, at=at)
+
+
+def _error(fields: dict[str, Any]) -> RecordedError:
+    return RecordedError(
+        _camera_name(fields),
+        _when_of(fields, "at"),
+        _get(fields, "error", str),
+        _get(fields, "text", str),
+        _optional_when(fields, "triggered_at"),
+    )
+
+
+# ---------------------------------------------------------------------- the table
+
+
+def _text(about: str) -> dict[str, Any]:
+    return {"type": "string", "description": about}
+
+
+def _integer(about: str) -> dict[str, Any]:
+    return {"type": "integer", "description": about}
+
+
+def _when(about: str) -> dict[str, Any]:
+    return {"type": "string", "format": "date-time", "description": f"{about}; ISO 8601, UTC"}
+
+
+_CAMERA = _text("name of the camera")
+_AT = _when("when")
+_BITS = {"type": "array", "items": {"type": "string"}, "description": "names of the status bits"}
+_TRIGGERED_AT = _when("when it was triggered; absent where it was not")
+
+KINDS: dict[str, Kind] = {
+    "frames": Kind(
+        "frames",
+        "smartcam.Frame",
+        "A frame on the wire, or bytes that make none.",
+        {
+            "at": _AT,
+            "camera": _CAMERA,
+            "direction": _text("> to the camera, < from it, ! bytes that make no frame"),
+            "message_id": _integer("id on the wire"),
+            "message": _text("name of the message, or what is wrong with the bytes"),
+            "fields": {"type": "object", "properties": {}, "description": "the decoded body"},
+            "hex": _text("the bytes"),
+        },
+        ("at", "camera", "direction", "message", "hex"),
+        _object,
+        _frame,
+    ),
+    "results": Kind(
+        "results",
+        "smartcam.Result",
+        "A decoded result container; in `value` stands what the interpreter made of it.",
+        {
+            "camera": _CAMERA,
+            "application": _integer("id of the application that made it"),
+            "sequence": _integer("value of the layout's @sequence field"),
+            "number": _integer("the client's own count, from 1"),
+            "triggered_at": _TRIGGERED_AT,
+            "received_at": _when("when its last byte arrived"),
+            "latency": {"type": "number", "description": "seconds from trigger to arrival"},
+            "raw": _text("the container's bytes behind the application id, as hex"),
+        },
+        ("camera", "application", "number", "received_at", "raw"),
+        _object,
+        _result,
+    ),
+    "events": Kind(
+        "events",
+        "smartcam.Event",
+        "Something happened to the camera.",
+        {
+            "event": _text(
+                "Connected, Reconnected, Disconnected, StatusChanged or ApplicationChanged"
+            ),
+            "camera": _CAMERA,
+            "at": _AT,
+            "url": _text("Connected, Reconnected: the address, with everything pinned"),
+            "reason": _text("Disconnected: why"),
+            "expected": {
+                "type": "boolean",
+                "description": "Disconnected: by the client's own wish",
+            },
+            "status": _BITS,
+            "previous_status": _BITS,
+            "application": _integer("ApplicationChanged: id of the active application"),
+            "previous_application": _integer("ApplicationChanged: id of the one before"),
+        },
+        ("event", "camera", "at"),
+        _event_object,
+        _event,
+    ),
+    "errors": Kind(
+        "errors",
+        "smartcam.Error",
+        "Something went wrong: a trigger without a result, a lost link, a container that does "
+        "not fit.",
+        {
+            "camera": _CAMERA,
+            "at": _AT,
+            "error": _text("name of the exception's class"),
+            "text": _text("what it says"),
+            "triggered_at": _TRIGGERED_AT,
+        },
+        ("camera", "at", "error", "text"),
+        _object,
+        _error,
+    ),
+}
+"""The kinds of messages, by the last part of their topics."""

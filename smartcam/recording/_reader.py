@@ -1,0 +1,320 @@
+"""Reading a recording, whole or cut off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
+from smartcam.models import CameraEvent, Result
+from smartcam.observers import TraceEntry
+from smartcam.recording._form import (
+    CAMERA_METADATA,
+    FILE_METADATA,
+    FORMAT,
+    KINDS,
+    MAX_CAMERAS,
+    RecordedError,
+    count_values,
+    message_fields,
+)
+from smartcam.recording._recorder import Counts
+from smartcam.recording._records import (
+    Channel,
+    CutOffError,
+    McapMessage,
+    Metadata,
+    RecordReader,
+    Schema,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sized
+    from datetime import datetime
+
+    from smartcam.recording._form import Item, Kind
+    from smartcam.recording._records import Record
+
+MIN_VALUES = 10_000_000
+"""Values in the messages of a file that every file may have: ten seconds of work."""
+
+VALUES_PER_BYTE = 100
+"""Values for each byte of a larger file. Real recordings have less than one, since each message
+takes 16 bytes of index; tables that are nearly all zeros have ten."""
+
+T = TypeVar("T")
+
+
+class RecordedCamera(NamedTuple):
+    """What a recording says about a camera.
+
+    Attributes:
+        name: its name.
+        url: its address, without a password; "" where there was never a session.
+        protocol: name of its protocol; "" where there was never a session.
+        dialect: name of its dialect, None where none is known.
+        quirks: deviations from the dialect.
+        interpret_as: how its results were read, as text; None where the recorder was not told.
+        facts: everything that was told, by name.
+    """
+
+    name: str
+    url: str
+    protocol: str
+    dialect: str | None
+    quirks: tuple[str, ...]
+    interpret_as: str | None
+    facts: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """An MCAP file of :class:`~smartcam.recording.Recorder`; made by :func:`load_recording`.
+
+    Its items are read from the file each time, in the order in which they were recorded.
+
+    Attributes:
+        path: the file.
+        version: of the smartcam that wrote it.
+        cameras: the cameras in it, by name, in the order in which they appear.
+        counts: how many items of each kind there are.
+        began: time of the first item, UTC; None where there is none.
+        ended: time of the last item, UTC.
+        remark: "" for a whole file; otherwise where it stops being readable, and why.
+    """
+
+    path: Path
+    version: str
+    cameras: dict[str, RecordedCamera]
+    counts: Counts
+    began: datetime | None
+    ended: datetime | None
+    remark: str
+
+    @property
+    def seconds(self) -> float:
+        """From the first to the last item."""
+        if self.began is None or self.ended is None:
+            return 0.0
+        return (self.ended - self.began).total_seconds()
+
+    def camera(self, name: str | None = None) -> RecordedCamera:
+        """Return the camera of that name; without a name the only one there is.
+
+        Raises:
+            ConfigurationError: there is none of that name, or there are several; names them.
+        """
+        names = ", ".join(self.cameras)
+        if not names:
+            raise ConfigurationError(f"recording {self.path}: no camera is in it")
+        if name is not None and name not in self.cameras:
+            raise ConfigurationError(
+                f"recording {self.path}: no camera {name!r} is in it; there are: {names}"
+            )
+        if name is None and len(self.cameras) != 1:
+            raise ConfigurationError(
+                f"recording {self.path}: {len(self.cameras)} cameras are in it, say which one: "
+                f"{names}"
+            )
+        return self.cameras[next(iter(self.cameras)) if name is None else name]
+
+    def items(self, camera: str | None = None) -> Iterator[Item]:
+        """Yield everything, of all cameras or of one."""
+        for found in _Scan(self.path).items():
+            if camera is None or found.camera == camera:
+                yield found
+
+    def frames(self, camera: str | None = None) -> Iterator[TraceEntry]:
+        """Yield the frames."""
+        return self._of_type(TraceEntry, camera)
+
+    def results(self, camera: str | None = None) -> Iterator[Result]:
+        """Yield the results; ``value`` is as JSON has it: dicts, lists, texts and numbers."""
+        return self._of_type(Result, camera)
+
+    def events(self, camera: str | None = None) -> Iterator[CameraEvent]:
+        """Yield the events."""
+        return self._of_type(CameraEvent, camera)
+
+    def errors(self, camera: str | None = None) -> Iterator[RecordedError]:
+        """Yield the errors."""
+        return self._of_type(RecordedError, camera)
+
+    def _of_type(self, kind: type[T], camera: str | None) -> Iterator[T]:
+        return (item for item in self.items(camera) if isinstance(item, kind))
+
+
+def load_recording(path: str | Path) -> Recording:
+    """Look through a recording; what can be read of a file that was cut off, is.
+
+    Raises:
+        ConfigurationError: the file cannot be read, is no MCAP, or is another program's.
+        RecordingError: it goes beyond a bound that no recording comes near, or the disk fails.
+        MissingExtraError: what inflates its chunks is not installed.
+    """
+    scan = _Scan(Path(path))
+    counts = dict.fromkeys(KINDS, 0)
+    began: datetime | None = None
+    ended: datetime | None = None
+    names: dict[str, None] = {}
+    for item in scan.items():
+        names[item.camera] = None
+        _check_cameras(scan.path, names)
+        counts[_kind(item)] += 1
+        at = item.received_at if isinstance(item, Result) else item.at
+        began = at if began is None else min(began, at)
+        ended = at if ended is None else max(ended, at)
+        del item  # the next one may be large, too
+    return Recording(
+        path=scan.path,
+        version=scan.file_facts.get("version", ""),
+        cameras={name: _camera(name, scan.camera_facts.get(name, {})) for name in names},
+        counts=Counts(**counts),
+        began=began,
+        ended=ended,
+        remark=scan.remark,
+    )
+
+
+def _check_cameras(path: Path, names: Sized) -> None:
+    if len(names) > MAX_CAMERAS:
+        raise RecordingError(
+            f"recording {path}: {len(names)} cameras, expected {MAX_CAMERAS} at most"
+        )
+
+
+def _kind(item: Item) -> str:
+    match item:
+        case TraceEntry():
+            return "frames"
+        case Result():
+            return "results"
+        case RecordedError():
+            return "errors"
+        case _:
+            return "events"
+
+
+def _camera(name: str, facts: dict[str, str]) -> RecordedCamera:
+    return RecordedCamera(
+        name,
+        facts.get("url", ""),
+        facts.get("protocol", ""),
+        facts.get("dialect"),
+        tuple(quirk for quirk in facts.get("quirks", "").split(",") if quirk),
+        facts.get("interpret_as"),
+        facts,
+    )
+
+
+@dataclass(slots=True)
+class _Scan:
+    """One pass through a file."""
+
+    path: Path
+    # what it says about itself; filled during the pass, as the next two
+    file_facts: dict[str, str] = field(default_factory=dict[str, str])
+    # what it says about cameras, by their names
+    camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    remark: str = ""  # where it stops being readable, and why
+    values: int = 0  # in its messages so far
+
+    def items(self) -> Iterator[Item]:
+        """Yield everything that can be read.
+
+        Raises:
+            ConfigurationError: it is no recording of ours.
+            RecordingError: it goes beyond a bound, or the disk fails.
+        """
+        try:
+            stream = self.path.open("rb")
+        except (OSError, ValueError) as exc:
+            reason = exc.strerror if isinstance(exc, OSError) else exc
+            raise ConfigurationError(f"recording {self.path}: {reason}") from exc
+        with stream:
+            self._check_magic(stream.read(8))
+            stream.seek(0)
+            count = 0
+            kinds: dict[int, Kind] = {}
+            schemas: dict[int, str] = {}
+            reader = RecordReader(stream, self.path)
+            records = reader.records()
+            while True:
+                try:
+                    record = next(records)
+                    item = self._take(record, schemas, kinds, reader.place)
+                except StopIteration:
+                    break
+                except SmartCamError:
+                    raise
+                except OSError as exc:
+                    raise RecordingError(f"recording {self.path}: {exc.strerror or exc}") from exc
+                except (CutOffError, ValueError, OverflowError, RecursionError) as exc:
+                    self.remark = _remark(count, exc)
+                    break
+                if item is not None:
+                    count += 1
+                    yield item
+                    item = None  # the next one may be large, too
+            self._check_ours(schemas)
+
+    def _take(
+        self, record: Record, schemas: dict[int, str], kinds: dict[int, Kind], place: int
+    ) -> Item | None:
+        match record:
+            case Schema(number, name):
+                schemas[number] = name
+            case Channel(number, schema):
+                name = schemas.get(schema, "")
+                kind = next((one for one in KINDS.values() if one.schema == name), None)
+                if kind is not None:
+                    kinds[number] = kind
+            case McapMessage(channel, data) if channel in kinds:
+                body = bytes(data)
+                self._count_values(count_values(body), place)
+                return kinds[channel].from_json(message_fields(body))
+            case Metadata(name, facts) if name == FILE_METADATA:
+                self.file_facts = facts
+                self._check_format()
+            case Metadata(name, facts) if name == CAMERA_METADATA:
+                self.camera_facts[facts.get("camera", "")] = facts
+                _check_cameras(self.path, self.camera_facts)
+            case _:
+                pass
+        return None
+
+    def _count_values(self, count: int, place: int) -> None:
+        self.values += count
+        if self.values > max(MIN_VALUES, VALUES_PER_BYTE * place):
+            raise RecordingError(
+                f"recording {self.path}: {self.values} values in the messages of the first {place} "
+                f"bytes of the file, expected {VALUES_PER_BYTE} a byte at most, or {MIN_VALUES}"
+            )
+
+    def _check_magic(self, begin: bytes) -> None:
+        if not begin.startswith(b"\x89MCAP"):
+            came = f"it begins with {begin.hex(' ')}" if begin else "it is empty"
+            raise ConfigurationError(f"recording {self.path}: this is no MCAP file: {came}")
+
+    def _check_format(self) -> None:
+        came = self.file_facts.get("format")
+        if came != FORMAT:
+            raise ConfigurationError(
+                f"recording {self.path}: its form is {came}, this version of smartcam reads "
+                f"{FORMAT}; it was written by smartcam {self.file_facts.get('version')}"
+            )
+
+    def _check_ours(self, schemas: dict[int, str]) -> None:
+        if not self.file_facts:
+            names = ", ".join(sorted(set(schemas.values()))[:8]) or "nothing"
+            raise ConfigurationError(
+                f"recording {self.path}: this MCAP file is no recording of smartcam; it holds "
+                f"{names}"
+            )
+
+
+def _remark(count: int, cause: Exception) -> str:
+    if isinstance(cause, CutOffError):
+        return f"the file has no end: the recording was cut off; {count} messages were read"
+    return f"the file is damaged behind message {count}: {cause!s:.200}; the rest cannot be read"

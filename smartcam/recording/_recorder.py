@@ -1,0 +1,408 @@
+"""Writing a recording: an observer that hands on, and a thread that writes.
+
+The hooks put what they are called with into a list and return. A thread takes the list twice a
+second, writes it as one chunk of the file and has the system put that on the disk, so a crash, even
+of the machine, loses about half a second. Nothing is left out: where the disk is full, or too slow
+for what comes, the recording ends with an error, and never has a gap.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import json
+import os
+import stat
+import threading
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
+
+import smartcam
+from smartcam._locks import try_lock
+from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
+from smartcam.models import CameraEvent, Connected, Reconnected, Result
+from smartcam.observers import Observer, TraceEntry
+from smartcam.recording._form import (
+    CAMERA_METADATA,
+    FILE_METADATA,
+    FORMAT,
+    KINDS,
+    PROFILE,
+    RecordedError,
+    count_values,
+    load_extra,
+    nanoseconds,
+    topic_of,
+)
+from smartcam.settings import parse_address
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+    from smartcam.recording._form import Item
+
+INTERVAL = 0.5
+"""Seconds that anything waits for its chunk: a crash loses at most a second, writing included. The
+index of the chunks is kept in memory until the end: about 100 MB for a day without a pause."""
+
+CHUNK = 1 << 20
+"""Bytes that wait before a chunk is written sooner; also the largest chunk."""
+
+MAX_WAITING = 1 << 26
+"""Bytes that wait for the disk before the recording gives up: a minute of a fast camera."""
+
+CLOSE_TIMEOUT = 30.0
+"""Seconds that :meth:`Recorder.close` waits for the disk."""
+
+OVERHEAD = 512
+"""Bytes that an item counts beside its data."""
+
+
+class Counts(NamedTuple):
+    """What was recorded so far, written or waiting.
+
+    Attributes:
+        frames: frames and bytes that make none.
+        results: interpreted results.
+        events: events of cameras.
+        errors: errors.
+    """
+
+    frames: int = 0
+    results: int = 0
+    events: int = 0
+    errors: int = 0
+
+
+class _Description(NamedTuple):
+    """Facts about a camera, for the file's metadata."""
+
+    facts: dict[str, str]
+
+
+class Recorder(Observer):
+    """Writes everything that clients see to an MCAP file.
+
+    ::
+
+        with Recorder("run.mcap") as recorder:
+            async with smartcam.connect(url, observers=[recorder]) as camera:
+                ...
+
+    One recorder may serve several cameras, of several event loops: topics have the camera's name.
+    Before it is opened and after it is closed it takes nothing. A result's value is turned to JSON
+    a moment later in the recorder's thread: do not change it in place.
+
+    Args:
+        path: the file; the usual ending is ``.mcap``.
+        overwrite: take the place of a file that is there.
+
+    Attributes:
+        path: as given.
+    """
+
+    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
+        self.path: Path = Path(path)
+        self._overwrite = overwrite
+        self._more = threading.Condition()
+        self._items: list[Item | _Description] = []
+        self._waiting = 0  # bytes in it
+        self._counts = dict.fromkeys(KINDS, 0)
+        self._taking = False
+        self._closing = False
+        self._file: _File | None = None
+        self._thread: threading.Thread | None = None
+        self._failure: concurrent.futures.Future[RecordingError] = concurrent.futures.Future()
+
+    # ------------------------------------------------------------------ life
+
+    def open(self) -> Self:
+        """Make the file and start the thread that writes it.
+
+        Raises:
+            ConfigurationError: the file is there already, another recorder writes it, or it cannot
+                be made.
+            MissingExtraError: the mcap library is not installed.
+        """
+        if self._thread is not None:
+            raise ConfigurationError(f"recording {self.path}: opened before; make a new recorder")
+        writer = load_extra("mcap.writer")
+        try:
+            stream = _opened(self.path, overwrite=self._overwrite)
+        except FileExistsError as exc:
+            raise ConfigurationError(
+                f"recording {self.path}: the file is there already; overwrite (--force) takes its "
+                "place"
+            ) from exc
+        except ConfigurationError:
+            raise
+        except (OSError, ValueError) as exc:
+            reason = exc.strerror if isinstance(exc, OSError) else exc
+            raise ConfigurationError(f"recording {self.path}: {reason}") from exc
+        self._file = _File(stream, writer)
+        self._taking = True
+        self._thread = threading.Thread(
+            target=self._write_all, name=f"smartcam.recorder[{self.path.name}]", daemon=True
+        )
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Write what waits and end the file; idempotent.
+
+        It waits for the disk, usually some milliseconds, 30 s at most: call it in a thread where an
+        event loop has other things to do.
+
+        Raises:
+            RecordingError: the recording had failed, or does so now.
+        """
+        with self._more:
+            self._taking, self._closing = False, True
+            self._more.notify()
+        if self._thread is not None:
+            self._thread.join(CLOSE_TIMEOUT)
+            if self._thread.is_alive():
+                self._fail(f"the disk did not take the rest within {CLOSE_TIMEOUT:g} s")
+        if self.error is not None:
+            raise self.error
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        if exc is None:
+            self.close()
+            return
+        with contextlib.suppress(RecordingError):  # the first error is the one that is told
+            self.close()
+
+    @property
+    def counts(self) -> Counts:
+        """What was recorded so far."""
+        return Counts(**self._counts)
+
+    @property
+    def error(self) -> RecordingError | None:
+        """Why the recording ended before it was closed; None where it did not."""
+        return self._failure.result() if self._failure.done() else None
+
+    async def wait_failed(self) -> RecordingError:
+        """Wait until the recording fails and return why; without a bound, it is its life.
+
+        Cancellation: safe.
+        """
+        return await asyncio.shield(asyncio.wrap_future(self._failure))
+
+    def describe(self, camera: str, **facts: object) -> None:
+        """Keep facts about a camera in the file, such as ``interpret_as``; None is left out.
+
+        Its address and dialect are kept by themselves, with every session.
+        """
+        texts = {name: str(fact) for name, fact in facts.items() if fact is not None}
+        self._put(_Description({"camera": camera, **texts}), 0)
+
+    # ------------------------------------------------------------------ the observer
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        """Keep a frame."""
+        self._put(entry, len(entry.hex), "frames")
+
+    def on_state(self, event: CameraEvent) -> None:
+        """Keep an event."""
+        self._put(event, 0, "events")
+
+    def on_result(self, result: Result) -> None:
+        """Keep a result."""
+        self._put(result, 4 * len(result.raw), "results")
+
+    def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
+        """Keep an error."""
+        now = datetime.now(UTC)
+        text = str(error)
+        self._put(
+            RecordedError(camera, now, type(error).__name__, text, triggered_at),
+            len(text),
+            "errors",
+        )
+
+    def _put(self, item: Item | _Description, size: int, kind: str | None = None) -> None:
+        with self._more:
+            if not self._taking:
+                return
+            if kind is not None:
+                self._counts[kind] += 1
+            before = self._waiting
+            self._items.append(item)
+            self._waiting += size + OVERHEAD
+            if not before or before < CHUNK <= self._waiting:
+                self._more.notify()
+            full = self._waiting > MAX_WAITING
+        if full:
+            self._fail(f"the disk is too slow: {self._waiting >> 20} MiB wait to be written")
+
+    # ------------------------------------------------------------------ the thread
+
+    def _fail(self, reason: str, cause: BaseException | None = None) -> None:
+        """End the recording; the first reason stays."""
+        error = RecordingError(f"recording {self.path}: {reason}")
+        error.__cause__ = cause
+        with self._more:
+            self._taking = False
+            self._items.clear()
+            self._waiting = 0
+            first = not self._failure.done()
+        if first:
+            with contextlib.suppress(concurrent.futures.InvalidStateError):
+                self._failure.set_result(error)
+
+    def _write_all(self) -> None:
+        if self._file is None:
+            return
+        try:
+            with contextlib.closing(self._file) as file:
+                file.start()
+                while not self._write_some(file):
+                    pass
+                file.finish()
+        except OSError as exc:
+            self._fail(exc.strerror or str(exc), exc)
+        except ValueError as exc:  # a message that nobody could read back
+            self._fail(str(exc), exc)
+        except Exception as exc:  # noqa: BLE001 - a thread that ends silently would be worse
+            self._fail(f"unexpected {exc!r}", exc)
+
+    def _write_some(self, file: _File) -> bool:
+        """Wait for something, write it; return whether that was the last."""
+        with self._more:
+            self._more.wait_for(lambda: self._items or self._closing)
+            self._more.wait_for(lambda: self._closing or self._waiting > CHUNK, INTERVAL)
+            items, self._items = self._items, []
+            self._waiting, over = 0, self._closing
+        for item in items:
+            file.add(item)
+        file.flush()
+        return over
+
+
+def _opened(path: Path, *, overwrite: bool) -> IO[bytes]:
+    """Open a file for one recorder; what was in it is gone when it is ours, not before.
+
+    Raises:
+        ConfigurationError: another recorder writes it.
+        FileExistsError: it is there already.
+        OSError: it cannot be made.
+    """
+    stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
+    try:
+        if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):  # a pipe may have many writers
+            if try_lock(stream.fileno()) is False:
+                raise ConfigurationError(f"recording {path}: another recorder is writing this file")
+            stream.truncate()
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _open_whole(path: str, flags: int) -> int:
+    return os.open(path, flags & ~os.O_TRUNC, 0o666)
+
+
+class _File:
+    """An MCAP file that is being written; ``mcap`` is the library's module ``mcap.writer``."""
+
+    def __init__(self, stream: IO[bytes], mcap: Any) -> None:
+        self._stream = stream  # closed at the end
+        self._writer = mcap.Writer(stream, chunk_size=CHUNK)
+        self._on_disk = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._numbers: dict[int, int] = {}
+        self._facts: dict[str, dict[str, str]] = {}
+
+    def start(self) -> None:
+        """Write what stands first."""
+        self._writer.start(PROFILE, library=f"smartcam {smartcam.__version__}")
+        began = datetime.now(UTC).isoformat()
+        facts = {"format": FORMAT, "version": smartcam.__version__, "began": began}
+        self._writer.add_metadata(FILE_METADATA, facts)
+        self.flush()
+
+    def add(self, item: Item | _Description) -> None:
+        """Write one thing; it is on the disk after the next :meth:`flush`."""
+        match item:
+            case _Description(facts):
+                self._describe(facts)
+            case TraceEntry():
+                self._message("frames", item.camera, item.at, item)
+            case Result():
+                self._message("results", item.camera, item.received_at, item)
+            case RecordedError():
+                self._message("errors", item.camera, item.at, item)
+            case _:
+                if isinstance(item, (Connected, Reconnected)):
+                    self._describe({"camera": item.camera, **_address_facts(item.url)})
+                self._message("events", item.camera, item.at, item)
+
+    def flush(self) -> None:
+        """End the chunk and have it put on the disk."""
+        self._writer.flush()
+        if self._on_disk:
+            os.fsync(self._stream.fileno())
+
+    def finish(self) -> None:
+        """Write the index and what stands last."""
+        self._writer.finish()
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Close the file; what it does not take any more is dropped."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    def _message(self, kind: str, camera: str, at: datetime, item: Item) -> None:
+        channel = self._channel(camera, kind)
+        when = nanoseconds(at)
+        self._numbers[channel] = number = self._numbers[channel] + 1
+        data = json.dumps(KINDS[kind].to_json(item), separators=(",", ":")).encode()
+        count_values(data)
+        self._writer.add_message(channel, when, data, when, number & 0xFFFFFFFF)
+
+    def _channel(self, camera: str, kind: str) -> int:
+        known = self._channels.get((camera, kind))
+        if known is not None:
+            return known
+        if kind not in self._schemas:
+            schema = json.dumps(KINDS[kind].json_schema).encode()
+            self._schemas[kind] = self._writer.register_schema(
+                KINDS[kind].schema, "jsonschema", schema
+            )
+        channel: int = self._writer.register_channel(
+            topic_of(camera, kind), "json", self._schemas[kind], {"camera": camera}
+        )
+        self._channels[camera, kind] = channel
+        self._numbers[channel] = 0
+        return channel
+
+    def _describe(self, facts: dict[str, str]) -> None:
+        """Write a camera's facts where they are new."""
+        before = self._facts.get(facts["camera"], {})
+        now = {**before, **facts}
+        if now != before:
+            self._facts[facts["camera"]] = now
+            self._writer.add_metadata(CAMERA_METADATA, now)
+
+
+def _address_facts(url: str) -> dict[str, str]:
+    try:
+        address = parse_address(url)
+    except ConfigurationError:  # a plug-in's that is no longer there
+        return {"url": url}
+    quirks = ",".join(address.quirks)
+    said = {"protocol": address.protocol, "dialect": address.dialect, "quirks": quirks}
+    return {"url": address.url, **{name: text for name, text in said.items() if text}}

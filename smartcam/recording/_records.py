@@ -1,0 +1,326 @@
+"""The records of an MCAP file, within bounds: a file may lie about everything in it.
+
+What is compressed is inflated piece by piece and never beyond a bound, lengths are held against
+what is there, and what nobody needs (indexes, statistics, attachments) is skipped unread.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+from smartcam.exceptions import RecordingError
+from smartcam.recording._form import MAX_MESSAGE, load_extra
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+MAX_RECORD = 1 << 28
+"""Bytes of one record of a file: ours have about 1 MiB, a damaged length says anything."""
+
+MAX_CHUNK = MAX_MESSAGE + (1 << 21)
+"""Bytes that a chunk may unpack to. A recorder ends its chunk behind 1 MiB, so the largest has one
+message more; 2 kB of zstd can claim as much as this."""
+
+MAX_FACTS = 1 << 20
+"""Bytes of a schema, a channel or a metadata record: ours have about 2 kB."""
+
+MIN_RECORDS = 10_000
+"""Records that every file may have; a larger file as many as it has bytes. A recorder indexes each
+message with 16 bytes behind its chunk, and a chunk of 1 MiB has fewer than these."""
+
+MIN_UNPACKED = 1 << 29
+"""Bytes that the chunks of every file may unpack to together: seconds of work."""
+
+UNPACKED_PER_BYTE = 10_000
+"""Bytes that a larger file may unpack to for each of its own. Containers of nothing but zeros come
+to 6,000; a bomb to 30,000."""
+
+PIECE = 1 << 18
+"""Bytes that are read or inflated at once."""
+
+MAGIC = b"\x89MCAP0\r\n"
+
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
+_METADATA, _DATA_END, _FOOTER = 0x0C, 0x0F, 0x02
+
+_HEAD = struct.Struct("<BQ")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+_CHUNK_HEAD = struct.Struct("<QQQI")
+
+
+class CutOffError(Exception):
+    """The file ends before it is over."""
+
+
+class Schema(NamedTuple):
+    """A schema: what messages of a channel are."""
+
+    id: int
+    name: str
+
+
+class Channel(NamedTuple):
+    """A channel, and which schema its messages have."""
+
+    id: int
+    schema_id: int
+
+
+class McapMessage(NamedTuple):
+    """A message and its channel; ``data`` is of the chunk."""
+
+    channel_id: int
+    data: memoryview
+
+
+class Metadata(NamedTuple):
+    """Facts under a name."""
+
+    name: str
+    facts: dict[str, str]
+
+
+Record: TypeAlias = Schema | Channel | McapMessage | Metadata
+
+
+@dataclass(eq=False)
+class RecordReader:
+    """Reads a file from its begin to its end, once."""
+
+    _stream: IO[bytes]  # at the file's begin
+    _name: object  # of the file, for errors
+
+    def __post_init__(self) -> None:
+        self.place: int = 0  # bytes read so far
+        self._count = 0  # records read
+        self._unpacked = 0  # bytes that chunks unpacked to
+        self._crc = 0
+
+    def records(self) -> Iterator[Record]:
+        """Yield what matters, in the order in which it stands there.
+
+        Raises:
+            CutOffError: the file ends before it is over.
+            RecordingError: it goes beyond a bound.
+            ValueError: it is damaged here.
+        """
+        self._check_magic()
+        while True:
+            crc = self._crc
+            opcode, length = _HEAD.unpack(self._read(_HEAD.size))
+            self._count_one()
+            if length > MAX_RECORD:
+                raise ValueError(f"a record of {length} bytes, expected {MAX_RECORD} at most")
+            if opcode == _CHUNK:
+                yield from self._unpack(memoryview(self._read(length)))
+            elif opcode == _FOOTER:
+                self._skip(length)
+                self._check_magic()
+                return
+            elif opcode == _DATA_END:
+                said = _Body(memoryview(self._read(_small(length)))).number(4)
+                if said not in {0, crc}:
+                    raise ValueError(f"the data's checksum is {crc:08x}, expected {said:08x}")
+            elif opcode == _METADATA:
+                yield _metadata(_Body(memoryview(self._read(_small(length)))))
+            elif opcode in _PARSERS:
+                yield _PARSERS[opcode](memoryview(self._read(length)))
+            else:
+                self._skip(length)
+
+    def _unpack(self, body: memoryview) -> Iterator[Record]:
+        """Yield the records of a chunk; its bytes are kept until the last was taken."""
+        data = self._inflated(body)
+        place = 0
+        while place < len(data):
+            if len(data) - place < _HEAD.size:
+                raise ValueError("a record in a chunk is cut off")
+            opcode, length = _HEAD.unpack_from(data, place)
+            place += _HEAD.size
+            if length > len(data) - place:
+                raise ValueError(f"a record of {length} bytes in the last {len(data) - place}")
+            self._count_one()
+            if opcode in _PARSERS:
+                yield _PARSERS[opcode](data[place : place + length])
+            place += length
+
+    def _inflated(self, body: memoryview) -> memoryview:
+        """Unpack a chunk."""
+        fields = _Body(body)
+        _, _, said, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
+        how = fields.text()
+        packed = fields.take(fields.number(8))
+        if how in {"zstd", "lz4"}:
+            data = memoryview(self._pieces((_zstd if how == "zstd" else _lz4)(packed)))
+        elif how:
+            raise ValueError(f"a chunk is packed as {how!r:.40}, expected zstd, lz4 or nothing")
+        else:
+            data = packed
+        if len(data) != said:
+            raise ValueError(f"a chunk unpacks to {len(data)} bytes, expected {said}")
+        if crc not in {0, zlib.crc32(data)}:
+            raise ValueError(f"a chunk's checksum is not {crc:08x}")
+        return data
+
+    def _pieces(self, inflate: Callable[[int], bytes]) -> bytearray:
+        """Join what comes, up to the bound."""
+        data = bytearray()
+        while piece := inflate(PIECE):
+            data += piece
+            self._unpacked += len(piece)
+            if self._unpacked > max(MIN_UNPACKED, UNPACKED_PER_BYTE * self.place):
+                raise RecordingError(
+                    f"recording {self._name}: the first {self.place} bytes of the file unpack to "
+                    f"{self._unpacked}, expected {UNPACKED_PER_BYTE} for each at most, or "
+                    f"{MIN_UNPACKED}"
+                )
+            if len(data) > MAX_CHUNK:
+                raise RecordingError(
+                    f"recording {self._name}: a chunk unpacks to more than {len(data) - 1} bytes, "
+                    f"expected {MAX_CHUNK} at most"
+                )
+        return data
+
+    def _count_one(self) -> None:
+        self._count += 1
+        if self._count > MIN_RECORDS and self._count > self.place:
+            raise RecordingError(
+                f"recording {self._name}: {self._count} records in the first {self.place} bytes "
+                f"of the file, expected one a byte at most, or {MIN_RECORDS}"
+            )
+
+    # ------------------------------------------------------------------ the file
+
+    def _check_magic(self) -> None:
+        came = self._read(len(MAGIC))
+        if came != MAGIC:
+            raise ValueError(f"{came.hex(' ')} is not MCAP's magic, {MAGIC.hex(' ')}")
+
+    def _read(self, size: int) -> bytes:
+        """Return the next bytes; what a length says is reserved as it comes, not before."""
+        if size <= PIECE:
+            return self._piece(size)
+        data = bytearray()
+        while len(data) < size:
+            data += self._piece(min(PIECE, size - len(data)))
+        return bytes(data)
+
+    def _skip(self, size: int) -> None:
+        while size:
+            size -= len(self._piece(min(PIECE, size)))
+
+    def _piece(self, size: int) -> bytes:
+        data = self._stream.read(size)
+        self.place += len(data)
+        self._crc = zlib.crc32(data, self._crc)
+        if len(data) < size:
+            raise CutOffError("the file ends here")
+        return data
+
+
+@dataclass(slots=True, eq=False)
+class _Body:
+    """A record's fields, one after the other."""
+
+    _data: memoryview
+    _place: int = 0
+
+    @property
+    def left(self) -> int:
+        """Bytes that follow."""
+        return len(self._data) - self._place
+
+    def take(self, size: int) -> memoryview:
+        """Return the next bytes."""
+        if size > self.left:
+            raise ValueError(f"a field of {size} bytes in the last {self.left} of a record")
+        self._place += size
+        return self._data[self._place - size : self._place]
+
+    def number(self, size: int) -> int:
+        """Return the next number."""
+        return int.from_bytes(self.take(size), "little")
+
+    def text(self) -> str:
+        """Return the next text, which its length precedes."""
+        return str(self.take(self.number(4)), "utf-8")
+
+
+def _small(length: int) -> int:
+    if length > MAX_FACTS:
+        raise ValueError(f"a record of {length} bytes, expected {MAX_FACTS} at most")
+    return length
+
+
+def _schema(data: memoryview) -> Schema:
+    fields = _Body(data)
+    return Schema(fields.number(2), fields.text()[:200])  # another program's may be long
+
+
+def _channel(data: memoryview) -> Channel:
+    fields = _Body(data)
+    return Channel(fields.number(2), fields.number(2))
+
+
+def _message(data: memoryview) -> McapMessage:
+    if len(data) < _MESSAGE_HEAD.size:
+        raise ValueError(f"a message of {len(data)} bytes, expected {_MESSAGE_HEAD.size} at least")
+    return McapMessage(int.from_bytes(data[:2], "little"), data[_MESSAGE_HEAD.size :])
+
+
+def _metadata(fields: _Body) -> Metadata:
+    name = fields.text()
+    facts = _Body(fields.take(fields.number(4)))
+    found: dict[str, str] = {}
+    while facts.left:
+        key = facts.text()
+        found[key] = facts.text()
+    return Metadata(name, found)
+
+
+_PARSERS: dict[int, Callable[[memoryview], Record]] = {
+    _SCHEMA: _schema,
+    _CHANNEL: _channel,
+    _MESSAGE: _message,
+}
+
+
+# ---------------------------------------------------------------------- inflating
+
+
+def _zstd(packed: memoryview) -> Callable[[int], bytes]:
+    """Return a reader of the next bytes; a frame's window is as large as its chunk at most."""
+    library: Any = load_extra("zstandard")
+    inflater = library.ZstdDecompressor(max_window_size=1 << (MAX_CHUNK - 1).bit_length())
+    stream = inflater.stream_reader(packed)
+
+    def inflate(size: int) -> bytes:
+        try:
+            data: bytes = stream.read(size)
+        except library.ZstdError as exc:
+            raise ValueError(f"a chunk is no zstd: {exc}") from exc
+        return data
+
+    return inflate
+
+
+def _lz4(packed: memoryview) -> Callable[[int], bytes]:
+    library: Any = load_extra("lz4.frame")
+    inflater = library.LZ4FrameDecompressor()
+    rest = bytes(packed)
+
+    def inflate(size: int) -> bytes:
+        nonlocal rest
+        if inflater.eof:
+            return b""
+        try:
+            data: bytes = inflater.decompress(rest, max_length=size)
+        except RuntimeError as exc:
+            raise ValueError(f"a chunk is no lz4: {exc}") from exc
+        rest = b""  # it keeps what it has not used
+        return data
+
+    return inflate

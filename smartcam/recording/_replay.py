@@ -1,0 +1,405 @@
+"""A recorded camera, emulated: it sends what the real one sent, with the same timing.
+
+The device is the emulator's own. Its applications give the recorded containers, byte for byte:
+
+- The n-th trigger of an application gets what the n-th one got, after the same time; where that had
+  no result it gets none, and where it was dropped it is dropped.
+- What came unasked comes by itself: counted from the begin of the run, then each from the one
+  before. It waits while the camera is stopped or has another application; nothing is left out.
+- Overheat and System Error come and go, counted from the begin of the first session.
+
+One thing cannot be as recorded: the sequence numbers of a client that sets them, as one does whose
+layout has an ``@sequence`` field. Such a client gets its own numbers, in that field; which one it
+is, is known from the ``interpret_as`` in the recording.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from pydantic import PrivateAttr
+
+from smartcam.emulator._application import Application
+from smartcam.emulator._camera import EmulatedCamera
+from smartcam.emulator._generators import wrap_number
+from smartcam.exceptions import ConfigurationError
+from smartcam.interpreters._base import resolve
+from smartcam.protocols import messages as m
+from smartcam.recording._schedule import CONDITIONS, plan_replay
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from smartcam.emulator._client_link import ClientLink
+    from smartcam.emulator._clock import Clock, TimerHandle
+    from smartcam.emulator._scene import TableScene
+    from smartcam.layout import Field
+    from smartcam.models import ByteOrder, Status
+    from smartcam.recording._reader import Recording
+    from smartcam.recording._schedule import ReplayPlan, Take, TakeList
+
+MAX_SPEED = 1000.0
+"""Times faster, or slower, than recorded: beyond it timers of a millisecond decide."""
+
+SOON = 1e-6
+"""Seconds that a replayed inspection takes at least: its take is chosen when it has begun."""
+
+NEVER = 0.0001
+"""Rate of a free-running application, per second: it is the replay that sends its containers."""
+
+MAX_LOAD_TIME = 3600.0
+"""Seconds that an emulated switch takes at most."""
+
+
+@dataclass(slots=True, eq=False)
+class _Takes:
+    """A list of takes that is played once, or over and over."""
+
+    _takes: list[Take]
+    _loop: bool
+    _next: int = 0
+
+    @property
+    def head(self) -> Take | None:
+        """The next one; None where there is none any more."""
+        return self._takes[self._next] if self._next < len(self._takes) else None
+
+    @property
+    def left(self) -> int:
+        """How many there are still, in this round."""
+        return len(self._takes) - self._next
+
+    def pop(self) -> Take | None:
+        """Take the next one away."""
+        head = self.head
+        self._next += head is not None
+        if self._loop and self._next >= len(self._takes):
+            self._next = 0
+        return head
+
+
+class _Numbers(NamedTuple):
+    """Where the sequence number stands in a container."""
+
+    field: Field  # of the layout
+    offset: int  # of its first byte
+
+    def put(self, data: bytes, number: int, byte_order: ByteOrder) -> bytes:
+        """Return a container with another number; one that has none as it is."""
+        end = self.offset + self.field.size
+        if len(data) < end:
+            return data
+        low = self.field.wire.low
+        value = wrap_number(self.field, number).to_bytes(
+            self.field.size, byte_order, signed=low is not None and low < 0
+        )
+        return data[: self.offset] + value + data[end:]
+
+
+@dataclass(slots=True)
+class _Track:
+    """What is played of one application."""
+
+    waits: bool  # it waits for triggers
+    triggered: _Takes  # takes for triggers
+    unasked: _Takes  # takes that come by themselves
+    current: Take | None = None  # the take of the inspection under way
+    # its further containers, still to be sent
+    rest: list[bytes] = field(default_factory=list[bytes])
+    # how to give containers the client's numbers; None: they keep their own
+    numbers: _Numbers | None = None
+
+    def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
+        """The inspection ends: return its container; None where it sends nothing."""
+        take, self.current = self.current, None
+        if take is None or not take.containers:
+            return None
+        containers = take.containers
+        if self.numbers is not None:
+            containers = [self.numbers.put(data, number, byte_order) for data in containers]
+        first, *self.rest = containers
+        return first
+
+
+class _PlayedApplication(Application):
+    """An application whose containers a track gives."""
+
+    _track: _Track | None = PrivateAttr(default=None)
+
+    def play(self, track: _Track) -> _PlayedApplication:
+        """Have containers given by ``track``."""
+        self._track = track
+        return self
+
+    def container(
+        self,
+        *,
+        number: int,
+        turn: int,
+        time: float,
+        scene: TableScene,
+        values: Mapping[str, Any] | None = None,
+        byte_order: ByteOrder = "little",
+    ) -> bytes | None:
+        """Return the track's next container."""
+        return None if self._track is None else self._track.give(number, byte_order)
+
+
+class ReplayedCamera(EmulatedCamera):
+    """An emulated camera that plays a recording.
+
+    It is in the application that gave the first container, and runs if anything came. When the
+    recording is over, triggers get no result and nothing comes any more, unless ``loop``. All
+    containers are kept in memory.
+
+    Args:
+        recording: what to play.
+        camera: name of the camera in it; default the only one there is.
+        speed: how many times faster than recorded, 0.001 to 1000.
+        loop: begin again where something is over: each application's takes on their own.
+        host: address to listen on.
+        port: port to listen on, 0 for a free one.
+        transport: default the recorded one.
+        dialect: default the recorded one.
+        quirks: what is not known of real cameras, beside the recorded deviations of the dialect:
+            fields of :class:`~smartcam.emulator.Quirks`.
+        clock: its time; default: real time.
+        name: for logs; default the recorded one.
+        on_over: called once, in the event loop, when nothing is left; never with ``loop``.
+
+    Attributes:
+        plan: what it plays.
+        speed: as given.
+
+    Raises:
+        ConfigurationError: something given is wrong, or the camera cannot be replayed.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        camera: str | None = None,
+        speed: float = 1.0,
+        loop: bool = False,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+        name: str | None = None,
+        on_over: Callable[[], None] | None = None,
+    ) -> None:
+        if not 1 / MAX_SPEED <= speed <= MAX_SPEED:
+            raise ConfigurationError(
+                f"replay: a speed from {1 / MAX_SPEED:g} to {MAX_SPEED:g} was expected, got {speed}"
+            )
+        self.plan: ReplayPlan = plan_replay(recording, camera)
+        self.speed: float = speed
+        self._loop = loop
+        self._on_over = None if loop else on_over
+        self._tracks = {
+            number: _Track(
+                found.waits,
+                _Takes(found.triggered, loop),
+                _Takes(found.unasked, loop),
+            )
+            for number, found in self.plan.applications.items()
+        }
+        recorded: dict[str, Any] = {}
+        if dialect in {None, self.plan.dialect}:
+            recorded = dict.fromkeys(self.plan.quirks, True)
+        super().__init__(
+            [
+                _application(found, speed).play(self._tracks[number])
+                for number, found in self.plan.applications.items()
+            ],
+            builtins=False,
+            host=host,
+            port=port,
+            transport=transport or self.plan.transport,
+            dialect=dialect or self.plan.dialect,
+            quirks={**recorded, **(quirks or {})},
+            clock=clock,
+            name=name or recording.camera(camera).name,
+            active=self.plan.active,
+            running=self.plan.running,
+        )
+        self._numbers = _numbers(recording.camera(camera).interpret_as)
+        self.device.set_endian(self.plan.endian)
+        self._set_conditions(self.plan.conditions)
+        self._armed: Take | None = None  # the take before which triggers are to be dropped
+        self._ready: int | None = None  # the application that may send by itself now
+        self._reference = 0.0  # the next unasked take is counted from here
+        self._alarm: TimerHandle | None = None
+        self._due = False  # an unasked take is to begin as soon as it can
+        self._round: float | None = None  # when the present round of conditions began
+        self._changed = 0  # changes of conditions in it
+        self._change_alarm: TimerHandle | None = None
+
+    @property
+    def remaining(self) -> int:
+        """How many inspections are left, in this round."""
+        return sum(track.triggered.left + track.unasked.left for track in self._tracks.values())
+
+    async def stop(self) -> None:
+        """Close the port and every connection; the replay stands still. Does nothing if stopped.
+
+        Cancellation: everything is closed nevertheless.
+        """
+        self._pause()
+        if self._change_alarm is not None:
+            self._change_alarm.cancel()
+            self._change_alarm = None
+        await super().stop()
+
+    def received(self, link: ClientLink, message: m.Message) -> None:
+        """A link received a message; who sets a sequence number gets it."""
+        if isinstance(message, m.SetSequenceNumber):
+            for track in self._tracks.values():
+                track.numbers = self._numbers
+        super().received(link, message)
+
+    # ------------------------------------------------------------------ after each step
+
+    def _end_step(self) -> None:
+        if self._started:
+            self._play()
+        super()._end_step()
+
+    def _play(self) -> None:
+        """Look what became of the device, and do what follows for the replay."""
+        if self._change_alarm is None and self.has_session:
+            self._arm_change()
+        track = self._tracks[self.device.active_application]
+        if not self.device.processing:
+            track.current = None
+        elif track.waits and track.current is None:
+            self._begin(track, track.triggered.pop())
+        if track.rest:
+            rest, track.rest = track.rest, []
+            self._send(rest)
+        self._arm_drops(track)
+        self._play_unasked(track)
+        if self._on_over is not None and not self.remaining and not self.device.processing:
+            tell, self._on_over = self._on_over, None
+            tell()
+
+    def _begin(self, track: _Track, take: Take | None) -> None:
+        """An inspection began: it takes as long as the recorded one."""
+        track.current, self._armed = take, None
+        if take is not None:
+            self.device.change_run(late=max(0.0, take.seconds / self.speed - SOON))
+
+    def _arm_drops(self, track: _Track) -> None:
+        """Have the next triggers dropped where the recorded ones were."""
+        head = track.triggered.head
+        if head is not None and head.drops and head is not self._armed:
+            self._armed = head
+            self.device.drop_triggers(head.drops)
+
+    def _send(self, containers: list[bytes]) -> None:
+        """Say containers of the active application, behind what the device has said."""
+        self._collect()
+        number = self.device.active_application
+        messages: list[m.Message] = [
+            m.ResultContainer(application=number, data=data) for data in containers
+        ]
+        self._say_all(messages, provoke=True)
+
+    # ------------------------------------------------------------------ by itself
+
+    def _play_unasked(self, track: _Track) -> None:
+        """Send what is due, and set the alarm for the next."""
+        runs = self.has_session and self.device.running
+        ready = self.device.active_application if runs else None
+        if ready != self._ready:
+            self._pause()
+            self._ready, self._reference = ready, self.clock.now
+        head = track.unasked.head
+        if ready is None or head is None:
+            return
+        if self._due and not (track.waits and self.device.processing):
+            self._begin_unasked(track, head)
+            head = track.unasked.head
+        if head is not None and self._alarm is None and not self._due:
+            when = self._reference + head.gap / self.speed
+            self._alarm = self.clock.call_at(max(when, self.clock.now), self._wake_unasked)
+
+    def _begin_unasked(self, track: _Track, take: Take) -> None:
+        if not track.waits:
+            self._send(take.containers)
+        elif self.device.trigger():
+            self._begin(track, take)
+        else:
+            return  # it takes no trigger now; later
+        self._due = False
+        self._reference += (take.gap + take.seconds) / self.speed
+        track.unasked.pop()
+
+    def _wake_unasked(self) -> None:
+        self._alarm, self._due = None, True
+        with self.step():
+            pass
+
+    def _pause(self) -> None:
+        """What comes by itself waits."""
+        self._ready, self._due = None, False
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
+
+    # ------------------------------------------------------------------ conditions
+
+    def _arm_change(self) -> None:
+        """Set the alarm for the next change; the first session begins the first round."""
+        if self._round is None:
+            self._round = self.clock.now
+        changes = self.plan.changes
+        if self._changed == len(changes) and self._loop and changes:
+            self._changed = 0
+            self._round += self.plan.seconds / self.speed
+        if self._changed < len(changes):
+            when = self._round + changes[self._changed].at / self.speed
+            self._change_alarm = self.clock.call_at(when, self._wake_change)
+
+    def _wake_change(self) -> None:
+        self._change_alarm = None
+        change = self.plan.changes[self._changed]
+        self._changed += 1
+        with self.step():
+            self.device.set_condition(change.condition, change.on)
+            self._arm_change()
+
+    def _set_conditions(self, conditions: Status) -> None:
+        for condition in CONDITIONS:
+            self.device.set_condition(condition, condition in conditions)
+
+
+def _numbers(interpret_as: str | None) -> _Numbers | None:
+    """Return the offset of the sequence number; None where it is not told, or nowhere."""
+    try:
+        layout = None if interpret_as is None else resolve(interpret_as).layout
+    except ConfigurationError:  # a plug-in's that is not there, or a mapping
+        return None
+    if layout is None:
+        return None
+    offset = 0
+    for one in (*layout.head, *layout.fields):
+        if one.sequence:
+            return _Numbers(one, offset)
+        offset += one.size
+    return None
+
+
+def _application(found: TakeList, speed: float) -> _PlayedApplication:
+    fields: dict[str, Any] = {"id": found.application, "name": "recorded"}
+    if found.load_time is not None:
+        fields["load_time"] = min(found.load_time / speed, MAX_LOAD_TIME)
+    if found.waits:
+        fields["processing_time"] = SOON
+    else:
+        fields["rate"] = NEVER
+    return _PlayedApplication(**fields)

@@ -1,0 +1,425 @@
+"""What a replay does, worked out from a recording's frames; pure.
+
+A container belongs to the oldest trigger without one. Others came unasked: by the digital input,
+where the application waits for triggers, or from a free run.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, NamedTuple, cast
+
+from smartcam.exceptions import ConfigurationError, RecordingError
+from smartcam.models import Disconnected, Status
+from smartcam.observers import TraceEntry
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import Transport, Verdict
+from smartcam.recording._form import status_of
+from smartcam.registry import PROTOCOLS
+from smartcam.settings import parse_address
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from smartcam.protocols._base import Protocol
+    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.recording._form import Item
+    from smartcam.recording._reader import RecordedCamera, Recording
+
+CONDITIONS = (Status.OVERHEAT, Status.SYSTEM_ERROR)
+"""What an operator of the emulated camera can set; the other bits follow from what it does."""
+
+MAX_REPLAY = 1 << 30
+"""Bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times a second."""
+
+
+@dataclass(slots=True)
+class Take:
+    """One inspection."""
+
+    containers: list[bytes]  # what it sent, in order; nothing where the trigger had no result
+    seconds: float  # from its begin to its first container, or to its end where it sent nothing
+    # seconds from the end of the one before, or from the begin of the run, to its begin; only where
+    # nobody had triggered it
+    gap: float = 0.0
+    drops: int = 0  # triggers that the camera dropped before it
+
+
+@dataclass(slots=True)
+class TakeList:
+    """What an application gave, in order."""
+
+    application: int
+    triggered: list[Take] = field(default_factory=list[Take])  # takes that a client triggered
+    unasked: list[Take] = field(default_factory=list[Take])  # the others
+    waits: bool = True  # it waits for triggers; otherwise it runs free
+    load_time: float | None = None  # seconds that a switch to it took; None where none was recorded
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A condition set or cleared, seconds after the begin of the first session."""
+
+    at: float
+    condition: Status
+    on: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayPlan:
+    """Everything that a replay needs to know."""
+
+    dialect: str
+    quirks: tuple[str, ...]  # its deviations
+    transport: Literal["tcp", "udp"]
+    applications: Mapping[int, TakeList]  # what each gave, by id; never empty
+    active: int  # id of the one that gave the first container
+    running: bool  # whether the camera ran
+    endian: int  # the status message's endian field
+    conditions: Status  # those that were set at first
+    changes: tuple[Change, ...]  # of conditions afterwards, in order
+    seconds: float  # length of the recording from its first session on
+
+
+def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
+    """Work out how to play a camera of a recording, by default the only one in it.
+
+    Raises:
+        ConfigurationError: no such camera, it had no session, or it is none that can be emulated.
+        RecordingError: its containers are more than :data:`MAX_REPLAY`.
+    """
+    known = recording.camera(camera)
+    dialect, transport = _spoken(recording, known)
+    steps = list(_steps(recording.items(known.name), dialect))
+    maker = _ScheduleMaker(_free_running(steps))
+    for step in steps:
+        maker.take(step)
+    maker.finish()
+    if maker.began is None:
+        raise ConfigurationError(
+            f"recording {recording.path}: no answer of camera {known.name!r} is in it"
+        )
+    lists = _fitting(recording, maker.lists, dialect)
+    return ReplayPlan(
+        dialect=dialect.name,
+        quirks=dialect.quirks,
+        transport=transport,
+        applications=lists,
+        active=maker.first if maker.first is not None else next(iter(lists)),
+        running=maker.first is not None or maker.ran_at_first,
+        endian=maker.endian,
+        conditions=maker.conditions,
+        changes=tuple(maker.changes),
+        seconds=maker.now - maker.began,
+    )
+
+
+def _fitting(
+    recording: Recording, lists: Mapping[int, TakeList], dialect: FramedDialect
+) -> dict[int, TakeList]:
+    """Return the applications that can be emulated; one that cannot must have given nothing."""
+    fitting: dict[int, TakeList] = {}
+    for number, found in lists.items():
+        if number in dialect.application_ids and number >= 1:
+            fitting[number] = found
+        elif found.triggered or found.unasked:
+            raise ConfigurationError(
+                f"recording {recording.path}: application id {number} cannot be emulated in "
+                f"dialect {dialect.name}"
+            )
+    return fitting or {1: TakeList(1)}
+
+
+def _spoken(
+    recording: Recording, camera: RecordedCamera
+) -> tuple[FramedDialect, Literal["tcp", "udp"]]:
+    """Return the dialect and the transport that the camera spoke."""
+    if not camera.url:
+        raise ConfigurationError(
+            f"recording {recording.path}: there was no session with camera {camera.name!r}"
+        )
+    address = parse_address(camera.url)
+    if address.protocol != "bvs" or address.dialect is None:
+        raise ConfigurationError(
+            f"recording {recording.path}: camera {camera.name!r} speaks {address.protocol}; only "
+            "cameras that speak bvs can be replayed"
+        )
+    protocol = cast("Protocol", PROTOCOLS.load("bvs"))
+    dialect = cast("FramedDialect", protocol.dialects[address.dialect])
+    transport = protocol.schemes[address.scheme]
+    return dialect.with_quirks(address.quirks), "udp" if transport is Transport.UDP else "tcp"
+
+
+class _What(enum.Enum):
+    """Steps of a recording."""
+
+    CONNECTED = enum.auto()
+    LOST = enum.auto()
+    STATUS = enum.auto()
+    TRIGGER = enum.auto()
+    ABORT = enum.auto()
+    SWITCH = enum.auto()
+    SWITCHED = enum.auto()
+    NAMED = enum.auto()
+    CONTAINER = enum.auto()
+
+
+class _ReplayStep(NamedTuple):
+    """What a frame, or the end of a link, means for a replay."""
+
+    at: float  # when, seconds since 1970
+    what: _What
+    number: int = 0  # an application's id, or the endian field
+    bits: Status = Status(0)  # of a status
+    data: bytes = b""  # of a container
+
+
+_PLAIN = {
+    (">", "Trigger"): _What.TRIGGER,
+    (">", "Stop"): _What.ABORT,
+    (">", "Reboot"): _What.ABORT,
+    ("<", "ConnectAnswer"): _What.CONNECTED,
+}
+_ANSWERS = {("<", "SwitchAnswer"): _What.SWITCHED, ("<", "QueryAnswer"): _What.NAMED}
+
+
+def _steps(items: Iterable[Item], dialect: FramedDialect) -> Iterator[_ReplayStep]:
+    """Yield the steps among the items; their times never go back.
+
+    Raises:
+        ConfigurationError: a frame has not the fields of its message.
+        RecordingError: there is too much of them.
+    """
+    at, active, size = 0.0, m.UNNAMED_APPLICATION, 0
+    for item in items:
+        if isinstance(item, Disconnected):
+            yield _ReplayStep(at, _What.LOST)
+        if not isinstance(item, TraceEntry) or item.fields is None:
+            continue
+        at = max(at, item.at.timestamp())
+        try:
+            step = _step(at, item, dialect)
+        except (KeyError, TypeError, ValueError, OverflowError) as exc:
+            raise ConfigurationError(
+                f"recording: a {item.message} has not the fields of one: {item.fields!r:.80}"
+            ) from exc
+        if step is None:
+            continue
+        size += len(step.data)
+        if size > MAX_REPLAY:
+            raise RecordingError(
+                f"recording: {size} bytes of containers until {item.at}, expected {MAX_REPLAY} at "
+                "most for a replay"
+            )
+        if step.what is _What.CONTAINER and step.number == m.UNNAMED_APPLICATION:
+            step = step._replace(number=active)  # a quirk: it does not say whose it is
+        elif step.what in {_What.SWITCHED, _What.NAMED}:
+            active = step.number
+        yield step
+
+
+def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:
+    """Return the step that a frame means; None where it does not matter."""
+    key, fields = (entry.direction, entry.message), entry.fields
+    if key in _PLAIN:
+        return _ReplayStep(at, _PLAIN[key])
+    if key in _ANSWERS:
+        done = dialect.code(int(fields.get("code", 0))).verdict is Verdict.DONE
+        return _ReplayStep(at, _ANSWERS[key], int(fields["application"])) if done else None
+    match key:
+        case (">", "SwitchApplication"):
+            return _ReplayStep(at, _What.SWITCH, int(fields["application"]))
+        case ("<", "StatusReport"):
+            bits = status_of(fields["status"])
+            return _ReplayStep(at, _What.STATUS, int(fields.get("endian", 0)), bits)
+        case ("<", "ResultContainer"):
+            number = int(fields.get("application", m.UNNAMED_APPLICATION))
+            return _ReplayStep(at, _What.CONTAINER, number, data=bytes.fromhex(fields["data"]))
+        case _:
+            return None
+
+
+def _free_running(steps: Iterable[_ReplayStep]) -> set[int]:
+    """Return the applications that ran and never waited for a trigger."""
+    seen: dict[int, Status] = {}
+    active: int | None = None
+    early = Status(0)  # before it is known whose they are
+    for step in steps:
+        if step.what is _What.STATUS:
+            if step.bits.loading:
+                active = None
+            elif active is None:
+                early |= step.bits
+            else:
+                seen[active] = seen.get(active, Status(0)) | step.bits
+        elif step.what in {_What.SWITCHED, _What.NAMED, _What.CONTAINER}:
+            active = step.number
+            seen[active] = seen.get(active, Status(0)) | early
+            early = Status(0)
+    return {
+        number
+        for number, bits in seen.items()
+        if Status.RUNNING in bits and Status.WAITING_FOR_TRIGGER not in bits
+    }
+
+
+class _ScheduleMaker:
+    """Follows a recording, step by step."""
+
+    def __init__(self, free: set[int]) -> None:
+        self.lists: dict[int, TakeList] = {}  # what came so far, by application
+        self.began: float | None = None  # when the first session began, seconds; None before
+        self.now: float = 0.0  # time of the last step, seconds
+        self.first: int | None = None  # application of the first container; None before
+        self.ran_at_first: bool = False  # the first status said Running
+        self.endian: int = 0  # of the last status before the first container
+        self.conditions: Status = Status(0)  # those of the first status
+        self.changes: list[Change] = []  # of conditions so far
+        self._free = free  # applications that run free
+        self._active: int | None = None
+        self._status: Status | None = None  # in this session
+        self._last: Status | None = None  # of all sessions
+        self._triggers: list[float] = []  # without a container so far
+        self._drops = 0  # triggers dropped since the last take
+        self._waits_from = self._waited_until = 0.0  # when Waiting for Trigger rose, and fell
+        self._open: Take | None = None  # its inspection may send more
+        self._began_unasked: float | None = None  # an inspection that nobody had triggered
+        self._reference = 0.0  # the next unasked one is counted from here
+        self._switching: tuple[float, int] | None = None
+        self._takers: Mapping[_What, Callable[[_ReplayStep], None]] = {
+            _What.CONNECTED: self._on_connected,
+            _What.LOST: self._on_lost,
+            _What.STATUS: self._on_status,
+            _What.TRIGGER: self._on_trigger,
+            _What.ABORT: lambda _: self._give_up(),
+            _What.SWITCH: self._on_switch,
+            _What.SWITCHED: self._on_switched,
+            _What.NAMED: lambda step: self._name(step.number),
+            _What.CONTAINER: self._on_container,
+        }
+
+    def take(self, step: _ReplayStep) -> None:
+        """Take the next step."""
+        self.now = step.at
+        self._takers[step.what](step)
+
+    def finish(self) -> None:
+        """Nothing more comes: what a trigger under way would have given is not known."""
+        self._triggers.clear()
+
+    # ------------------------------------------------------------------ steps
+
+    def _on_connected(self, _: _ReplayStep) -> None:
+        if self.began is None:
+            self.began = self._reference = self.now
+        self._status = None
+
+    def _on_lost(self, _: _ReplayStep) -> None:
+        self._triggers.clear()  # their results went with the link
+        self._open = self._began_unasked = self._switching = None
+
+    def _on_status(self, step: _ReplayStep) -> None:
+        was, self._status = self._status, step.bits
+        risen = step.bits & ~was if was is not None else Status(0)
+        fallen = was & ~step.bits if was is not None else Status(0)
+        self._note_conditions(step.bits)
+        if self.first is None:
+            self.endian = step.number
+        if Status.RUNNING in risen:
+            self._reference = self.now
+        if Status.WAITING_FOR_TRIGGER in fallen:
+            self._waited_until = self.now
+        if Status.OVERTRIGGERED in risen and self._triggers:
+            self._drop(step.bits)
+        if Status.SYSTEM_ERROR in risen or Status.RUNNING in fallen:
+            self._give_up()
+        if Status.WAITING_FOR_TRIGGER in fallen and not self._triggers:
+            self._began_unasked = self.now
+        if Status.WAITING_FOR_TRIGGER in risen:
+            self._waits_from = self.now
+            self._open = None
+
+    def _note_conditions(self, bits: Status) -> None:
+        before, self._last = self._last, bits
+        if before is None:
+            self.conditions = bits & (Status.OVERHEAT | Status.SYSTEM_ERROR)
+            self.ran_at_first = Status.RUNNING in bits
+            return
+        for condition in CONDITIONS:
+            on = condition in bits
+            if (condition in before) != on and self.began is not None:
+                self.changes.append(Change(self.now - self.began, condition, on))
+
+    def _drop(self, bits: Status) -> None:
+        """The camera dropped the last trigger."""
+        self._triggers.pop()
+        if self._triggers:
+            return  # one of ours is under way: the emulated camera drops it by itself
+        if Status.WAITING_FOR_TRIGGER in bits:
+            self._drops += 1
+        elif self._began_unasked is None:  # for one that nobody had triggered, which shows late
+            self._began_unasked = self._waited_until
+
+    def _on_trigger(self, _: _ReplayStep) -> None:
+        self._open = None
+        if self._status is not None and Status.WAITING_FOR_TRIGGER in self._status:
+            self._give_up()  # where it waits, the inspection before is over
+        self._triggers.append(self.now)
+
+    def _on_switch(self, step: _ReplayStep) -> None:
+        self._switching = (self.now, step.number)
+
+    def _on_switched(self, step: _ReplayStep) -> None:
+        self._give_up()
+        self._name(step.number)
+        switching, self._switching = self._switching, None
+        if switching is not None and switching[1] == step.number:
+            self._list(step.number).load_time = self.now - switching[0]
+
+    def _on_container(self, step: _ReplayStep) -> None:
+        if self.first is None:
+            self.first = step.number
+        self._name(step.number)
+        found = self._list(step.number)
+        if not found.waits:
+            self._triggers.clear()  # it ignores them
+            found.unasked.append(Take([step.data], 0.0, gap=self._gap(self.now)))
+        elif self._triggers:
+            began = self._triggers.pop(0)
+            self._open = Take([step.data], self.now - began, drops=self._drops)
+            self._drops = 0
+            found.triggered.append(self._open)
+        elif self._open is not None:
+            self._open.containers.append(step.data)
+        else:
+            began = self.now if self._began_unasked is None else self._began_unasked
+            self._open = Take([step.data], self.now - began, gap=self._gap(began))
+            found.unasked.append(self._open)
+        self._began_unasked = None
+
+    # ------------------------------------------------------------------ inside
+
+    def _gap(self, began: float) -> float:
+        gap = max(0.0, began - self._reference)
+        self._reference = self.now
+        return gap
+
+    def _give_up(self) -> None:
+        """The inspection under way sends nothing: its trigger has no result."""
+        if self._active is not None and self._list(self._active).waits:
+            for began in self._triggers:
+                ended = self._waits_from if self._waits_from > began else self.now
+                take = Take([], ended - began, drops=self._drops)
+                self._list(self._active).triggered.append(take)
+                self._drops = 0
+        self._triggers.clear()
+        self._open = self._began_unasked = None
+
+    def _name(self, number: int) -> None:
+        if number != self._active:
+            self._active = number
+            self._list(number)
+
+    def _list(self, number: int) -> TakeList:
+        return self.lists.setdefault(number, TakeList(number, waits=number not in self._free))

@@ -1,0 +1,410 @@
+"""The emulator's site: its page, and an HTTP call for everything the page does."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
+
+from smartcam.emulator._scene import PIECES, TablePose
+from smartcam.emulator.faults import Fault
+from smartcam.exceptions import ConfigurationError
+from smartcam.web import _serialize as serialize
+from smartcam.web._errors import RefusedError
+from smartcam.web._feed import Watcher
+from smartcam.web._routes import CallBody, CallRequest, Calls
+from smartcam.web._site import API, Site
+from smartcam.web._streams import is_open
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from aiohttp import web
+
+    from smartcam.emulator import EmulatedCamera
+
+MAX_ENTRIES = 1000
+"""Log entries that one answer tells; ``next`` says where to go on."""
+
+MAX_WAIT = 30.0
+"""Seconds that a call waits for a log entry at most."""
+
+MAX_WAITING = 16
+"""Calls that wait for one at a time. With the event streams they leave half of the places free."""
+
+LOOK_AGAIN = 0.02
+"""Seconds between two looks for it."""
+
+MAX_PARTS = 100
+"""Parts on a table; a result container has room for about 900 localizations."""
+
+MAX_NAMES = 20
+"""Names of cameras that a refusal lists."""
+
+
+class EmulatorSite(Site):
+    """A page and HTTP calls that show and control emulated cameras.
+
+    It runs in the emulators' own event loop. They may be started and stopped on their own; the
+    mapping is looked into at each call.
+
+    ::
+
+        async with EmulatedCamera() as emulator, EmulatorSite({"camera": emulator}) as site:
+            site.url    # http://127.0.0.1:PORT/
+
+    Args:
+        cameras: the cameras by the names that stand in paths.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
+            and ``_`` at least. None: nothing on a loopback address; on any other one is made.
+
+    Raises:
+        ConfigurationError: a name or the token cannot be used.
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, EmulatedCamera],
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        for name in cameras:
+            if not name.isprintable() or name in {"", ".", ".."}:
+                raise ConfigurationError(f"web: {name!r} cannot stand in a path: name the camera")
+        super().__init__(CALLS, "emulator", host=host, port=port, token=token)
+        self.cameras: Mapping[str, EmulatedCamera] = cameras
+        self._waiting = 0
+
+    async def wait_for(
+        self, request: web.Request, condition: Callable[[], bool], seconds: float
+    ) -> None:
+        """Wait until something holds, for some time, and as long as site and client are there.
+
+        Raises:
+            RefusedError: 503, :data:`MAX_WAITING` calls wait already.
+        """
+        if self._waiting >= MAX_WAITING:
+            raise RefusedError(503, f"waiting call {MAX_WAITING + 1}", f"{MAX_WAITING} at one time")
+        self._waiting += 1
+        try:
+            loop = asyncio.get_running_loop()
+            deadline = loop.time() + seconds
+            while loop.time() < deadline and is_open(request) and not condition():
+                if await self.streams.pause(LOOK_AGAIN):
+                    break
+        finally:
+            self._waiting -= 1
+
+
+# ---------------------------------------------------------------------- what calls take
+
+
+class _ApplicationBody(CallBody):
+    id: int = Field(ge=1, le=0xFFFFFFFF)
+    running: bool = False
+
+
+class _RebootBody(CallBody):
+    seconds: float | None = Field(default=None, ge=0, le=3600, allow_inf_nan=False)
+
+
+class _Conditions(CallBody):
+    overheat: bool | None = None
+    system_error: bool | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> _Conditions:
+        if self.overheat is None and self.system_error is None:
+            raise ValueError("overheat, system_error or both, true or false")
+        return self
+
+
+class _Endian(CallBody):
+    endian: int = Field(ge=0, le=0xFFFFFFFF)
+
+
+_Metres = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
+
+
+class _PartPose(CallBody):
+    x: _Metres
+    y: _Metres
+    theta: float = Field(default=0.0, ge=-1000, le=1000, allow_inf_nan=False)
+
+
+class _Place(BaseModel):
+    """Where a look into the log begins."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+
+    since: int | None = Field(default=None, ge=0, le=2**63 - 1)
+
+
+class _Part(_Place):
+    """Which part of the log is wanted."""
+
+    limit: int = Field(default=MAX_ENTRIES, ge=1, le=MAX_ENTRIES)
+    wait: float = Field(default=0.0, ge=0, le=MAX_WAIT, allow_inf_nan=False)
+
+
+def _as_list(value: object) -> object:
+    return [value] if isinstance(value, dict) else value
+
+
+_FAULTS: TypeAdapter[Any] = TypeAdapter(Annotated[list[Fault], BeforeValidator(_as_list)])
+
+
+# ---------------------------------------------------------------------- what calls do
+
+CALLS: Calls[EmulatorSite] = Calls()
+"""All calls; ``docs/control.md`` shows them."""
+
+_CAMERA = f"{API}/cameras/{{camera}}"
+
+
+def _name(site: EmulatorSite, call: CallRequest) -> str:
+    name = call.path["camera"]
+    if name not in site.cameras:
+        known = list(site.cameras)
+        more = ", ..." if len(known) > MAX_NAMES else ""
+        raise RefusedError(
+            404, f"no camera is called {name!r}", f"{', '.join(known[:MAX_NAMES])}{more}"
+        )
+    return name
+
+
+def _emulator(site: EmulatorSite, call: CallRequest) -> EmulatedCamera:
+    return site.cameras[_name(site, call)]
+
+
+@CALLS.add("GET", API)
+def _calls(_site: EmulatorSite, _ask: CallRequest) -> object:
+    """These calls."""
+    return {"calls": CALLS.as_json()}
+
+
+@CALLS.add("GET", f"{API}/cameras")
+def _cameras(site: EmulatorSite, _ask: CallRequest) -> object:
+    """All cameras, in short."""
+    return {"cameras": [serialize.camera_row(name, one) for name, one in site.cameras.items()]}
+
+
+@CALLS.add("GET", _CAMERA)
+def _state(site: EmulatorSite, call: CallRequest) -> object:
+    """All that one camera's state is."""
+    name = _name(site, call)
+    emulator = site.cameras[name]
+    return {
+        **serialize.camera_state(name, emulator),
+        **serialize.times(emulator),
+        "log": serialize.log_range(emulator),
+    }
+
+
+@CALLS.add("POST", f"{_CAMERA}/trigger")
+def _trigger(site: EmulatorSite, call: CallRequest) -> object:
+    """Trigger by the digital input; `taken` tells whether an inspection began."""
+    taken = _emulator(site, call).device.trigger()
+    return {"taken": taken, "camera": _state(site, call)}
+
+
+@CALLS.add("POST", f"{_CAMERA}/start")
+def _start(site: EmulatorSite, call: CallRequest) -> object:
+    """Enter run mode."""
+    _emulator(site, call).device.start()
+    return {"camera": _state(site, call)}
+
+
+@CALLS.add("POST", f"{_CAMERA}/stop")
+def _stop(site: EmulatorSite, call: CallRequest) -> object:
+    """Leave run mode."""
+    _emulator(site, call).device.stop()
+    return {"camera": _state(site, call)}
+
+
+@CALLS.add(
+    "POST", f"{_CAMERA}/application", body=_ApplicationBody, sample='{"id": 7, "running": true}'
+)
+def _application(site: EmulatorSite, call: CallRequest) -> object:
+    """Load another application behind the client's back; 409 while one is loaded."""
+    device = _emulator(site, call).device
+    wanted: _ApplicationBody = call.body
+    if wanted.id not in device.applications:
+        known = ", ".join(str(one) for one in device.applications)
+        field = {"field": "id", "came": str(wanted.id), "expected": f"one of {known}"}
+        raise RefusedError(422, f"application {wanted.id}", f"one of {known}", (field,))
+    if not device.switch_application(wanted.id, running=wanted.running):
+        raise RefusedError(409, f"the camera is {device.mode.value}", "it to be stopped or running")
+    return {"camera": _state(site, call)}
+
+
+@CALLS.add("POST", f"{_CAMERA}/reboot", body=_RebootBody, optional=True, sample='{"seconds": 0.5}')
+def _reboot(site: EmulatorSite, call: CallRequest) -> object:
+    """Restart it, as by its power switch; without a body as the quirk says."""
+    wanted: _RebootBody = call.body
+    _emulator(site, call).device.reboot(wanted.seconds)
+    return {"camera": _state(site, call)}
+
+
+@CALLS.add("POST", f"{_CAMERA}/conditions", body=_Conditions, sample='{"overheat": true}')
+def _conditions(site: EmulatorSite, call: CallRequest) -> object:
+    """Set or clear Overheat and System Error."""
+    device = _emulator(site, call).device
+    for name, bit in serialize.CONDITIONS.items():
+        on = getattr(call.body, name)
+        if on is not None:
+            device.set_condition(bit, on)
+    return {"camera": _state(site, call)}
+
+
+@CALLS.add("POST", f"{_CAMERA}/endian", body=_Endian, sample='{"endian": 1}')
+def _endian(site: EmulatorSite, call: CallRequest) -> object:
+    """Byte order of results: 0 little, 1 big."""
+    wanted: _Endian = call.body
+    _emulator(site, call).device.set_endian(wanted.endian)
+    return {"camera": _state(site, call)}
+
+
+@CALLS.add("GET", f"{API}/faults")
+def _kinds(_site: EmulatorSite, _ask: CallRequest) -> object:
+    """Every kind of fault, with the JSON Schema of its fields."""
+    return {"kinds": serialize.kinds()}
+
+
+@CALLS.add("GET", f"{_CAMERA}/faults")
+def _faults(site: EmulatorSite, call: CallRequest) -> object:
+    """Faults that wait, and the last ones that have happened."""
+    return serialize.faults_state(_emulator(site, call))
+
+
+@CALLS.add(
+    "POST", f"{_CAMERA}/faults", body=_FAULTS, sample='{"kind": "drop", "on": "ResultContainer"}'
+)
+def _inject(site: EmulatorSite, call: CallRequest) -> object:
+    """Inject a fault, or a list of them: all or, where one is wrong, none."""
+    _emulator(site, call).inject(*call.body)
+    return _faults(site, call)
+
+
+@CALLS.add("DELETE", f"{_CAMERA}/faults")
+def _clear_faults(site: EmulatorSite, call: CallRequest) -> object:
+    """Forget the faults that wait, end those that last."""
+    _emulator(site, call).clear_faults()
+    return _faults(site, call)
+
+
+@CALLS.add("POST", f"{_CAMERA}/commands/{{command}}")
+def _command(site: EmulatorSite, call: CallRequest) -> object:
+    """Let that row of the scenario's timeline happen."""
+    emulator, name = _emulator(site, call), call.path["command"]
+    if name not in emulator.commands:
+        known = ", ".join(emulator.commands) or "none: its scenario's timeline has no command"
+        raise RefusedError(404, f"no command is called {name!r}", known)
+    emulator.command(name)
+    return {"camera": _state(site, call)}
+
+
+@CALLS.add("GET", f"{_CAMERA}/scene")
+def _scene(site: EmulatorSite, call: CallRequest) -> object:
+    """The table: parts at their true poses, the field of view, and what was reported."""
+    emulator = _emulator(site, call)
+    return {**serialize.scene_state(emulator.scene), "reported": serialize.reported(emulator)}
+
+
+@CALLS.add(
+    "PUT",
+    f"{_CAMERA}/scene/parts/{{part}}",
+    body=_PartPose,
+    sample='{"x": 0.2, "y": 0.1, "theta": 0.0}',
+)
+def _put_part(site: EmulatorSite, call: CallRequest) -> object:
+    """Put a part there, or move it: metres and radians."""
+    pieces, name = _emulator(site, call).scene.pieces, call.path["part"]
+    if not (name.isascii() and name.isprintable() and len(name) <= 50):
+        raise RefusedError(
+            422, f"the part {name!r}", "a name of 1 to 50 printable ASCII characters"
+        )
+    if name not in pieces and len(pieces) >= MAX_PARTS:
+        raise RefusedError(422, f"part {MAX_PARTS + 1}", f"{MAX_PARTS} parts on a table at most")
+    wanted: _PartPose = call.body
+    pieces[name] = TablePose(wanted.x, wanted.y, wanted.theta)
+    return _scene(site, call)
+
+
+@CALLS.add("DELETE", f"{_CAMERA}/scene/parts/{{part}}")
+def _remove_part(site: EmulatorSite, call: CallRequest) -> object:
+    """Take a part off the table."""
+    pieces, name = _emulator(site, call).scene.pieces, call.path["part"]
+    if pieces.pop(name, None) is None:
+        known = ", ".join(pieces) or "nothing: the table is empty"
+        raise RefusedError(404, f"no part is called {name!r}", known)
+    return _scene(site, call)
+
+
+@CALLS.add("POST", f"{_CAMERA}/scene/reset")
+def _reset_scene(site: EmulatorSite, call: CallRequest) -> object:
+    """Put all parts back to where they lay at first."""
+    pieces = _emulator(site, call).scene.pieces
+    pieces.clear()
+    pieces.update(PIECES)
+    return _scene(site, call)
+
+
+@CALLS.add("GET", f"{_CAMERA}/log", query=_Part)
+async def _log(site: EmulatorSite, call: CallRequest) -> object:
+    """Log entries from serial `?since=` on, `?limit=` at most; `next` is the serial to go on with.
+
+    With `?wait=` seconds it waits for the first one.
+    """
+    emulator, part = _emulator(site, call), call.query
+    since: int = part.since or 0
+
+    def came() -> bool:
+        return bool(emulator.log.since(since, 1)[0])
+
+    if part.wait:
+        await site.wait_for(call.request, came, part.wait)
+    return serialize.log_part(emulator, since, part.limit)[0]
+
+
+@CALLS.add("GET", f"{_CAMERA}/log/{{serial}}")
+def _log_entry(site: EmulatorSite, call: CallRequest) -> object:
+    """One log entry, with all of its payload."""
+    emulator, text = _emulator(site, call), call.path["serial"]
+    serial = int(text) if text.isdecimal() and len(text) < 20 else -1
+    entries, count = emulator.log.since(serial, 1)
+    first = count - len(emulator.log)
+    if not entries or serial < first:
+        there = f"{first} to {count - 1}" if len(emulator.log) else "none"
+        raise RefusedError(404, f"log entry {text!r}", f"one that is there: {there}")
+    return serialize.camera_entry(serial, entries[0], emulator, whole=True)
+
+
+@CALLS.add("DELETE", f"{_CAMERA}/log")
+def _clear_log(site: EmulatorSite, call: CallRequest) -> object:
+    """Empty the log."""
+    emulator = _emulator(site, call)
+    emulator.log.clear()
+    return {"next": serialize.log_count(emulator)}
+
+
+@CALLS.add(
+    "GET",
+    f"{_CAMERA}/events",
+    about="What happens, as server-sent events: `camera`, `scene`, `faults`, `log`, `clock`; "
+    "the log from `?since=` on, else from now.",
+    query=_Place,
+)
+def _events(site: EmulatorSite, call: CallRequest) -> object:
+    name = _name(site, call)
+    since: int | None = call.query.since
+    last = call.request.headers.get("Last-Event-ID", "")
+    if since is None and last.isdecimal() and len(last) < 20:
+        since = int(last)
+    watcher = Watcher(name, site.cameras[name], since)
+    return site.streams.serve(call.request, watcher.look)

@@ -1,0 +1,66 @@
+"""What a call is answered with that cannot be done: JSON that says why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pydantic import ValidationError
+
+MAX_SHOWN = 200
+"""Characters of what a client sent that a refusal shows."""
+
+
+@dataclass(eq=False)
+class RefusedError(Exception):
+    """A call cannot be done."""
+
+    status: int  # the HTTP status code
+    came: str
+    expected: str
+    # for each wrong field ``field``, ``came`` and ``expected``
+    fields: tuple[dict[str, str], ...] = ()
+    headers: Mapping[str, str] = field(default_factory=dict[str, str])  # of the answer
+
+    def as_json(self, tried: str) -> dict[str, Any]:
+        """Return the answer's body; ``tried`` is method and path of the call."""
+        answer = {
+            "error": f"{tried}: {self.came}; expected {self.expected}",
+            "tried": tried,
+            "came": self.came,
+            "expected": self.expected,
+        }
+        return {**answer, "fields": self.fields} if self.fields else answer
+
+
+def shown(value: object) -> str:
+    """Return a value as text, cut after :data:`MAX_SHOWN` characters."""
+    text = repr(value)
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+_EXPECTED = {"missing": "a value", "extra_forbidden": "no such field"}
+
+
+def _expected(kind: str, text: str) -> str:
+    return _EXPECTED.get(kind) or text.removeprefix("Input should be ").removeprefix(
+        "Value error, "
+    )
+
+
+def refused_fields(error: ValidationError) -> RefusedError:
+    """Return the refusal of a body or a query with wrong fields (422)."""
+    fields = tuple(
+        {
+            "field": ".".join(str(part) for part in item["loc"]),
+            "came": "nothing" if item["type"] == "missing" else shown(item["input"]),
+            "expected": _expected(item["type"], item["msg"]),
+        }
+        for item in error.errors(include_url=False)
+    )
+    came = "; ".join(f"{one['field'] or 'the body'}: {one['came']}" for one in fields)
+    expected = "; ".join(one["expected"] for one in fields)
+    return RefusedError(422, came, expected, fields)

@@ -1,0 +1,72 @@
+"""Finding out what is new with a camera, for one event stream."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.web import _serialize as serialize
+from smartcam.web._streams import PERIOD, News
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.emulator import EmulatedCamera
+
+MAX_LOG_NEWS = 200
+"""Log entries in one event; at ten events a second it keeps up with 2000 messages a second."""
+
+MAX_FAULTS_TOLD = 100
+"""Faults that an event tells."""
+
+CLOCK_LOOKS = round(1.0 / PERIOD)
+"""Looks after which the clock is told: once a second. It shows a reader that is gone, too."""
+
+
+class Watcher:
+    """What one reader knows of a camera.
+
+    ``since`` is the serial of the first log entry that is wanted; None: what comes from now on.
+    """
+
+    def __init__(self, name: str, emulator: EmulatedCamera, since: int | None = None) -> None:
+        self._name = name
+        self._emulator = emulator
+        self._serial = serialize.log_count(emulator) if since is None else since
+        self._known: dict[str, Any] = {}
+        self._reported = serialize.reported(emulator)
+        self._looks = 0
+
+    def look(self) -> Iterator[News]:
+        """Yield what changed since the last look; the first one tells everything but the log."""
+        emulator = self._emulator
+        log = self._log()
+        yield from self._changed("camera", serialize.camera_state(self._name, emulator))
+        scene = {**serialize.scene_state(emulator.scene), "reported": self._reported}
+        yield from self._changed("scene", scene)
+        if self._changed_faults():
+            yield News("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
+        if log is not None:
+            yield log
+        if self._looks % CLOCK_LOOKS == 0:
+            yield News("clock", serialize.times(emulator))
+        self._looks += 1
+
+    def _changed(self, kind: str, value: Any) -> Iterator[News]:
+        if self._known.get(kind) != value:
+            self._known[kind] = value
+            yield News(kind, value)
+
+    def _changed_faults(self) -> bool:
+        fired = self._emulator.fired
+        now = (self._emulator.faults, len(fired), fired[-1] if fired else None)
+        before, self._known["faults"] = self._known.get("faults"), now
+        return now != before
+
+    def _log(self) -> News | None:
+        emulator = self._emulator
+        part, entries = serialize.log_part(emulator, self._serial, MAX_LOG_NEWS)
+        self._serial = part["next"]  # a serial of another emulator's time may have been higher
+        if not entries and not part["missed"]:
+            return None
+        self._reported = serialize.reported(emulator, entries) or self._reported
+        return News("log", part, self._serial)

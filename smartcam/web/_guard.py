@@ -1,0 +1,127 @@
+"""Who may use a site: checks of Host, Origin and token, and the headers of every answer.
+
+A page of another web site runs in the same browser and can send requests to this machine. It must
+neither read nor change anything here, whatever name it gives this machine:
+
+- *Host* must name this machine's loopback where no token is required. A name that was made to
+  point here (DNS rebinding) is another one.
+- *Origin*, which a browser sends with whatever changes something, must be the site itself;
+  *Sec-Fetch-Site* must not tell of another.
+- With a token, each call carries it in ``Authorization``. A page elsewhere does not know it.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.web._errors import RefusedError, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from aiohttp import web
+
+MIN_TOKEN = 16
+"""Characters of a token at least, so that nobody guesses it; made ones have 32."""
+
+HEADERS: Mapping[str, str] = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Server": "smartcam",
+}
+"""Of every answer: nothing from elsewhere is loaded, nobody frames the page, nothing is kept."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guard:
+    """The checks of one site."""
+
+    token: str | None  # what calls must carry; None: nothing, and the site listens on loopback
+
+    def check(self, request: web.Request, *, is_call: bool) -> None:
+        """Refuse a request that is not from here.
+
+        The page's own files, which are no calls, hold no secret.
+
+        Raises:
+            RefusedError: 403 for another site's, 401 for a missing or wrong token.
+        """
+        if self.token is None:
+            _check_host(request.host)
+        if is_call:
+            _check_origin(request)
+            self._check_token(request.headers.get("Authorization"))
+
+    def _check_token(self, given: str | None) -> None:
+        if self.token is None:
+            return
+        wanted = f"Bearer {self.token}".encode()
+        came = (given or "").encode("utf-8", "surrogateescape")
+        if not hmac.compare_digest(came, wanted):
+            what = "no Authorization" if given is None else "an Authorization with another token"
+            raise RefusedError(
+                401,
+                what,
+                "Authorization: Bearer TOKEN, with the token that stands in the page's address",
+                headers={"WWW-Authenticate": 'Bearer realm="smartcam"'},
+            )
+
+
+def _check_host(given: str) -> None:
+    try:
+        name = urlsplit(f"//{given}").hostname or ""
+    except ValueError:
+        name = ""
+    if not is_loopback(name):
+        raise RefusedError(403, f"Host {shown(given)}", "localhost or another name of loopback")
+
+
+def _check_origin(request: web.Request) -> None:
+    origin = request.headers.get("Origin")
+    if origin is not None and origin.partition("://")[2] != request.host:
+        raise RefusedError(403, f"Origin {shown(origin)}", f"the page's own: http://{request.host}")
+    site = request.headers.get("Sec-Fetch-Site", "none")
+    if site not in {"none", "same-origin"}:
+        raise RefusedError(403, f"Sec-Fetch-Site {shown(site)}", "the page's own calls")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host's name or address is that of this machine for itself alone."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def new_token() -> str:
+    """Return a new token."""
+    return secrets.token_urlsafe(24)
+
+
+def checked_token(token: str) -> str:
+    """Return a token that was given.
+
+    Raises:
+        ConfigurationError: it is too short, or has signs that a header or a URL cannot carry.
+    """
+    signs = token.replace("-", "").replace("_", "")
+    if len(token) < MIN_TOKEN or not (signs.isascii() and signs.isalnum()):
+        raise ConfigurationError(
+            f"web: a token has {MIN_TOKEN} letters, digits, '-' and '_' at least, "
+            f"this one has {len(token)} characters"
+        )
+    return token

@@ -1,0 +1,340 @@
+"""An emulated camera as JSON: what calls and events tell of it."""
+
+from __future__ import annotations
+
+import functools
+import math
+import sys
+from typing import TYPE_CHECKING, Any
+
+from smartcam.emulator._scene import TABLE_SIZE, Observation, TablePose
+from smartcam.emulator.faults import FAULTS
+from smartcam.emulator.faults._base import DeviceFault
+from smartcam.exceptions import InterpretationError
+from smartcam.models import Status, jsonable
+from smartcam.protocols import messages as m
+from smartcam.web._shapes import OUTLINES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from smartcam.emulator import Application, EmulatedCamera, FiredFault, LogEntry, TableScene
+    from smartcam.emulator._bvs.device import Device
+    from smartcam.emulator.faults._base import BaseFault
+    from smartcam.models import ByteOrder
+    from smartcam.protocols._framed.dialect import FramedDialect
+
+SENSOR = (1280, 1024)
+"""Pixels of the sensor for which the scene is scaled (derived: 1280 stands in the type's code)."""
+
+MAX_HEX = 512
+"""Bytes of a payload that a list of log entries shows; the entry alone has all."""
+
+MAX_VALUES = 2048
+"""Bytes of a result that a list of log entries shows decoded; the entry alone shows any."""
+
+MAX_TOLD = 1 << 18
+"""Bytes of payload that a list tells: of log entries, as far as it shows them, or of faults. More
+end the list; an answer stays a few megabytes of JSON, and no more than its entries is ever made."""
+
+MAX_LISTED = 1000
+"""Faults that a list shows."""
+
+MAX_LOOK_BACK = 1000
+"""Log entries among which the last result that has poses is searched."""
+
+CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
+"""What an operator can set and clear, by name."""
+
+
+# ---------------------------------------------------------------------- the camera
+
+
+def camera_row(name: str, emulator: EmulatedCamera) -> dict[str, Any]:
+    """Return a camera as a list of cameras shows it."""
+    device = emulator.device
+    return {
+        "name": name,
+        "url": emulator.url,
+        "mode": device.mode,
+        "status": device.status,
+        "active_application": device.active_application,
+        "session": next(iter(emulator.sessions), None),
+    }
+
+
+def camera_state(name: str, emulator: EmulatedCamera) -> dict[str, Any]:
+    """Return all there is to know of a camera but scene, faults and log."""
+    device = emulator.device
+    status = device.status
+    return {
+        **camera_row(name, emulator),
+        "status_word": status.value,
+        "conditions": {key: bool(status & bit) for key, bit in CONDITIONS.items()},
+        "running": device.running,
+        "processing": device.processing,
+        "endian": device.endian,
+        "next_number": device.next_number,
+        "queued_inputs": device.queued_inputs,
+        "links": emulator.links,
+        "applications": [_application(one) for one in device.applications.values()],
+        "commands": list(emulator.commands),
+        "host": emulator.host,
+        "port": emulator.port,
+        "transport": emulator.transport,
+        "dialect": emulator.dialect,
+        "quirks": emulator.quirks,
+        "quirks_chosen": emulator.quirks.model_dump(exclude_defaults=True),
+        "faults": {"waiting": len(emulator.faults), "fired": len(emulator.fired)},
+    }
+
+
+def times(emulator: EmulatedCamera) -> dict[str, Any]:
+    """Return the time of the log, seconds, and what the camera's own clock shows."""
+    with emulator.step():  # which brings the device's time up
+        return {"time": emulator.clock.now, "clock_time": emulator.device.clock_time}
+
+
+def _application(application: Application) -> dict[str, Any]:
+    shown = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
+    return {key: getattr(application, key) for key in shown}
+
+
+# ---------------------------------------------------------------------- the log
+
+
+def log_count(emulator: EmulatedCamera) -> int:
+    """Return the number of entries that the log has had: the serial behind the last one."""
+    return emulator.log.since(sys.maxsize, 0)[1]
+
+
+def log_range(emulator: EmulatedCamera) -> dict[str, int]:
+    """Return the serials of the log: ``first`` that is there, ``next`` that will be."""
+    count = log_count(emulator)
+    return {"first": count - len(emulator.log), "next": count}
+
+
+def log_part(
+    emulator: EmulatedCamera, since: int, limit: int
+) -> tuple[dict[str, Any], list[LogEntry]]:
+    """Return entries from a serial on as JSON, and themselves: so many, or :data:`MAX_TOLD`.
+
+    ``next`` is the serial to go on with, ``missed`` how many are gone.
+    """
+    entries, count = emulator.log.since(since, limit)
+    first = min(max(since, count - len(emulator.log)), count)
+    told: list[dict[str, Any]] = []
+    room = MAX_TOLD
+    for serial, entry in enumerate(entries, first):
+        told.append(camera_entry(serial, entry, emulator))
+        room -= min(told[-1]["size"], MAX_VALUES)
+        if room <= 0:
+            break
+    part = {"entries": told, "next": first + len(told), "missed": max(0, first - since)}
+    return part, entries[: len(told)]
+
+
+def camera_entry(
+    serial: int, entry: LogEntry, emulator: EmulatedCamera, *, whole: bool = False
+) -> dict[str, Any]:
+    """Return an entry of the log; ``serial`` is its place among all that there have been, from 0.
+
+    What is left out of a long payload, unless ``whole``, is told by ``size`` and ``wire_size``,
+    and by null in place of ``values``.
+    """
+    shown = None if whole else MAX_HEX * 3 - 1
+    message, wire = entry.message, entry.wire
+    values = None if message is None else _values(message, emulator.device, whole=whole)
+    return {
+        "serial": serial,
+        "time": entry.time,
+        "direction": entry.direction,
+        "peer": entry.peer,
+        "message_id": entry.message_id,
+        "message": None if message is None else type(message).__name__,
+        "fields": {} if message is None else _fields(message, emulator.spoken),
+        "values": values,
+        "hex": entry.hex[:shown],
+        "size": _size(entry.hex),
+        "error": entry.error,
+        "fault": entry.fault,
+        "wire": None if wire is None else wire[:shown],
+        "wire_size": None if wire is None else _size(wire),
+    }
+
+
+def _size(text: str) -> int:
+    """Return the number of bytes of a text of hex."""
+    return (len(text) + 1) // 3
+
+
+def _fields(message: m.Message, dialect: FramedDialect) -> dict[str, Any]:
+    """Return the fields that the dialect has on the wire; bytes stand in the payload's hex."""
+    names = _field_names(dialect).get(type(message), ())
+    return {name: getattr(message, name) for name in names}
+
+
+@functools.lru_cache(maxsize=16)
+def _field_names(dialect: FramedDialect) -> Mapping[type[m.Message], tuple[str, ...]]:
+    return {
+        row.type: tuple(name for name, wire in row.fields if wire is not m.Wire.DATA)
+        for row in dialect.table
+    }
+
+
+def _values(message: m.Message, device: Device, *, whole: bool) -> Any:
+    """Return a result's values as its application's layout has them, None where there is none."""
+    if not isinstance(message, m.ResultContainer):
+        return None
+    application = device.applications.get(message.application)
+    layout = None if application is None else application.result_layout
+    if layout is None or (not whole and len(message.data) > MAX_VALUES):
+        return None
+    try:
+        return layout.parse(message.data, _byte_order(device))
+    except InterpretationError:
+        return None  # a fault may have changed the bytes
+
+
+def _byte_order(device: Device) -> ByteOrder:
+    return "big" if device.endian == 1 else "little"
+
+
+# ---------------------------------------------------------------------- faults
+
+
+def faults_state(emulator: EmulatedCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
+    """Return the faults that wait and the last ones that have happened."""
+    waiting, fired = emulator.faults, list(emulator.fired)
+    last = (one.fault for one in reversed(fired))
+    return {
+        "waiting": [_fault(one) for one in waiting[: _as_many(waiting, limit)]],
+        "waiting_count": len(waiting),
+        "fired": [_fired(one) for one in fired[len(fired) - _as_many(last, limit) :]],
+    }
+
+
+def _as_many(faults: Iterable[BaseFault], limit: int) -> int:
+    """Return the number of faults shown: ``limit``, or :data:`MAX_TOLD` bytes of inserted data."""
+    count, room = 0, MAX_TOLD
+    for fault in faults:
+        room -= len(getattr(fault, "data", None) or b"")
+        if count == limit or room < 0:
+            break
+        count += 1
+    return count
+
+
+def _fault(fault: BaseFault) -> dict[str, Any]:
+    given = fault.model_dump(mode="json", exclude_unset=True)
+    return {"kind": getattr(fault, "kind", None), **given}
+
+
+def _fired(one: FiredFault) -> dict[str, Any]:
+    message = None if one.message is None else type(one.message).__name__
+    return {"time": one.time, "fault": _fault(one.fault), "message": message}
+
+
+def kinds() -> list[dict[str, Any]]:
+    """Return every kind of fault with what it does and the JSON Schema of its fields."""
+    return [
+        {
+            "kind": kind,
+            "of": "device" if issubclass(fault, DeviceFault) else "wire",
+            "about": (fault.__doc__ or "").partition("\n")[0].replace("``", "`"),
+            "schema": fault.model_json_schema(),
+        }
+        for kind, fault in FAULTS.items()
+    ]
+
+
+# ---------------------------------------------------------------------- the scene
+
+
+def scene_state(scene: TableScene) -> dict[str, Any]:
+    """Return the table: parts at their true poses, and what the camera sees of it.
+
+    Lengths are metres on the table, angles radians.
+    """
+    return {
+        "table": {"width": TABLE_SIZE[0], "depth": TABLE_SIZE[1]},
+        "sensor": {"width": SENSOR[0], "height": SENSOR[1]},
+        "field_of_view": [_corner(scene, u, v) for u, v in _corners()],
+        "scale": scene.scale,
+        "offset": scene.offset,
+        "rotation": scene.rotation,
+        "pixel_noise": scene.pixel_noise,
+        "seed": scene.seed,
+        "y_down": scene.y_down,
+        "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
+    }
+
+
+def _corners() -> tuple[tuple[float, float], ...]:
+    width, height = SENSOR
+    return ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height))
+
+
+def _corner(scene: TableScene, u: float, v: float) -> dict[str, float]:
+    pose = scene.to_table(Observation("", u, v, 0.0, 1.0))
+    return {"x": pose.x, "y": pose.y}
+
+
+def _part(scene: TableScene, name: str, pose: TablePose) -> dict[str, Any]:
+    u, v, _ = scene.to_pixels(pose)
+    return {
+        "name": name,
+        **pose._asdict(),
+        "u": u,
+        "v": v,
+        "in_view": 0 <= u <= SENSOR[0] and 0 <= v <= SENSOR[1],
+        "outline": OUTLINES.get(name),
+    }
+
+
+def reported(
+    emulator: EmulatedCamera, entries: Iterable[LogEntry] | None = None
+) -> dict[str, Any] | None:
+    """Return the reported poses of the last result that has some, or None.
+
+    Those are results of the generators ``tangram`` and ``tangram_pixels``, which fill ``x``, ``y``
+    and ``theta``. Entries are searched, oldest first, by default the log's last ones.
+    """
+    if entries is None:
+        entries = emulator.log.since(log_count(emulator) - MAX_LOOK_BACK)[0]
+    for entry in reversed(list(entries)):
+        message = entry.message
+        if entry.direction == "out" and isinstance(message, m.ResultContainer):
+            parts = _poses(message, emulator.device)
+            if parts is not None:
+                return {"application": message.application, "time": entry.time, "parts": parts}
+    return None
+
+
+def _poses(message: m.ResultContainer, device: Device) -> list[dict[str, Any]] | None:
+    application = device.applications.get(message.application)
+    layout = None if application is None else application.result_layout
+    if application is None or layout is None:
+        return None
+    pixels = {"tangram": False, "tangram_pixels": True}.get(str(application.generator))
+    if pixels is None or not {"x", "y", "theta"} <= {field.name for field in layout.fields}:
+        return None
+    try:
+        records = layout.parse_records(message.data, _byte_order(device))
+    except InterpretationError:
+        return None
+    found = [_pose(record, device.scene, pixels=pixels) for record in records]
+    return [one for one in found if one is not None]
+
+
+def _pose(record: Any, scene: TableScene, *, pixels: bool) -> dict[str, Any] | None:
+    values = record._asdict()
+    if not any(values.values()):
+        return None  # a slot that is not filled
+    pose = TablePose(values["x"], values["y"], values["theta"])
+    if not all(map(math.isfinite, pose)):
+        return None  # a fault may have changed the bytes
+    if pixels:
+        pose = scene.to_table(Observation("", *pose, 1.0))
+    name = values.get("feature_id")
+    return {"name": name, **jsonable(pose)}

@@ -1,0 +1,115 @@
+"""Event streams: what happens, told to whoever listens, as server-sent events.
+
+A stream looks for news ten times a second and writes them. Nothing waits for it: while its reader
+is slow it does not look, and a reader that takes nothing at all is disconnected.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from aiohttp import web
+
+from smartcam.models import jsonable
+from smartcam.web._errors import RefusedError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+_log = logging.getLogger("smartcam.web")
+
+MAX_STREAMS = 16
+"""Event streams at one time; each looks for news on its own."""
+
+PERIOD = 0.1
+"""Seconds between two looks for news."""
+
+SLOW = 10.0
+"""Seconds that a reader may take for what was written; then its stream ends."""
+
+
+class News(NamedTuple):
+    """One event."""
+
+    kind: str  # the event's name
+    data: Any  # what happened; sent as JSON
+    serial: int | None = None  # sent as the event's id; None for none
+
+    def as_text(self) -> str:
+        """Return it as it stands in the stream."""
+        mark = "" if self.serial is None else f"id: {self.serial}\n"
+        return f"event: {self.kind}\n{mark}data: {json.dumps(jsonable(self.data))}\n\n"
+
+
+class Streams:
+    """All event streams of a site."""
+
+    def __init__(self) -> None:
+        self._closing = asyncio.Event()
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    async def serve(
+        self, request: web.Request, look: Callable[[], Iterable[News]]
+    ) -> web.StreamResponse:
+        """Write news until the reader goes, is too slow, or :meth:`close` is called.
+
+        ``look`` is called every :data:`PERIOD` and returns what is new.
+
+        Raises:
+            RefusedError: 503, there are :data:`MAX_STREAMS` already.
+
+        Cancellation: ends the stream.
+        """
+        if self._count >= MAX_STREAMS:
+            raise RefusedError(503, f"event stream {MAX_STREAMS + 1}", f"{MAX_STREAMS} at one time")
+        response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
+        self._count += 1
+        try:
+            await response.prepare(request)
+            while not self._closing.is_set() and is_open(request):
+                await _write(response, "".join(one.as_text() for one in look()))
+                await self.pause(PERIOD)
+            if is_open(request):
+                await _write(response, None)
+        except TimeoutError:
+            _log.info("= %s: event stream ended, its reader is too slow", request.remote)
+            if request.transport is not None:
+                request.transport.abort()
+        except ConnectionError:
+            pass  # the reader is gone
+        finally:
+            self._count -= 1
+        return response
+
+    def close(self) -> None:
+        """End all streams, and those that come."""
+        self._closing.set()
+
+    async def pause(self, seconds: float) -> bool:
+        """Wait for some time; True at once where all streams are to end."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._closing.wait()
+        return self._closing.is_set()
+
+
+def is_open(request: web.Request) -> bool:
+    """Whether the client is still there."""
+    transport = request.transport
+    return transport is not None and not transport.is_closing()
+
+
+async def _write(response: web.StreamResponse, text: str | None) -> None:
+    """Write some text, or the end for None."""
+    async with asyncio.timeout(SLOW):
+        if text is None:
+            await response.write_eof()
+        elif text:
+            await response.write(text.encode())

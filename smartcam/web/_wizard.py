@@ -1,0 +1,227 @@
+"""The wizard's site: a page that shows its steps, and HTTP calls for the services."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
+
+from smartcam.calibration._codes import Code
+from smartcam.exceptions import CalibrationError
+from smartcam.web._errors import RefusedError
+from smartcam.web._routes import CallBody, CallRequest, Calls
+from smartcam.web._site import API, Site
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.calibration.wizards._services import CalibrationService
+
+    Handler = Callable[[CalibrationService, Any], object | Awaitable[object]]
+
+
+class WizardSite(Site):
+    """A page and HTTP calls that drive the wizards of calibrations.
+
+    It runs in the event loop that the service's actions run in. Whoever uses it at the same time
+    uses one sequence: a token tells which step a call meant.
+
+    ::
+
+        async with WizardSite(service) as site:
+            site.url    # http://127.0.0.1:PORT/
+
+    Args:
+        service: the calibrations' folder and their wizards; closed by who made it.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
+            and ``_`` at least. None: nothing on a loopback address; on any other one is made.
+
+    Attributes:
+        service: as given.
+
+    Raises:
+        ConfigurationError: the token cannot be used.
+    """
+
+    def __init__(
+        self,
+        service: CalibrationService,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        super().__init__(CALLS, "wizard", host=host, port=port, token=token)
+        self.service: CalibrationService = service
+
+
+# ---------------------------------------------------------------------- what calls take
+
+
+class _StartBody(CallBody):
+    name: str = Field(max_length=1000)
+    wizard: str = "plane"
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    fresh: bool = False
+
+
+class _Answers(CallBody):
+    token: str
+    answers: dict[str, Any] = Field(default_factory=dict)
+
+
+class _StepToken(CallBody):
+    token: str
+
+
+class _Export(CallBody):
+    name: str
+    target: str
+    form: str | None = None
+
+
+class _Load(CallBody):
+    name: str
+
+
+class _CameraPose(CallBody):
+    x: float = Field(allow_inf_nan=False)
+    y: float = Field(allow_inf_nan=False)
+    theta: float = Field(default=0.0, allow_inf_nan=False)
+    frame: str | None = None
+
+
+# ---------------------------------------------------------------------- what calls do
+
+_STATUS = {
+    Code.NOT_FOUND: 404,
+    Code.NO_SEQUENCE: 409,
+    Code.NO_CALIBRATION: 409,
+    Code.STALE_STEP: 409,
+    Code.NOT_POSSIBLE: 409,
+    Code.IN_USE: 409,
+    Code.NOT_WRITTEN: 500,
+}
+"""HTTP status by what a call is refused for; 422 for the rest."""
+
+
+def _refused(error: CalibrationError) -> RefusedError:
+    came, expected = [*re.split(r"[;:] expected ", str(error), maxsplit=1), ""][:2]
+    status = next((code for kind, code in _STATUS.items() if kind == error.code), 422)
+    field = {"field": "code", "came": error.code, "expected": ""}
+    return RefusedError(status, came, expected or "what the folder and its wizard can do", (field,))
+
+
+CALLS: Calls[WizardSite] = Calls()
+"""All calls; ``docs/calibrating.md`` shows them."""
+
+
+def _call(
+    method: Literal["GET", "POST"], path: str, *, writes: str = "folder", **takes: Any
+) -> Callable[[Handler], Handler]:
+    """Make a call of the function below, which does it to the service, given the body.
+
+    ``path`` stands behind that of all calls, ``writes`` is what it writes to; what it takes, see
+    :meth:`~smartcam.web._routes.Calls.add`.
+    """
+
+    def declare(handler: Handler) -> Handler:
+        @CALLS.add(method, f"{API}{path}", **takes)
+        @functools.wraps(handler)
+        async def answer(site: WizardSite, call: CallRequest) -> object:
+            try:
+                value = handler(site.service, call.body)
+                return await value if inspect.isawaitable(value) else value
+            except CalibrationError as exc:
+                raise _refused(exc) from exc
+            except OSError as exc:
+                raise RefusedError(500, f"the {writes}: {exc.strerror}", "one to write to") from exc
+
+        return handler
+
+    return declare
+
+
+@CALLS.add("GET", API)
+def _calls(_site: WizardSite, _ask: CallRequest) -> object:
+    """These calls."""
+    return {"calls": CALLS.as_json()}
+
+
+@_call("GET", "/calibrations")
+def _state(service: CalibrationService, _body: object) -> object:
+    """Names of the calibrations and of the wizards, and the one that is under way."""
+    return {"calibrations": service.names, "wizards": service.wizards, "name": service.name}
+
+
+@_call("POST", "/start", body=_StartBody, sample='{"name": "table"}')
+def _start(service: CalibrationService, body: _StartBody) -> object:
+    """Start a wizard under a name, or go on with the one that was broken off; answers its step.
+
+    `wizard` is `plane`, `drift` to check a calibration, `sheet` or `hand-eye`, which look at
+    pictures. With `fresh` begin anew in any case.
+    """
+    return service.start(body.name, body.wizard, body.parameters, fresh=body.fresh)
+
+
+@_call("GET", "/step")
+def _step(service: CalibrationService, _body: object) -> object:
+    """The current step: what to show, and the JSON Schema of what is asked for."""
+    return service.session.current
+
+
+@_call("POST", "/step", writes="journal", body=_Answers, sample='{"token": "...", "answers": {}}')
+def _submit(service: CalibrationService, body: _Answers) -> object:
+    """Answer the step of that token; answers the next one, or the same with `errors`.
+
+    May be made again if its answer was lost.
+    """
+    return service.session.submit(body.token, body.answers)
+
+
+@_call("POST", "/undo", writes="journal", body=_StepToken, sample='{"token": "..."}')
+def _undo(service: CalibrationService, body: _StepToken) -> object:
+    """Go back to the step before; its answers stand there as defaults."""
+    return service.session.undo(body.token)
+
+
+@_call("POST", "/repeat", writes="journal", body=_StepToken, sample='{"token": "..."}')
+def _repeat(service: CalibrationService, body: _StepToken) -> object:
+    """Do the action of the step before again."""
+    return service.session.repeat(body.token)
+
+
+@_call("POST", "/abort", writes="journal", body=_StepToken, sample='{"token": "..."}')
+def _abort(service: CalibrationService, body: _StepToken) -> object:
+    """End it without a result; what was measured stays in the journal."""
+    return service.session.abort(body.token)
+
+
+@_call(
+    "POST",
+    "/export",
+    about="Copy a calibration to a file of `exports/`: `.json` whole, `.yaml` its matrix, or with "
+    "`form` its frame as another program reads it.",
+    body=_Export,
+    sample='{"name": "table", "target": "table.yaml"}',
+)
+def _export(service: CalibrationService, body: _Export) -> object:
+    return {"file": service.export(body.name, body.target, body.form)}
+
+
+@_call("POST", "/load", body=_Load, sample='{"name": "table"}')
+def _load(service: CalibrationService, body: _Load) -> object:
+    """Load a calibration by its name, or an exported one by its path in the folder."""
+    calibration = service.load(body.name)
+    return {"name": body.name, "model": calibration.model, "robot_frame": calibration.robot_frame}
+
+
+@_call("POST", "/transform", body=_CameraPose, sample='{"x": 0.1, "y": 0.05, "theta": 0.0}')
+def _transform(service: CalibrationService, body: _CameraPose) -> object:
+    """The robot's pose for one in the camera's plane, by the loaded calibration."""
+    return {"pose": service.transform(body.x, body.y, body.theta, body.frame)}
