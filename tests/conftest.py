@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
-from timed_loop import TimedLoop
+
+from tests.timed_loop import TimedLoop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

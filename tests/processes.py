@@ -20,25 +20,23 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
 
 PATIENCE = 60.0
 """Seconds; only what has gone wrong takes as long."""
 
 MAINS = {"smartcam": "main", "smartcam-emulator": "emulator_main"}
-"""Our console scripts, and what of ``smartcam.cli`` they call."""
+"""Our console scripts, and what of ``smartcam._cli`` they call."""
 
 LOADED = (
     *(
-        "smartcam.cli.smartcam",
-        "smartcam.cli.smartcam_emulator",
-        "smartcam.emulator.insight.camera",
+        "smartcam._cli.smartcam",
+        "smartcam._cli.smartcam_emulator",
+        "smartcam.emulator._insight.camera",
     ),
-    *("smartcam.calibration.wizards.plane", "smartcam.recording", "smartcam.web", "mcap.writer"),
+    *("smartcam.calibration.wizards._plane", "smartcam.recording", "smartcam.web", "mcap.writer"),
     "scipy.special",
 )
 """What commands import, mostly when it is used."""
@@ -83,23 +81,15 @@ def script(name: str) -> str:
 
 
 class Process:
-    """A console script in a process of its own; a context manager that ends with it.
-
-    Args:
-        command: its name and its arguments.
-        env: variables beside the present ones.
-        cwd: where it runs, else here.
-        merged: whether stderr goes where stdout goes.
-        fresh: whether Python starts for it.
-    """
+    """A console script in a process of its own; a context manager that ends with it."""
 
     def __init__(
         self,
         *command: str,
-        env: Mapping[str, str] | None = None,
-        cwd: Path | None = None,
-        merged: bool = False,
-        fresh: bool = False,
+        env: Mapping[str, str] | None = None,  # variables beside the present ones
+        cwd: Path | None = None,  # where it runs, else here
+        merged: bool = False,  # whether stderr goes where stdout goes
+        fresh: bool = False,  # whether Python starts for it
     ) -> None:
         given, self._stdin = os.pipe()
         self._pipes: dict[str, int] = {}
@@ -328,7 +318,7 @@ def _is_the_command(stdin: int, stdout: int, stderr: int, report: int) -> bool:
 def _run(program: str, *arguments: str) -> None:
     sys.argv = [program, *arguments]
     try:
-        getattr(importlib.import_module("smartcam.cli"), MAINS[program])()
+        getattr(importlib.import_module("smartcam._cli"), MAINS[program])()
     except SystemExit as exc:
         # Python would take everything apart that was imported, which takes longer than the command
         atexit._run_exitfuncs()

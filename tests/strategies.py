@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +12,9 @@ from hypothesis import strategies as st
 from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
+    from collections.abc import Callable, Iterable
 
-__all__ = ["bodies", "chunkings", "garbage", "message_types", "messages", "split", "streams"]
+    from smartcam.protocols._framed.dialect import FramedDialect
 
 
 def message_types(dialect: FramedDialect, sender: m.Sender) -> list[type[m.Message]]:
@@ -81,3 +83,33 @@ def split(data: bytes, cuts: list[int]) -> list[bytes]:
     """Cut ``data`` at ``cuts``; empty pieces are left in, a socket's reader must bear them."""
     edges = [0, *cuts, len(data)]
     return [data[a:b] for a, b in pairwise(edges)]
+
+
+def over(
+    names: str, cells: Iterable[Any], label: Callable[[Any], object] = str
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Run a test for each cell; a failure names its cell.
+
+    Like ``pytest.mark.parametrize``, but one test and not thousands; ``label`` names a value.
+    """
+    keys, grid = names.split(", "), list(cells)
+    assert grid
+
+    def decorate(test: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(test)
+        def run(**given: Any) -> None:
+            for cell in grid:
+                values = cell if len(keys) > 1 else (cell,)
+                try:
+                    test(**dict(zip(keys, values, strict=True)), **given)
+                except BaseException as exc:
+                    exc.add_note(f"{names}: {', '.join(str(label(value)) for value in values)}")
+                    raise
+
+        signature = inspect.signature(test)
+        others = [one for name, one in signature.parameters.items() if name not in keys]
+        run.__signature__ = signature.replace(parameters=others)  # type: ignore[attr-defined]
+        del run.__wrapped__  # pytest asks it for the arguments
+        return run
+
+    return decorate

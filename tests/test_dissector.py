@@ -9,30 +9,24 @@ import random
 import re
 import shutil
 import socket
-import sys
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
-from wireshark import PORT, Capture, Shown, lua, needs_tshark, show, tshark
 
 import smartcam
-from smartcam.dissector import lua_source, lua_tables
+from smartcam._dissector import lua_source, lua_tables
 from smartcam.emulator import EmulatedCamera
 from smartcam.protocols import messages as m
-from smartcam.protocols.bvs import B16, BID, BVS, HANDBOOK, THESIS
+from smartcam.protocols._bvs import B16, BID, BVS, HANDBOOK, THESIS
+from smartcam.protocols._framed.dialect import FramedDialect
 from smartcam.protocols.messages import Sender
-
-sys.path.append(str(Path(__file__).parent / "protocols"))  # where the vectors are read
-from test_vectors import VECTORS
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from smartcam.protocols.framed.dialect import FramedDialect
-
-__all__ = ["lua"]
+from tests import ROOT
+from tests.protocols.test_vectors import VECTORS
+from tests.wireshark import PORT, Capture, Shown, needs_tshark, show, tshark
+from tests.wireshark import lua as lua  # a fixture
 
 CLIENT, CAMERA = Sender.CLIENT, Sender.CAMERA
 CODE = B16.with_quirks(["code"])
@@ -299,7 +293,7 @@ def test_another_protocol_on_the_port_is_not_swallowed(lua: Path, capture: Captu
 def test_filters_of_the_documents_are_understood_and_find_something(
     lua: Path, capture: Capture
 ) -> None:
-    page = Path(__file__).parents[1] / "docs" / "wireshark.md"
+    page = ROOT / "docs" / "wireshark.md"
     filters = re.findall(r"^\| `(bvs[^`]*)` \|", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert len(filters) > 8
     status = smartcam.Status.BUSY | smartcam.Status.OVERTRIGGERED

@@ -16,30 +16,27 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
-from processes import MAINS, Process
 
 from smartcam import exceptions
 from smartcam.client import SmartCamera
 from smartcam.emulator import Quirks
 from smartcam.models import Status
-from smartcam.protocols.bvs import B16, BID, BVS, CODES, HANDBOOK
-from smartcam.protocols.framed.machine import TRANSITIONS, State
+from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.machine import TRANSITIONS, State
 from smartcam.settings import CameraSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from smartcam.protocols.framed.dialect import FramedDialect
+from tests import ROOT
+from tests.processes import MAINS, Process
 
 pytestmark = pytest.mark.long
 
-ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 CAMERA = "bvs://192.168.0.10"
 """The address of a real camera in examples; an emulator's takes its place here."""
 LOCAL = re.compile(r"127\.0\.0\.1:\d{4,5}")
@@ -66,7 +63,9 @@ def blocks(language: str, pages: list[Path]) -> list[Any]:
         for text in [page.read_text(encoding="utf-8")]
         for match in fence.finditer(text)
     ]
-    return [pytest.param(block, id=f"{block.page.name}:{block.line}") for block in found]
+    return [
+        pytest.param(block, id=f"{block.page.relative_to(ROOT)}:{block.line}") for block in found
+    ]
 
 
 FILE = re.compile(
@@ -242,10 +241,14 @@ def test_file_that_a_page_shows_is_run_by_a_command_of_it() -> None:
 
 
 def test_every_page_is_in_the_contents() -> None:
-    index = (DOCS / "index.md").read_text(encoding="utf-8")
-    trees = re.findall(r"^```\{toctree\}\n(.*?)^```$", index, re.DOTALL | re.MULTILINE)
-    entries = re.findall(r"^([a-z][a-z-]*)$", "".join(trees), re.MULTILINE)
-    assert sorted([*entries, "index"]) == sorted(page.stem for page in DOCS.glob("*.md"))
+    pages = {page for page in DOCS.rglob("*.md") if "benchmarks" not in page.parent.name}
+    named = {DOCS / "index.md"}
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        for tree in re.findall(r"^```\{toctree\}\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
+            entries = re.findall(r"^([a-z0-9./-]+)$", tree, re.MULTILINE)
+            named |= {(page.parent / f"{entry}.md").resolve() for entry in entries}
+    assert named == pages
 
 
 def test_every_page_the_readme_names_is_there() -> None:
@@ -318,12 +321,17 @@ def test_promises_have_every_wait_with_its_default() -> None:
 @pytest.fixture(scope="module")
 def tables() -> dict[str, str]:
     """Return every table that the documents make from the code."""
-    spec = importlib.util.spec_from_file_location("docs_conf", DOCS / "conf.py")
+    return {name: make() for name, make in module_of("conf").GENERATED.items()}
+
+
+def module_of(name: str) -> Any:
+    """Return a module from the folder of the documents."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
-    conf = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(conf)
-    return {name: make() for name, make in conf.GENERATED.items()}
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def rows(table: str) -> list[list[str]]:
@@ -387,12 +395,18 @@ def test_limits_table_says_why(tables: dict[str, str]) -> None:
 
 
 def test_architecture_names_every_module() -> None:
-    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    page = (DOCS / "architecture" / "rooms.md").read_text(encoding="utf-8")
     modules = [path.stem for path in (ROOT / "smartcam").iterdir() if not path.name.startswith("_")]
     named = {
         name for row in re.findall(r"^\| (`.+?) \|", page, re.MULTILINE) for name in row.split(", ")
     }
     assert [name for name in modules if name != "py" and f"`{name}`" not in named] == []
+
+
+def test_drawing_of_the_rooms_is_what_the_imports_say() -> None:
+    rooms = module_of("rooms")
+    drawn = rooms.DRAWING.read_text(encoding="utf-8")
+    assert drawn == rooms.drawing(), "python docs/rooms.py draws it anew"
 
 
 def test_import_contract_is_shown(tables: dict[str, str]) -> None:
@@ -411,5 +425,5 @@ def test_protocol_page_has_every_status_bit() -> None:
 
 
 def test_every_generated_table_is_in_a_page(tables: dict[str, str]) -> None:
-    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
     assert set(re.findall(r"^```\{generated\} (\w+)$", text, re.MULTILINE)) == set(tables)

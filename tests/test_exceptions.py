@@ -8,9 +8,9 @@ import pickle
 from typing import Any
 
 import pytest
-from grids import over
 
 from smartcam import exceptions as e
+from tests.strategies import over
 
 ROOT = e.SmartCamError
 
@@ -141,9 +141,7 @@ def test_remote_protocol_error_keeps_64_bytes_of_any_buffer() -> None:
 
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
-def test_hex_excerpt_is_cut_after_64_bytes(
-    kind: type[bytes | bytearray | memoryview],
-) -> None:
+def test_hex_excerpt_is_cut_after_64_bytes(kind: type[bytes | bytearray | memoryview]) -> None:
     assert e.hex_excerpt(kind(b"")) == ""
     assert e.hex_excerpt(kind(b"\x01\xff")) == "01 ff"
     assert e.hex_excerpt(kind(bytes(64))) == " ".join(["00"] * 64)

@@ -50,13 +50,7 @@ POSE_JSON = {
     "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
 }
 ACCOUNT = SubscriberStatistics(
-    name="results",
-    policy="drop_oldest",
-    offered=3,
-    taken=1,
-    dropped=1,
-    queued=1,
-    queued_bytes=40,
+    name="results", policy="drop_oldest", offered=3, taken=1, dropped=1, queued=1, queued_bytes=40
 )
 
 

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 import smartcam
 from smartcam import Connected, Observer, Result, SmartCamError
-from smartcam._client.link import TraceEntry
-from smartcam.observers import Observers
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from smartcam.observers import Observers, TraceEntry
 
 AT = datetime(2024, 5, 1, tzinfo=UTC)
 FRAME = TraceEntry(AT, "press 4", ">", 0x40, "Trigger", {}, "00")
@@ -80,10 +77,7 @@ HOOKS: dict[str, tuple[Callable[[Observers], None], tuple[Any, ...]]] = {
     "frame": (_frame, (FRAME,)),
     "state": (lambda observers: observers.state(EVENT), (EVENT,)),
     "result": (lambda observers: observers.result(RESULT), (RESULT,)),
-    "error": (
-        lambda observers: observers.error("press 4", ERROR, AT),
-        ("press 4", ERROR, AT),
-    ),
+    "error": (lambda observers: observers.error("press 4", ERROR, AT), ("press 4", ERROR, AT)),
 }
 EACH = pytest.mark.parametrize("hook", HOOKS)
 

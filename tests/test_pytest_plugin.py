@@ -5,21 +5,18 @@ from __future__ import annotations
 import importlib
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from smartcam.registry import INTERPRETERS, PROTOCOLS
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytest_plugins = ["pytester"]
 
 # pytester forgets what a nested run imported, and the next one would make second copies of it
 _LOADED = [
     importlib.import_module(name)
-    for name in ("smartcam.client", "smartcam.testing.threads", "numpy", "yaml")
+    for name in ("smartcam.client", "smartcam.testing._threads", "numpy", "yaml")
 ]
 _PLUGINS = [one.load(info.name) for one in (INTERPRETERS, PROTOCOLS) for info in one.available()]
 
@@ -299,7 +296,7 @@ def test_suite_that_does_not_use_it_imports_nothing_heavy(tmp_path: Path) -> Non
     (tmp_path / "test_nothing.py").write_text(
         "import sys\n\ndef test_nothing():\n"
         "    heavy = {'asyncio', 'numpy', 'pydantic', 'construct', 'yaml', 'aiohttp',\n"
-        "        'smartcam.emulator', 'smartcam.client', 'smartcam.testing.threads'}\n"
+        "        'smartcam.emulator', 'smartcam.client', 'smartcam.testing._threads'}\n"
         "    assert 'smartcam.pytest_plugin' in sys.modules\n"
         "    assert heavy.isdisjoint(sys.modules)\n",
         encoding="utf-8",

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
 
 import pytest
 
 from smartcam.exceptions import PluginError
 from smartcam.interpreters import Reader, resolve, run
-from smartcam.interpreters.raw import Raw
+from smartcam.interpreters._basic import RawInterpreter
 from smartcam.registry import INTERPRETERS, PROTOCOLS, PluginInfo, Registry
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 GROUP = "smartcam.interpreters"
 BUILT_IN = ["localizations", "raw", "record", "strings50", "table"]
@@ -50,7 +48,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 def test_built_ins_are_listed_sorted() -> None:
     infos = INTERPRETERS.available()
     assert [info.name for info in infos if info.origin == "built-in"] == BUILT_IN
-    assert PluginInfo("raw", "smartcam.interpreters.raw:Raw", "built-in") in infos
+    assert PluginInfo("raw", "smartcam.interpreters._basic:RawInterpreter", "built-in") in infos
 
 
 @pytest.mark.parametrize("name", [*BUILT_IN, "Localizations", "50ByteStrings"])
@@ -91,7 +89,7 @@ def test_broken_plugin_costs_only_its_own_name(install: Install) -> None:
     with pytest.raises(PluginError, match="'mine' of first failed to load") as caught:
         INTERPRETERS.load("mine")
     assert isinstance(caught.value.__cause__, RuntimeError)
-    assert INTERPRETERS.load("raw") is Raw
+    assert INTERPRETERS.load("raw") is RawInterpreter
 
 
 def test_name_of_two_distributions_names_both(install: Install) -> None:
@@ -119,8 +117,8 @@ def test_refresh_looks_again(install: Install) -> None:
 
 
 def test_registry_without_aliases() -> None:
-    registry = Registry("smartcam.nothing", {"raw": "smartcam.interpreters.raw:Raw"})
-    assert registry.load("raw") is Raw
+    registry = Registry("smartcam.nothing", {"raw": "smartcam.interpreters._basic:RawInterpreter"})
+    assert registry.load("raw") is RawInterpreter
     assert [info.name for info in registry.available()] == ["raw"]
 
 
@@ -130,7 +128,7 @@ def test_plugin_that_ends_programs_is_a_plugin_error(install: Install, code: str
     with pytest.raises(PluginError, match="'mine' of first failed to load") as caught:
         resolve("mine")
     assert caught.value.__cause__ is not None
-    assert INTERPRETERS.load("raw") is Raw
+    assert INTERPRETERS.load("raw") is RawInterpreter
 
 
 def test_plugin_that_ends_programs_when_it_is_made_is_a_plugin_error(install: Install) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -11,18 +13,14 @@ from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, CameraOptions, CameraSettings, parse_address, validation_text
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
 ACME = """
 import dataclasses
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols.base import Protocol, Transport
-from smartcam.protocols.bvs import B16, HANDBOOK
-from smartcam.protocols.framed.dialect import FramedDialect
-from smartcam.protocols.framed.machine import Machine
+from smartcam.protocols._base import Protocol, Transport
+from smartcam.protocols._bvs import B16, HANDBOOK
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.machine import Machine
 
 PROTOCOL = Protocol(
     name="acme",
@@ -103,10 +101,7 @@ def provide(
         ("bvs://[fe80::1]:7?dialect=thesis", Address("bvs", "bvs", "fe80::1", 7, "thesis")),
         ("bvs://h?dialect=b16", Address("bvs", "bvs", "h", 36701, "b16")),
         ("bvs+udp://h?dialect=bid", Address("bvs", "bvs+udp", "h", 36701, "bid")),
-        (
-            "bvs://h?dialect=b16&quirks=code",
-            Address("bvs", "bvs", "h", 36701, "b16", ("code",)),
-        ),
+        ("bvs://h?dialect=b16&quirks=code", Address("bvs", "bvs", "h", 36701, "b16", ("code",))),
         (
             "bvs://h?quirks=no_id,%20code,,code&dialect=b16",
             Address("bvs", "bvs", "h", 36701, "b16", ("code", "no_id")),

@@ -14,13 +14,9 @@ import asyncio
 import selectors
 import socket
 import time
-from typing import TYPE_CHECKING, NoReturn, TypeVar, TypeVarTuple
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from concurrent.futures import Executor
-
-__all__ = ["TimedLoop", "spend"]
+from collections.abc import Callable
+from concurrent.futures import Executor
+from typing import NoReturn, TypeVar, TypeVarTuple
 
 Arguments = TypeVarTuple("Arguments")
 Value = TypeVar("Value")
@@ -94,10 +90,7 @@ class TimedLoop(asyncio.SelectorEventLoop):
         self._timed.now += seconds
 
     def run_in_executor(
-        self,
-        executor: Executor | None,
-        func: Callable[[*Arguments], Value],
-        *args: *Arguments,
+        self, executor: Executor | None, func: Callable[[*Arguments], Value], *args: *Arguments
     ) -> asyncio.Future[Value]:
         """Have a thread do something; the time is real until it is done."""
         done = super().run_in_executor(executor, func, *args)

@@ -5,21 +5,18 @@ from __future__ import annotations
 import shutil
 import struct
 import subprocess
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, TypeVar
 from xml.etree import ElementTree as ET
 
 import pytest
 
-from smartcam.dissector import lua_source
+from smartcam._dissector import lua_source
 from smartcam.models import Status
 from smartcam.protocols import messages as m
+from smartcam.protocols._framed.dialect import FramedDialect
 from smartcam.protocols.messages import Sender, UnknownMessage, wire_fields
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from smartcam.protocols.framed.dialect import FramedDialect
 
 PORT = 36701
 SECONDS = 300
@@ -42,16 +39,11 @@ def needs_tshark(test: TestT) -> TestT:
 
 
 class Capture:
-    """Packets in a file: raw IPv4 without check sums.
-
-    Args:
-        path: of the file.
-        camera: its port.
-    """
+    """Packets in a file: raw IPv4 without check sums."""
 
     def __init__(self, path: Path, camera: int = PORT) -> None:
         self.path = path
-        self._camera = camera
+        self._camera = camera  # its port
         self._numbers: dict[tuple[int, Sender], int] = {}
         self._time = 0
         path.write_bytes(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 101))
@@ -85,19 +77,13 @@ class Capture:
 
 
 class Shown(NamedTuple):
-    """One message, or bytes that make none, as Wireshark shows it.
+    """One message, or bytes that make none, as Wireshark shows it."""
 
-    Attributes:
-        packet: its packet's number.
-        ports: of the packet: source and target.
-        fields: value of each field by its name, without ``bvs.``; hex where it is bytes.
-        findings: names of the expert's findings.
-    """
-
-    packet: int
-    ports: tuple[int, int]
+    packet: int  # its packet's number
+    ports: tuple[int, int]  # of the packet: source and target
+    # value of each field by its name, without ``bvs.``; hex where it is bytes
     fields: dict[str, str]
-    findings: list[str]
+    findings: list[str]  # names of the expert's findings
 
     def message(self, dialect: FramedDialect) -> m.Message:
         """Return the message that these fields are."""

@@ -11,16 +11,13 @@ import socket
 import struct
 import sys
 import threading
-from typing import TYPE_CHECKING, Self
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Self
 from unittest import mock
 
-from processes import PATIENCE, Outcome, Process
-
-import smartcam.cli
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from pathlib import Path
+import smartcam._cli
+from tests.processes import PATIENCE, Outcome, Process
 
 CONNECT = bytes.fromhex("50535642 00000000 01000000")
 CONNECTED = bytes.fromhex("50535642 04000000 01000000 01000000")
@@ -97,7 +94,7 @@ def run(
         contextlib.redirect_stderr(err),
     ):
         try:
-            (main or smartcam.cli.main)()
+            (main or smartcam._cli.main)()
         except SystemExit as exc:
             code = exc.code if isinstance(exc.code, int) else 0
     out.seek(0)
@@ -129,7 +126,7 @@ def run_as_far_as(text: str, *args: str) -> Outcome:
 
 def run_emulator(*args: str) -> Outcome:
     """Run ``smartcam-emulator`` in this process, where it is to end by itself."""
-    return run(*args, program="smartcam-emulator", main=smartcam.cli.emulator_main)
+    return run(*args, program="smartcam-emulator", main=smartcam._cli.emulator_main)
 
 
 # ---------------------------------------------------------------------- cameras
@@ -153,16 +150,12 @@ def emulators(folder: Path, *options: tuple[str, ...]) -> Iterator[list[str]]:
 
 
 class Peer:
-    """Something at the other end that does exactly what a table says, on loopback TCP.
-
-    Args:
-        answers: what it sends for a whole frame; nothing for a frame that is not in it.
-        greeting: what it sends as soon as a connection is there.
-    """
+    """Something at the other end that does exactly what a table says, on loopback TCP."""
 
     def __init__(self, answers: Mapping[bytes, bytes] | None = None, greeting: bytes = b"") -> None:
+        # what it sends for a whole frame; nothing for a frame that is not in it
         self._answers = answers or {}
-        self._greeting = greeting
+        self._greeting = greeting  # what it sends as soon as a connection is there
         self._received = b""
         self._more = threading.Condition()
         self._closing = False

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from typing import TYPE_CHECKING, Self
+from collections.abc import Callable
+from typing import Self
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from smartcam.emulator import EmulatedCamera
+from smartcam.emulator import Device, EmulatedCamera
+from smartcam.models import Status
+from smartcam.protocols import messages as m
 
 MAGIC = bytes.fromhex("50535642")
 THESIS_MAGIC = bytes.fromhex("42565350")
@@ -216,3 +216,59 @@ class UdpClient:
         except BlockingIOError:
             return
         raise AssertionError(f"something came: {data.hex(' ')}")
+
+
+HELLO = (CONNECTED, NO_BIT)
+CLOCK_0 = bytes.fromhex(
+    "50535642 18000000 32000000 b2070000 01000000 01000000 00000000 00000000 00000000"
+)
+
+
+async def greet(client: TcpClient | RawClient | UdpClient) -> None:
+    """Connect to a camera with no status bit set; its answer and its status must come."""
+    client.send(CONNECT)
+    await client.expect(*HELLO)
+
+
+SHORT = {
+    Status.OVERHEAT: "hot",
+    Status.SYSTEM_ERROR: "error",
+    Status.INPUT_CONTAINER: "input",
+    Status.BUSY: "busy",
+    Status.RUNNING: "run",
+    Status.OVERTRIGGERED: "over",
+    Status.WAITING_FOR_TRIGGER: "wait",
+}
+
+
+def word(status: Status) -> str:
+    """Return a status as ``[run wait]``."""
+    return f"[{' '.join(name for bit, name in SHORT.items() if bit & status)}]"
+
+
+def heard(device: Device) -> list[str]:
+    """Take what the device said, one word a message."""
+    return [_short(message) for message in device.take_output()]
+
+
+def _short(message: m.Message) -> str:
+    match message:
+        case m.ConnectAnswer(version=version):
+            return f"hello {version}"
+        case m.StatusReport(status=status, endian=0):
+            return word(status)
+        case m.StatusReport(status=status, endian=endian):
+            return f"{word(status)} endian {endian}"
+        case m.ResultContainer(application=application, data=data):
+            return f"result {application} {data.hex()}"
+        case m.QueryAnswer(application=application):
+            return f"active {application}"
+        case m.SwitchAnswer(code=code, application=application):
+            return f"switched {code} {application}"
+        case m.ClockAnswer():
+            return (
+                f"{message.year}-{message.month}-{message.day} "
+                f"{message.hour}:{message.minute}:{message.second}"
+            )
+        case _:
+            raise AssertionError(f"a camera does not say {message}")

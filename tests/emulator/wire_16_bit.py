@@ -9,9 +9,8 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from camera_wire import TcpClient, UdpClient
-
 from smartcam.emulator import EmulatedCamera, ManualClock
+from tests.emulator.camera_wire import TcpClient, UdpClient
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

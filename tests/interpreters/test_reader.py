@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from contextlib import nullcontext
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve, run
-from smartcam.interpreters.base import plain, run_plain
-from smartcam.interpreters.table import Table
+from smartcam.interpreters._base import plain, run_plain
+from smartcam.interpreters._basic import TableInterpreter
 from smartcam.layout import Layout
-
-if TYPE_CHECKING:
-    from smartcam.models import ByteOrder
+from smartcam.models import ByteOrder
 
 NUMBERS = {
     "int8": ("b", -5),
@@ -192,7 +190,7 @@ def test_built_in_interpreters_of_bytes_alone_are_plain(spec: str) -> None:
 
 
 def test_table_that_is_read_otherwise_is_read_so_in_bursts() -> None:
-    class Count(Table):
+    class Count(TableInterpreter):
         def read(self, data: bytes, context: Context) -> Any:
             return len(super().read(data, context))
 
@@ -200,15 +198,15 @@ def test_table_that_is_read_otherwise_is_read_so_in_bursts() -> None:
         def read(self, data: bytes, context: Context) -> int:
             return 7
 
-    class Mixed(Fixed, Table): ...  # type: ignore[misc]
+    class Mixed(Fixed, TableInterpreter): ...  # type: ignore[misc]
 
     layout = Layout("(a: int16)*")
     assert Mixed(layout).read_all([bytes(4), bytes(6)], Context()) == [7, 7]
     assert Count(layout).read_all([bytes(4), bytes(6)], Context()) == [2, 3]
-    tables = Table(layout).read_all([bytes(4), b"", b"\1\0"], Context())
+    tables = TableInterpreter(layout).read_all([bytes(4), b"", b"\1\0"], Context())
     assert [table.tolist() for table in tables] == [[(0,), (0,)], [], [(1,)]]
     with pytest.raises(InterpretationError):
-        Table(layout).read_all([bytes(4), bytes(3)], Context())
+        TableInterpreter(layout).read_all([bytes(4), bytes(3)], Context())
 
 
 def test_interpreters_of_a_reader_have_no_plain_way() -> None:

@@ -1,6 +1,6 @@
 """Every coroutine of a camera, cancelled after 0, 1, 2 ... loop steps: what is left behind?
 
-Long form: ``python tests/proofs/cancel_sweep.py`` (every step of every call, on every wire).
+Long form: ``python -m tests.proofs.cancel_sweep`` (every step of every call, on every wire).
 
 Each cancellation has a camera and a client of its own, over the loopback. Time is the loop's: each
 of its steps takes a millisecond, so inspections, loads and graces are steps too and a sweep goes
@@ -18,30 +18,20 @@ import logging
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
-
-if __name__ == "__main__":  # the loop is the tests', too
-    sys.path.append(str(Path(__file__).parent.parent))
-
-from timed_loop import TimedLoop
+from typing import Any, Literal, NamedTuple
 
 import smartcam
 from smartcam import Backoff, LinkError, ResponseTimeoutError, SmartCamera, Status
 from smartcam.emulator import EmulatedCamera
-from smartcam.emulator.bvs.device import Mode
+from smartcam.emulator._bvs.device import Mode
+from smartcam.emulator._generators import Run
 from smartcam.protocols import messages as m
 from smartcam.streams import Subscription
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator
-
-    from smartcam.emulator.generators import Run
-    from smartcam.models import Statistics
-
-__all__ = ["CALLS", "WIRES", "Sweep", "Wire", "calls_over", "missing_calls", "run_sweep"]
+from tests.client.clientkit import balance
+from tests.timed_loop import TimedLoop
 
 STEP = 0.001
 """Seconds that a step of the loop takes."""
@@ -60,19 +50,12 @@ HOME, AWAY, PAIRS = 7, 3, 5
 
 
 class Wire(NamedTuple):
-    """How client and camera speak.
+    """How client and camera speak."""
 
-    Attributes:
-        transport: of the camera.
-        dialect: of the camera.
-        numbered: the client's layout has an ``@sequence`` field.
-        quirks: of the camera.
-    """
-
-    transport: Literal["tcp", "udp"] = "tcp"
-    dialect: str = "handbook"
-    numbered: bool = False
-    quirks: tuple[tuple[str, Any], ...] = ()
+    transport: Literal["tcp", "udp"] = "tcp"  # of the camera
+    dialect: str = "handbook"  # of the camera
+    numbered: bool = False  # the client's layout has an ``@sequence`` field
+    quirks: tuple[tuple[str, Any], ...] = ()  # of the camera
 
     def __str__(self) -> str:
         """Return what is special about it."""
@@ -117,39 +100,25 @@ class Bench(NamedTuple):
 
 @dataclass(frozen=True)
 class Call:
-    """A call to be cancelled.
+    """A call to be cancelled."""
 
-    Attributes:
-        make: the call; what it starts beside itself, it ends itself.
-        covers: names of the methods that it is about.
-        before: what happens before it.
-        homes: applications that may be active afterwards.
-        loses: the link may be lost by it.
-        stops: the camera may be stopped afterwards.
-        raises: what it ends with if nobody cancels it.
-        owes: what stays owed for good if it is cancelled: an answer that never comes.
-        meddled: somebody else switches the camera meanwhile, which the client is to see first.
-        running: whether the camera runs at first.
-        opened: whether the client is open at first.
-        options: of the client.
-        pinned: whether the client is told the dialect.
-        dialects: that have it.
-    """
-
+    # the call; what it starts beside itself, it ends itself
     make: Callable[[Bench], Coroutine[Any, Any, object]]
-    covers: tuple[str, ...]
-    before: Callable[[Bench], Coroutine[Any, Any, object]] | None = None
-    homes: frozenset[int] = frozenset({HOME})
-    loses: bool = False
-    stops: bool = False
-    raises: tuple[type[BaseException], ...] = ()
+    covers: tuple[str, ...]  # names of the methods that it is about
+    before: Callable[[Bench], Coroutine[Any, Any, object]] | None = None  # what happens before it
+    homes: frozenset[int] = frozenset({HOME})  # applications that may be active afterwards
+    loses: bool = False  # the link may be lost by it
+    stops: bool = False  # the camera may be stopped afterwards
+    raises: tuple[type[BaseException], ...] = ()  # what it ends with if nobody cancels it
+    # what stays owed for good if it is cancelled: an answer that never comes
     owes: frozenset[int] = frozenset()
+    # somebody else switches the camera meanwhile, which the client is to see first
     meddled: bool = False
-    running: bool = True
-    opened: bool = True
-    options: dict[str, Any] = field(default_factory=dict[str, Any])
-    pinned: bool = True
-    dialects: frozenset[str] = SMART | ID
+    running: bool = True  # whether the camera runs at first
+    opened: bool = True  # whether the client is open at first
+    options: dict[str, Any] = field(default_factory=dict[str, Any])  # of the client
+    pinned: bool = True  # whether the client is told the dialect
+    dialects: frozenset[str] = SMART | ID  # that have it
 
 
 # ---------------------------------------------------------------------- calls
@@ -273,15 +242,19 @@ MAPPING = {HOME: NUMBERED, AWAY: PLAIN, PAIRS: "raw"}
 BOTH = frozenset({HOME, AWAY})
 TRIGGER = ("trigger",)
 
+
+def asked(method: str, *args: Any, **more: Any) -> Call:
+    """Return the call of one of the camera's methods."""
+    return Call(lambda b: getattr(b.camera, method)(*args), (method,), **more)
+
+
 CALLS: dict[str, Call] = {
-    "trigger": Call(lambda b: b.camera.trigger(), TRIGGER),
+    "trigger": asked("trigger"),
     "trigger with input": Call(lambda b: b.camera.trigger(input=bytes(4)), TRIGGER),
-    "trigger here": Call(lambda b: b.camera.trigger(HOME), TRIGGER),
-    "trigger elsewhere": Call(lambda b: b.camera.trigger(AWAY), TRIGGER),
+    "trigger here": asked("trigger", HOME),
+    "trigger elsewhere": asked("trigger", AWAY),
     "trigger elsewhere with input": Call(lambda b: b.camera.trigger(AWAY, input=bytes(4)), TRIGGER),
-    "trigger nowhere": Call(
-        lambda b: b.camera.trigger(99), TRIGGER, raises=(smartcam.CommandRejectedError,)
-    ),
+    "trigger nowhere": asked("trigger", 99, raises=(smartcam.CommandRejectedError,)),
     "trigger read otherwise": Call(lambda b: b.camera.trigger(interpret_as=NUMBERED), TRIGGER),
     "trigger read by application": Call(lambda b: b.camera.trigger(interpret_as=MAPPING), TRIGGER),
     "trigger read wrongly": Call(
@@ -290,65 +263,44 @@ CALLS: dict[str, Call] = {
         raises=(smartcam.InterpretationError,),
     ),
     "trigger for two": Call(pair, TRIGGER),
-    "trigger from standstill": Call(
-        lambda b: b.camera.trigger(HOME), TRIGGER, running=False, dialects=SMART
-    ),
-    "trigger elsewhere from standstill": Call(
-        lambda b: b.camera.trigger(AWAY), TRIGGER, running=False, dialects=SMART
-    ),
-    "trigger after one dropped": Call(lambda b: b.camera.trigger(), TRIGGER, before=dropped),
+    "trigger from standstill": asked("trigger", HOME, running=False, dialects=SMART),
+    "trigger elsewhere from standstill": asked("trigger", AWAY, running=False, dialects=SMART),
+    "trigger after one dropped": asked("trigger", before=dropped),
     "trigger beside another": Call(beside_another, TRIGGER),
     "triggers at once": Call(at_once, TRIGGER),
-    "trigger after one given up": Call(lambda b: b.camera.trigger(), TRIGGER, before=give_up),
-    "trigger elsewhere after one given up": Call(
-        lambda b: b.camera.trigger(AWAY), TRIGGER, before=give_up
-    ),
-    "trigger after one cancelled": Call(
-        lambda b: b.camera.trigger(), TRIGGER, before=lose_interest
-    ),
-    "trigger elsewhere after one cancelled": Call(
-        lambda b: b.camera.trigger(AWAY), TRIGGER, before=lose_interest
-    ),
+    "trigger after one given up": asked("trigger", before=give_up),
+    "trigger elsewhere after one given up": asked("trigger", AWAY, before=give_up),
+    "trigger after one cancelled": asked("trigger", before=lose_interest),
+    "trigger elsewhere after one cancelled": asked("trigger", AWAY, before=lose_interest),
     "trigger that gives up": Call(give_up, TRIGGER),
-    "switch_application": Call(
-        lambda b: b.camera.switch_application(AWAY), ("switch_application",), homes=BOTH, stops=True
-    ),
-    "switch_application nowhere": Call(
-        lambda b: b.camera.switch_application(99),
-        ("switch_application",),
-        raises=(smartcam.CommandRejectedError,),
-        stops=True,
+    "switch_application": asked("switch_application", AWAY, homes=BOTH, stops=True),
+    "switch_application nowhere": asked(
+        "switch_application", 99, raises=(smartcam.CommandRejectedError,), stops=True
     ),
     "application": Call(in_application, ("application",)),
     "application that fails": Call(in_application_that_fails, ("application",)),
     "application from standstill": Call(
         in_application, ("application",), running=False, dialects=SMART
     ),
-    "start": Call(lambda b: b.camera.start(), ("start",), running=False, dialects=SMART),
-    "stop": Call(lambda b: b.camera.stop(), ("stop",), stops=True, dialects=SMART),
-    "query_application": Call(lambda b: b.camera.query_application(), ("query_application",)),
-    "query_status": Call(lambda b: b.camera.query_status(), ("query_status",), dialects=ID),
+    "start": asked("start", running=False, dialects=SMART),
+    "stop": asked("stop", stops=True, dialects=SMART),
+    "query_application": asked("query_application"),
+    "query_status": asked("query_status", dialects=ID),
     "reset_errors": Call(reset, ("reset_errors",), before=dropped, dialects=ID),
-    "read_image": Call(
-        lambda b: b.camera.read_image(), ("read_image",), raises=(smartcam.UnsupportedError,)
-    ),
-    "get_clock": Call(lambda b: b.camera.get_clock(), ("get_clock",)),
+    "read_image": asked("read_image", raises=(smartcam.UnsupportedError,)),
+    "get_clock": asked("get_clock"),
     "set_clock": Call(
         lambda b: b.camera.set_clock(datetime(2024, 1, 1)),  # noqa: DTZ001 - it has no zone
         ("set_clock",),
     ),
-    "set_input": Call(lambda b: b.camera.set_input(bytes(4)), ("set_input",)),
-    "set_sequence_number": Call(
-        lambda b: b.camera.set_sequence_number(1000), ("set_sequence_number",), dialects=SMART
-    ),
+    "set_input": asked("set_input", bytes(4)),
+    "set_sequence_number": asked("set_sequence_number", 1000, dialects=SMART),
     "wait_status": Call(status_of_a_run, ("wait_status",)),
     "wait_ready": Call(ready_after_a_switch, ("wait_ready",), homes=BOTH, meddled=True),
-    "wait_connected": Call(
-        lambda b: b.camera.wait_connected(), ("wait_connected",), before=lost, loses=True
-    ),
+    "wait_connected": asked("wait_connected", before=lost, loses=True),
     "next_result": Call(sensed, ("next_result",)),
     "streams": Call(streams, ("__anext__", "__aenter__", "__aexit__")),
-    "request": Call(lambda b: b.camera.request(0x32), ("request",)),
+    "request": asked("request", 0x32),
     "request without an answer": Call(
         lambda b: b.camera.request(0x32, answered=False), ("request",)
     ),
@@ -363,10 +315,8 @@ CALLS: dict[str, Call] = {
     "request that nobody knows": Call(
         lambda b: b.camera.request(0x77, timeout=30 * STEP), ("request",), dialects=ID
     ),
-    "reboot": Call(
-        lambda b: b.camera.reboot(), ("reboot",), loses=True, stops=True, dialects=SMART
-    ),
-    "open": Call(lambda b: b.camera.open(), ("open",), opened=False),
+    "reboot": asked("reboot", loses=True, stops=True, dialects=SMART),
+    "open": asked("open", opened=False),
     "open for an application": Call(
         lambda b: b.camera.open(),
         ("__aenter__", "__await__"),
@@ -375,24 +325,13 @@ CALLS: dict[str, Call] = {
         stops=True,
         options={"application": AWAY},
     ),
-    "open from standstill": Call(
-        lambda b: b.camera.open(),
-        ("open",),
-        opened=False,
-        running=False,
-        options={"application": HOME},
-        dialects=SMART,
+    "open from standstill": asked(
+        "open", opened=False, running=False, options={"application": HOME}, dialects=SMART
     ),
-    "open without a dialect": Call(
-        lambda b: b.camera.open(), ("open",), opened=False, pinned=False
-    ),
+    "open without a dialect": asked("open", opened=False, pinned=False),
     "close": Call(lambda b: b.camera.close(), ("close", "__aexit__")),
-    "close behind a way back": Call(
-        lambda b: b.camera.close(),
-        ("close",),
-        before=lambda b: abandoned(b),
-        stops=True,
-        homes=BOTH,
+    "close behind a way back": asked(
+        "close", before=lambda b: abandoned(b), stops=True, homes=BOTH
     ),
 }
 
@@ -444,9 +383,7 @@ def run_sweep(name: str, wire: Wire, every: int = 1) -> Sweep:
     """Cancel a call after 0, ``every``, 2 * ``every`` ... steps until it is over before that.
 
     Each is done twice: a trigger is the first thing afterwards, or a look at the camera's state.
-
-    Raises:
-        AssertionError: something was left behind; the notes say where.
+    The notes of an AssertionError say where something was left behind.
     """
     ends: Counter[str] = Counter()
     for steps, checks in itertools.product(
@@ -576,7 +513,7 @@ async def _check_client(bench: Bench, call: Call, checks: Checks) -> None:
         else:
             raise AssertionError("the link is lost again and again")
     _check_waiters(bench.camera)
-    _check_balance(bench.camera.statistics())
+    balance(bench.camera.statistics())
 
 
 async def _check_state(bench: Bench, call: Call) -> None:
@@ -585,16 +522,16 @@ async def _check_state(bench: Bench, call: Call) -> None:
     while device.processing or device.mode in {Mode.SWITCHING, Mode.REBOOTING}:  # noqa: ASYNC110
         await asyncio.sleep(0)
     await camera.wait_connected()
-    async with camera._turns.hold(BOUND):  # behind every way back
-        active = await camera._talk.query(camera._talk.deadline(BOUND))
+    async with camera._lock.hold(BOUND):  # behind every way back
+        active = await camera._commands.query(camera._connection.deadline(BOUND))
     assert active == camera.active_application == device.active_application
     assert active in call.homes
-    assert camera._inbox.expected in {None, active}
+    assert camera._state.wanted.application in {None, active}
     if not camera.capabilities.status_by_itself:
         await camera.query_status()
     bits = bench.box.spoken.status_bits
     assert camera.status == bits.read(bits.write(device.status))
-    while not camera._inbox.answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
+    while not camera._waits._answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
         await asyncio.sleep(0)
 
 
@@ -640,32 +577,18 @@ def _expected(kind: type[BaseException]) -> Iterator[None]:
 
 def _check_waiters(camera: SmartCamera) -> None:
     """Assert that nobody is left who waits, and no turn is held."""
-    inbox, turns = camera._inbox, camera._turns
-    assert inbox.attribution.pending is None
-    assert not inbox._status_waiters
-    assert not [future for future in inbox.next_results if not future.done()]
-    assert not turns._leaving
-    assert not turns._lock.locked()
+    lock, listeners = camera._lock, camera._listeners
+    assert camera._results.correlation.pending is None
+    assert not camera._waits._statuses
+    assert not [future for future in listeners._next_results if not future.done()]
+    assert not lock._leaving
+    assert not lock._lock.locked()
     names = [task.get_name() for task in asyncio.all_tasks()]
     ours = [name for name in names if name.startswith("smartcam[")]
     assert sorted(ours) == [
-        f"smartcam[{camera._talk.name}].receive",
+        f"smartcam[{camera.name}].receive",
         f"smartcam[{camera.settings.address.host}].supervisor",
     ]
-
-
-def _check_balance(statistics: Statistics) -> None:
-    fates = (
-        statistics.triggered
-        + statistics.streamed
-        + statistics.late
-        + statistics.wrong_application
-        + statistics.uninterpretable
-        + statistics.unclaimed
-    )
-    assert statistics.received == fates
-    for one in statistics.subscribers:
-        assert one.offered == one.taken + one.dropped + one.queued
 
 
 async def _check_closed(camera: SmartCamera) -> None:
@@ -685,7 +608,7 @@ async def _check_nothing_left(bench: Bench) -> None:
     assert not [t for t in asyncio.all_tasks() if t.get_name().startswith("smartcam[")]
     session = camera._supervisor.session
     assert session is None or session.link._transport.is_closing()
-    _check_balance(camera.statistics())
+    balance(camera.statistics())
 
 
 # ---------------------------------------------------------------------- long form

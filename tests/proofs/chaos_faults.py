@@ -5,20 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from collections.abc import Callable, Coroutine, Sequence
+from random import Random
+from typing import Any, Literal, Protocol
 
+from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.models import Status
-from smartcam.testing.proxy import rules
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Sequence
-    from random import Random
-
-    from smartcam.emulator import EmulatedCamera
-    from smartcam.testing import LinkProxy
-
-__all__ = ["TCP_FAULTS", "UDP_FAULTS", "Victim", "heal"]
+from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import _rules as rules
 
 CAMERA_MESSAGES = ("StatusReport", "ResultContainer", "QueryAnswer", "SwitchAnswer", "ClockAnswer")
 CLIENT_MESSAGES = ("Trigger", "SetSequenceNumber", "Query", "Stop", "Start", "SwitchApplication")
@@ -32,9 +27,7 @@ class Victim(Protocol):
     sets_number: bool
 
     @property
-    def emulator(self) -> EmulatedCamera:
-        """The camera."""
-        ...
+    def emulator(self) -> EmulatedCamera: ...
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
         """Do something then, unless the soak is over."""
@@ -75,12 +68,12 @@ def _bad_link(victim: Victim, chance: Random) -> None:
     """The next links are slow, cut into pieces, or break in the middle of a frame."""
     chosen: Sequence[rules.Rule] = chance.choice(
         [
-            [rules.Delay(seconds=0.002, jitter=0.01, seed=chance.randrange(1000))],
-            [rules.Split(at=at) for at in sorted(chance.sample(range(1, 400), 20))],
+            [rules.DelayBytes(seconds=0.002, jitter=0.01, seed=chance.randrange(1000))],
+            [rules.SplitBytes(at=at) for at in sorted(chance.sample(range(1, 400), 20))],
             [rules.Drip(count=200)],
-            [rules.Coalesce(at=chance.randrange(60, 200), size=100, seconds=0.05)],
+            [rules.CoalesceBytes(at=chance.randrange(60, 200), size=100, seconds=0.05)],
             [rules.Rate(bytes_per_second=20_000)],
-            [rules.Reset(at=chance.randrange(24, 600))],
+            [rules.ResetConnection(at=chance.randrange(24, 600))],
             [rules.Cut(at=chance.randrange(24, 600))],
             [rules.Stall(at=chance.randrange(60, 600), both=True)],
         ]
@@ -178,16 +171,16 @@ def _duplicate(victim: Victim, chance: Random) -> None:
 
 
 def _reboot(victim: Victim, chance: Random) -> None:
-    victim.emulator.inject(f.Reboot(seconds=chance.uniform(0.1, 0.5)))
+    victim.emulator.inject(f.PowerCycle(seconds=chance.uniform(0.1, 0.5)))
 
 
 def _operator(victim: Victim, chance: Random) -> None:
     application = chance.choice([1, 2, 3])
     choices: tuple[f.Fault, ...] = (
-        f.Stop(),
-        f.Start(),
-        f.SwitchApplication(application=application, running=True),
-        f.SwitchApplication(application=application),
+        f.OperatorStop(),
+        f.OperatorStart(),
+        f.OperatorSwitch(application=application, running=True),
+        f.OperatorSwitch(application=application),
     )
     victim.emulator.inject(chance.choice(choices))
 

@@ -3,7 +3,7 @@
 No result may be another trigger's, every container must be accounted for, every wait must end in
 time, and neither memory nor tasks may grow.
 
-Long form: ``python tests/proofs/chaos_soak.py --cameras 20 --seconds 600 --seed 1`` (prints its
+Long form: ``python -m tests.proofs.chaos_soak --cameras 20 --seconds 600 --seed 1`` (prints its
 figures, exit 1 on a violation).
 """
 
@@ -15,20 +15,15 @@ import ctypes
 import gc
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from statistics import fmean
-from typing import TYPE_CHECKING
 
-if __name__ == "__main__":  # the wire is another camera's, too
-    sys.path.append(str(Path(__file__).parent.parent))
-
-from chaos_faults import TCP_FAULTS, UDP_FAULTS
-from chaos_station import Station, Watch
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from tests.client.clientkit import loop_reports
+from tests.proofs.chaos_faults import TCP_FAULTS, UDP_FAULTS
+from tests.proofs.chaos_station import Station, Watch
 
 SAMPLES = 40
 """How often memory and tasks are looked at."""
@@ -45,48 +40,33 @@ MORE_TASKS = 1.2
 
 @dataclass(slots=True)
 class Soak:
-    """What came of it.
-
-    Attributes:
-        watch: counts and violations.
-        faults: how often each was done.
-        memory: resident MB, sample by sample.
-        blocks: blocks of memory that Python has in use.
-        tasks: how many there were.
-        sent, received, lost: containers, by transport.
-    """
+    """What came of it."""
 
     cameras: int
     seconds: float
-    watch: Watch = field(default_factory=Watch)
-    faults: Counter[str] = field(default_factory=Counter)
-    memory: list[float] = field(default_factory=list)
-    blocks: list[int] = field(default_factory=list)
-    tasks: list[int] = field(default_factory=list)
+    watch: Watch = field(default_factory=Watch)  # counts and violations
+    faults: Counter[str] = field(default_factory=Counter)  # how often each was done
+    memory: list[float] = field(default_factory=list)  # resident MB, sample by sample
+    blocks: list[int] = field(default_factory=list)  # blocks of memory that Python has in use
+    tasks: list[int] = field(default_factory=list)  # how many there were
+    # containers, by transport
     sent: Counter[str] = field(default_factory=Counter)
     received: Counter[str] = field(default_factory=Counter)
     lost: Counter[str] = field(default_factory=Counter)
 
 
 async def soak(cameras: int, seconds: float, seed: int, *, interval: float = 1.0) -> Soak:
-    """Run it.
+    """Run it, every fourth camera over UDP; ``interval`` is the mean time between two faults.
 
-    Args:
-        cameras: how many; every fourth over UDP.
-        seconds: how long.
-        seed: of the chance; the network's and the system's own is beside it.
-        interval: mean time between two faults, seconds.
+    The network's and the system's own chance is beside that of the seed.
     """
     chance = Random(seed)  # noqa: S311
     made = Soak(cameras, seconds)
-    loop = asyncio.get_running_loop()
     before = asyncio.all_tasks()
-    handler = loop.get_exception_handler()
-    loop.set_exception_handler(lambda _, context: made.watch.complain(f"unheard: {context}"))
-    try:
+    with loop_reports() as reports:
         await _run(made, chance, interval)
-    finally:
-        loop.set_exception_handler(handler)
+    for text in reports:
+        made.watch.complain(f"unheard: {text}")
     for _ in range(100):
         if not asyncio.all_tasks() - before:
             break
@@ -107,17 +87,16 @@ async def _run(made: Soak, chance: Random, interval: float) -> None:
         await station.open()
     workers = [asyncio.create_task(one.work(), name=f"{one.name} work") for one in stations]
     beside = [
-        asyncio.create_task(watch.measure_lag()),
         asyncio.create_task(_harm(made, stations, chance, interval)),
         asyncio.create_task(_sample(made, stations)),
     ]
     await asyncio.wait(beside, timeout=made.seconds, return_when=asyncio.FIRST_COMPLETED)
-    for task in beside[1:]:
+    for task in beside:
         task.cancel()
     for station in stations:
         station.stop()
     _, hanging = await asyncio.wait(workers, timeout=120)
-    beside[0].cancel()
+    watch.lag.stop()
     await asyncio.wait(beside)
     for task in (*beside, *workers):
         if task.done() and not task.cancelled() and task.exception() is not None:
@@ -212,7 +191,7 @@ def report(made: Soak) -> str:
         f"memory: {memory[0]:.1f} MB in the first quarter, {memory[1]:.1f} MB in the last",
         f"blocks in use: {blocks[0]:.0f} in the first quarter, {blocks[1]:.0f} in the last",
         f"tasks: {tasks[0]:.1f} in the first quarter, {tasks[1]:.1f} in the last",
-        f"loop late by {1000 * watch.longest_lag:.0f} ms at most; "
+        f"loop late by {1000 * watch.lag.worst:.0f} ms at most; "
         f"no wait more than {1000 * max(0.0, watch.worst):.0f} ms beyond its timeout and the lag",
     ]
     lines += [f"  {name}: {count}" for name, count in sorted(watch.counts.items())]

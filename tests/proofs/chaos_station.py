@@ -6,36 +6,34 @@ import asyncio
 import contextlib
 import random
 import socket
-from collections import Counter, deque
+from collections import Counter
+from collections.abc import Awaitable, Callable, Coroutine
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
-
-from chaos_faults import heal
-from chaos_ledger import NOBODY, RECORD, ClientEar, Ledger
-from late_storm import OUTCOMES
+from random import Random
+from typing import Any, Literal, TypeVar
 
 import smartcam
 from smartcam import exceptions
 from smartcam.backoff import Backoff
-from smartcam.emulator import Application, EmulatedCamera
-from smartcam.protocols import messages as m
+from smartcam.client import SmartCamera
+from smartcam.models import Result, Statistics
+from smartcam.streams import Subscription
 from smartcam.testing import LinkProxy
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine
-    from random import Random
-
-    from smartcam.client import SmartCamera
-    from smartcam.emulator import Run
-    from smartcam.emulator.links import Link
-    from smartcam.models import Result, Statistics
-    from smartcam.streams import Subscription
-
-__all__ = ["Station", "Watch"]
+from tests.client.clientkit import imbalances
+from tests.proofs.books import (
+    LINK_LOST,
+    NOBODY,
+    RECORD,
+    TRIGGER_OUTCOMES,
+    BookKeeper,
+    ClientEar,
+    LagProbe,
+    Ledger,
+)
+from tests.proofs.chaos_faults import heal
 
 T = TypeVar("T")
 
-LAYOUT = "serial: int32, tag: int32, number: int32{mark}, token: int32, application: int32"
 TRIGGERED, OTHER, READING, FREE = 1, 2, 3, 4
 """Applications: two that are triggered, one that reads input data too, one that runs free."""
 
@@ -47,34 +45,22 @@ TIMES = {"connect": 3.0, "switch": 1.5, "request": 0.5, "close": 0.3, "liveness"
 ALLOWANCE = 0.1
 """Seconds that a wait may take longer than its timeout beside the loop's own lag."""
 
-LINKS = (
-    exceptions.ConnectionLostError,
-    exceptions.ConnectionTakenError,
-    exceptions.ConnectFailedError,
-    exceptions.ConnectionClosedError,
-)
-EXPECTED = (*OUTCOMES, *LINKS, exceptions.ResponseTimeoutError)
+RECENT, RECENT_WIDTH = 40, 120
+"""Frames that are shown beside a violation, and characters of each."""
+
+LINKS = (*LINK_LOST, exceptions.ConnectFailedError)
+EXPECTED = (*TRIGGER_OUTCOMES, *LINKS, exceptions.ResponseTimeoutError)
 """What any call may end with here."""
 
 
 class Watch:
-    """What all stations report to.
-
-    Attributes:
-        counts: how often things happened.
-        violations: what must not be, in words; the first hundred.
-        worst: the longest that a wait took beyond its timeout and the lag, seconds.
-        lags: when, and how late the loop was then; the last quarter of a minute.
-        longest_lag: of all, seconds.
-    """
+    """What all stations report to."""
 
     def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self.violations: list[str] = []
-        self.worst = 0.0
-        self.lags: deque[tuple[float, float]] = deque(maxlen=1500)
-        self.longest_lag = 0.0
-        self._due = float("inf")
+        self.counts: Counter[str] = Counter()  # how often things happened
+        self.violations: list[str] = []  # what must not be, in words; the first hundred
+        self.worst = 0.0  # the longest that a wait took beyond its timeout and the lag, seconds
+        self.lag = LagProbe()  # says how late the loop is
 
     def complain(self, text: str) -> None:
         """Note a violation."""
@@ -82,94 +68,9 @@ class Watch:
         if len(self.violations) < 100:
             self.violations.append(text)
 
-    def lag_since(self, begun: float) -> float:
-        """Return how long the loop was late since then, all in all, seconds."""
-        lost = max(0.0, asyncio.get_running_loop().time() - max(self._due, begun))
-        for at, lag in reversed(self.lags):
-            if at < begun:
-                break
-            lost += min(lag, at - begun)
-        return lost
-
-    async def measure_lag(self, step: float = 0.01) -> None:
-        """Note how late timers are; for ever."""
-        while True:
-            self._due = asyncio.get_running_loop().time() + step
-            await asyncio.sleep(step)
-            now = asyncio.get_running_loop().time()
-            self.lags.append((now, now - self._due))
-            self.longest_lag = max(self.longest_lag, now - self._due)
-
-
-class TellingEmulator(EmulatedCamera):
-    """An emulated camera whose containers say which trigger began their run.
-
-    A trigger's tag is the sequence number that was set before it.
-
-    Attributes:
-        told: the number that was set and that no trigger has used.
-    """
-
-    def __init__(self, *, numbered: bool, **options: Any) -> None:
-        self.told = NOBODY
-        self._tag = NOBODY
-        self._serial = 0
-        layout = LAYOUT.format(mark=" @sequence" if numbered else "")
-        times = {TRIGGERED: 0.02, OTHER: 0.01, READING: 0.015, FREE: 0.002}
-        super().__init__(
-            [
-                Application(
-                    id=number,
-                    layout=layout,
-                    generator=self._values,
-                    parameters={"application": number},
-                    processing_time=seconds,
-                    load_time=0.03,
-                    rate=30 if number == FREE else None,
-                    input="token: int32" if number == READING else None,
-                )
-                for number, seconds in times.items()
-            ],
-            builtins=False,
-            running=True,
-            **options,
-        )
-
-    def received(self, link: Link, message: m.Message) -> None:
-        """Note whose the run is that a trigger begins."""
-        idle = not self.device.processing
-        if isinstance(message, m.SetSequenceNumber):
-            self.told = message.number
-        super().received(link, message)
-        if isinstance(message, m.Trigger):
-            tag, self.told = self.told, NOBODY
-            if idle and self.device.processing:
-                self._tag = tag
-
-    def trigger(self) -> None:
-        """Trigger by the digital input."""
-        if self.device.trigger():
-            self._tag = NOBODY
-
-    def _values(self, run: Run) -> dict[str, int]:
-        self._serial += 1
-        return {
-            "serial": self._serial,
-            "tag": self._tag,
-            "number": run.number & 0x7FFFFFFF,
-            "token": 0 if run.input is None else run.input["token"],
-            "application": run.parameters["application"],
-        }
-
 
 class Station:
-    """One camera, its link and its client, at work until told to stop.
-
-    Args:
-        number: of the camera.
-        watch: what to report to.
-        chance: decides what is done.
-    """
+    """One camera, its link and its client, at work until told to stop."""
 
     def __init__(self, number: int, watch: Watch, chance: Random) -> None:
         self.transport: Literal["tcp", "udp"] = "udp" if number % 4 == 3 else "tcp"
@@ -178,8 +79,18 @@ class Station:
         # who sets a run's number himself must be the only one that triggers
         self.sets_number = number % 4 in {1, 2}
         self.watch = watch
-        self._emulator = TellingEmulator(
-            numbered=self.numbered,
+        times = {TRIGGERED: 0.02, OTHER: 0.01, READING: 0.015, FREE: 0.002}
+        self._emulator = BookKeeper(
+            {
+                number: {
+                    "processing_time": seconds,
+                    "load_time": 0.03,
+                    "rate": 30 if number == FREE else None,
+                    "input": "token: int32" if number == READING else None,
+                }
+                for number, seconds in times.items()
+            },
+            marked=self.numbered,
             port=free_port(self.transport),
             transport=self.transport,
             dialect="thesis" if number % 4 == 1 else "handbook",
@@ -203,10 +114,10 @@ class Station:
         self._heard = False
         self._named = number % 3 == 1
         self._group = contextlib.AsyncExitStack()
-        self._ear = ClientEar(self.ledger)
+        self._ear = ClientEar()
 
     @property
-    def emulator(self) -> TellingEmulator:
+    def emulator(self) -> BookKeeper:
         """The camera."""
         return self._emulator
 
@@ -281,7 +192,8 @@ class Station:
             await asyncio.sleep(0.01)
 
     async def _one_client(self) -> None:
-        ear = self._ear = ClientEar(self.ledger)
+        ear = self._ear = ClientEar(keep=RECENT)
+        ear.at_container = self.ledger.on_received
         client = smartcam.connect(
             self.proxy.url(self.emulator.url),
             observers=[ear],
@@ -320,13 +232,11 @@ class Station:
         self._audit(client.statistics(), ear)
 
     def _interpretation(self) -> Any:
-        layout = LAYOUT.format(mark=" @sequence" if self.numbered else "")
-        if self._named:
-            return dict.fromkeys((TRIGGERED, OTHER, READING, FREE), layout)
-        return layout
+        layout = self.emulator.layout
+        return dict.fromkeys((TRIGGERED, OTHER, READING, FREE), layout) if self._named else layout
 
     async def _read(self, stream: Subscription[Result]) -> None:
-        """Read along: serials rise, where no datagram can overtake another."""
+        """Read along: runs rise, where no datagram can overtake another."""
         last = 0
         with contextlib.suppress(*LINKS):
             while True:
@@ -337,11 +247,11 @@ class Station:
                 except exceptions.InterpretationError as error:
                     self._complain(str(error))
                     continue
-                serial = result.value.serial
+                run = result.value.run
                 self.watch.counts["streamed"] += 1
-                if self.transport == "tcp" and serial < last:
-                    self.watch.complain(f"{self.name}: result {serial} came behind {last}")
-                last = serial
+                if self.transport == "tcp" and run < last:
+                    self.watch.complain(f"{self.name}: result {run} came behind {last}")
+                last = run
 
     async def _finish(self, client: SmartCamera) -> None:
         """Have everything mended, and hear all that was sent."""
@@ -361,19 +271,15 @@ class Station:
     def _audit(self, got: Statistics, ear: ClientEar) -> None:
         self.watch.counts["reconnects"] += got.reconnects
         self._balance(got)
-        if not ear.before <= got.received <= ear.before + ear.after:
-            heard = f"{ear.before} containers heard (and {ear.after} while closing)"
+        if not ear.received <= got.received <= ear.received + ear.after:
+            heard = f"{ear.received} containers heard (and {ear.after} while closing)"
             self.watch.complain(f"{self.name}: {heard}, {got.received} in the account")
 
     def _balance(self, got: Statistics) -> None:
-        fates = (got.triggered, got.streamed, got.late, got.wrong_application)
-        if got.received != sum(fates) + got.uninterpretable + got.unclaimed:
-            self.watch.complain(f"{self.name}: the fates do not add up: {got}")
+        for text in imbalances(got):
+            self.watch.complain(f"{self.name}: {text}")
         if got.uninterpretable:
             self.watch.complain(f"{self.name}: {got.uninterpretable} results do not fit")
-        for one in got.subscribers:
-            if one.offered != one.taken + one.dropped + one.queued:
-                self.watch.complain(f"{self.name}: a subscriber does not balance: {one}")
 
     # ------------------------------------------------------------------ what it does
 
@@ -428,7 +334,7 @@ class Station:
             await asyncio.wait({task}, timeout=5)
             return exceptions.ConnectionClosedError("hangs")
         if over > 0:
-            over -= self.watch.lag_since(begun + bound)
+            over -= sum(self.watch.lag.since(begun + bound))
             self.watch.worst = max(self.watch.worst, over)
             if over > ALLOWANCE:
                 text = f"{what} took {over:.2f} s beyond {bound:.2f} s and the lag: {task}"
@@ -445,7 +351,11 @@ class Station:
 
     def _complain(self, text: str) -> None:
         """Note a violation, with the frames before it."""
-        self.watch.complain("\n    ".join([f"{self.name}: {text}", *self._ear.recent]))
+        recent = [
+            f"{one.at:%S.%f} {one.direction} {one.message} {one.fields}"[:RECENT_WIDTH]
+            for one in self._ear.frames
+        ]
+        self.watch.complain("\n    ".join([f"{self.name}: {text}", *recent]))
 
     async def _number(self, client: SmartCamera) -> BaseException | None:
         """Set the number of the next run, by which its trigger is known; else the client does."""
@@ -484,16 +394,17 @@ class Station:
 
     def _compare(self, result: Result, what: str, options: dict[str, Any]) -> None:
         value, complain = result.value, self._complain
-        tag = self._ear.triggered_as
-        if value.tag == NOBODY and value.number == tag and not self.sets_number:
+        tag, told = self._ear.triggered_as, self.emulator.runs[value.run].told
+        if told == NOBODY and value.number == tag and not self.sets_number:
             # the camera had the number and dropped the trigger, in silence because Overtriggered
             # was set already or the trigger was lost, and then the digital input began the run:
             # nothing on the wire tells
             self.watch.counts["number taken by the digital input"] += 1
-        elif value.tag != tag or tag == NOBODY:
+        elif told != tag or tag == NOBODY:
             self.watch.counts["wrong"] += 1
-            complain(f"{what} {tag} has a result of {value.tag}: {value}")
-        if RECORD.unpack(result.raw)[0] != value.serial or value.application != result.application:
+            complain(f"{what} {tag} has a result of {told}: {value}")
+        said = (value.number, value.run, value.token, value.application)
+        if RECORD.unpack(result.raw) != said or value.application != result.application:
             complain(f"{what}: the result is not its bytes: {result}")
         if options.get("application", value.application) != value.application:
             complain(f"{what}: application {value.application}: {options}")

@@ -7,84 +7,155 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+from collections import Counter
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
-
-from client_model import CameraModel, Program
-from timed_loop import TimedLoop
+from typing import Any, ClassVar, Literal
 
 import smartcam
 from smartcam import (
     Backoff,
+    CameraEvent,
     Connected,
-    ConnectionClosedError,
-    ConnectionLostError,
     ConnectionTakenError,
     Disconnected,
     Observer,
     Reconnected,
     Result,
+    SmartCamera,
     Status,
     StatusChanged,
 )
 from smartcam.emulator import EmulatedCamera
-from smartcam.emulator.bvs.device import Mode
-from smartcam.protocols.bvs import ResultCode
+from smartcam.emulator._bvs.device import Mode
+from smartcam.emulator._generators import Run
+from smartcam.emulator._traffic import Log, LogEntry
+from smartcam.observers import TraceEntry
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import ResultCode
+from smartcam.settings import CameraOptions
+from smartcam.streams import Subscription
+from tests.client.clientkit import balance
+from tests.proofs.books import LINK_LOST, TRIGGER_OUTCOMES
+from tests.protocols.camera_model import CameraModel, Options, Program
+from tests.timed_loop import TimedLoop
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
-
-    from client_model import Run as Inspection
-
-    from smartcam import CameraEvent, SmartCamera
-    from smartcam._client.link import TraceEntry
-    from smartcam.emulator.generators import Run
-    from smartcam.settings import CameraOptions
-    from smartcam.streams import Subscription
-
-__all__ = [
-    "COMMAND_ERRORS",
-    "FED",
-    "FREE",
-    "LACKING",
-    "LINE",
-    "LINK_ERRORS",
-    "OTHER",
-    "TRIGGER_ERRORS",
-    "Call",
-    "ClientJudge",
-]
-
-# Times of the camera end in odd microseconds, those of the rules do not: so the model never has to
-# say which of two things comes first at one instant.
 LINE, OTHER, FREE, FED = 7, 3, 9, 5
-PROGRAMS = {
-    LINE: Program(processing=0.080137, loading=0.120311),
-    OTHER: Program(processing=0.020731, loading=0.050173),
-    FREE: Program(processing=0.010937, loading=0.050419, rate=3.0),
-    FED: Program(processing=0.030517, loading=0.070829),
-}
-REBOOT_TIME = 0.400631
+
+SECOND = 1_000_000_000
+"""The model's time is nanoseconds."""
+
+TOLERANCE = 1_000
+"""By which sums of the same times may differ here and there."""
+
+
+@dataclass(slots=True)
+class Inspection:
+    began: float  # when it began, seconds
+    number: int  # its sequence number
+    application: int  # the one that ran
+    # the client's address and which of its Trigger messages, from 0; None for the camera's own
+    # doing and the operator's
+    by: tuple[str, int] | None
+    # ``sent`` once its result was seen on the wire
+    fate: Literal["under way", "finished", "void", "sent"] = "under way"
+    peer: str | None = None  # who got the result
+
+
+class RecordedCamera(CameraModel):
+    """The plain camera, told by the emulator's log what clients did; it keeps its inspections."""
+
+    # These times end in odd microseconds, those of the rules do not: so the model never has to say
+    # which of two things comes first at one instant.
+    programs: ClassVar = {
+        LINE: Program(processing=80_137_000, loading=120_311_000),
+        OTHER: Program(processing=20_731_000, loading=50_173_000),
+        FREE: Program(processing=10_937_000, loading=50_419_000, period=SECOND // 3),
+        FED: Program(processing=30_517_000, loading=70_829_000),
+    }
+    reboot_time = 400_631_000
+    calm_after = 100_213_000
+
+    def __init__(self, options: Options, *, is_bid: bool) -> None:
+        self.inspections: list[Inspection] = []
+        self.sent: list[Inspection] = []  # those whose result was seen on the wire, in order
+        self._peer = ""
+        self._by: tuple[str, int] | None = None
+        self._triggers: Counter[str] = Counter()
+        super().__init__(options, is_bid=is_bid, coded=is_bid)
+
+    def at(self, seconds: float) -> RecordedCamera:
+        """Let everything happen that is due until then."""
+        ticks = round(seconds * SECOND) - self.now
+        while self.due and min(self.due.values()) <= self.now + ticks + TOLERANCE:
+            before = self.now
+            self.pass_time(max(0, min(self.due.values()) - before))
+            ticks -= self.now - before
+        self.pass_time(max(0, ticks))
+        return self
+
+    def read(self, log: Log) -> None:
+        """Take what was said out of a camera's log."""
+        assert len(log) < (log.maxlen or 0), "something may have gone by"
+        while log:
+            entry = log.popleft()
+            self.at(entry.time)
+            if entry.direction == "out":
+                self._note_result(entry)
+            elif entry.message is not None:
+                self._hear_from(entry.peer, entry.message)
+        self.take()
+
+    def _hear_from(self, peer: str, message: m.Message) -> None:
+        if isinstance(message, m.Connect) and self.mode != "rebooting":
+            self._peer, self.session = peer, True
+        if self._peer != peer or not self.session:
+            return
+        if isinstance(message, m.Trigger):
+            self._by = (peer, self._triggers[peer])
+            self._triggers[peer] += self.mode != "rebooting"
+        self.hear(message)
+        self._by = None
+
+    def _note_result(self, entry: LogEntry) -> None:
+        container = entry.message
+        if not isinstance(container, m.ResultContainer):
+            return
+        over = (one for one in reversed(self.inspections) if one.fate != "under way")
+        last = next(over, None)
+        assert last is not None, f"a result came that no inspection made: {entry}"
+        assert last.fate == "finished", f"a result came of an inspection that was over: {last}"
+        number = int.from_bytes(container.data[:4], "little")
+        assert (last.number, last.application) == (number, container.application), (last, entry)
+        last.fate, last.peer = "sent", entry.peer
+        self.sent.append(last)
+
+    def _begin_run(self) -> None:
+        began = self.now / SECOND
+        self.inspections.append(Inspection(began, self.number, self.active, self._by))
+        super()._begin_run()
+
+    def _inspected(self) -> None:
+        self.inspections[-1].fate = "finished"
+        super()._inspected()
+
+    def _void(self) -> None:
+        if self.run is not None:
+            self.inspections[-1].fate = "void"
+        super()._void()
+
+    def reboot(self) -> None:
+        if self.mode != "rebooting":
+            self._void()
+        super().reboot()
+
+
 TAKEN_WITHIN = 10.0
 A_MOMENT = 1e-5
 """Seconds of the loop's time in which nothing happens but what can happen at once."""
 MOST_CALLS = 8
 
-LINK_ERRORS = (ConnectionLostError, ConnectionTakenError, ConnectionClosedError)
-TRIGGER_ERRORS = (
-    smartcam.OvertriggeredError,
-    smartcam.NotRunningError,
-    smartcam.CameraBusyError,
-    smartcam.CameraFaultError,
-    smartcam.InputContainerError,
-    smartcam.TriggerTimeoutError,
-    smartcam.WrongApplicationError,
-    smartcam.InterpretationError,
-    smartcam.CommandRejectedError,
-    smartcam.UnsupportedError,
-    *LINK_ERRORS,
-)
-COMMAND_ERRORS = (smartcam.ResponseTimeoutError, smartcam.CommandRejectedError, *LINK_ERRORS)
+COMMAND_ERRORS = (smartcam.ResponseTimeoutError, smartcam.CommandRejectedError, *LINK_LOST)
 
 LACKING = {
     "bid": frozenset({"start", "stop", "reboot", "set_sequence_number"}),
@@ -97,26 +168,16 @@ CALLER: contextvars.ContextVar[int] = contextvars.ContextVar("CALLER", default=-
 
 @dataclass(eq=False, slots=True)
 class Call:
-    """A call of the client that goes on beside the rules.
+    """A call of the client that goes on beside the rules."""
 
-    Attributes:
-        kind: name of the method.
-        key: which call it is.
-        task: that runs it.
-        errors: what it may end with.
-        losses: how many links were lost before it.
-        part: input data sent with a trigger.
-        cancelled: whether a rule cancelled it.
-        outlives: it may go on after a loss: what waits for a session, and the user's own code.
-    """
-
-    kind: str
-    key: int
-    task: asyncio.Task[Any]
-    errors: tuple[type[BaseException], ...]
-    losses: int
-    part: int | None = None
-    cancelled: bool = False
+    kind: str  # name of the method
+    key: int  # which call it is
+    task: asyncio.Task[Any]  # that runs it
+    errors: tuple[type[BaseException], ...]  # what it may end with
+    losses: int  # how many links were lost before it
+    part: int | None = None  # input data sent with a trigger
+    cancelled: bool = False  # whether a rule cancelled it
+    # it may go on after a loss: what waits for a session, and the user's own code
     outlives: bool = False
 
 
@@ -156,16 +217,7 @@ class Witness(Observer):
 
 
 class ClientJudge:
-    """Client, camera and model, on a loop of their own.
-
-    Attributes:
-        calls: those that have not ended yet.
-        given_up: keys of the triggers that ended without a result.
-        delivered: triggers of the present client that gave a result.
-        undecided: those that did not, though the client may have counted their result.
-        taken: numbers of the results that each stream gave.
-        quiet: nothing more happens at once.
-    """
+    """Client, camera and model, on a loop of their own."""
 
     transport: ClassVar[Literal["tcp", "udp"]] = "tcp"
     numbered: ClassVar[bool] = False
@@ -173,20 +225,20 @@ class ClientJudge:
     def __init__(self) -> None:
         self.runner = asyncio.Runner(loop_factory=lambda: TimedLoop(turn=0.0))
         self.loop = self.runner.get_loop()
-        self.calls: list[Call] = []
+        self.calls: list[Call] = []  # those that have not ended yet
         self.count = 0
         self.numbers = 0
         self.camera: SmartCamera | None = None
         self.witness: Witness | None = None
         self.streams: list[Subscription[Result]] = []
-        self.taken: dict[int, list[int]] = {}
-        self.delivered = 0
-        self.undecided = 0
-        self.given_up: set[int] = set()
+        self.taken: dict[int, list[int]] = {}  # numbers of the results that each stream gave
+        self.delivered = 0  # triggers of the present client that gave a result
+        self.undecided = 0  # those that did not, though the client may have counted their result
+        self.given_up: set[int] = set()  # keys of the triggers that ended without a result
         self.box: EmulatedCamera
-        self.model = CameraModel(PROGRAMS, LINE, REBOOT_TIME)
+        self.model: RecordedCamera
         self.origin = 0.0
-        self.quiet = True
+        self.quiet = True  # nothing more happens at once
 
     def _make_box(self, dialect: str, quirks: dict[str, Any]) -> EmulatedCamera:
         def values(run: Run) -> dict[str, int]:
@@ -200,16 +252,20 @@ class ClientJudge:
                     "layout": "n: int32, part: int32, at: uint32",
                     "generator": values,
                     "input": "part: int32" if key == FED else None,
-                    "load_time": program.loading,
-                    "processing_time": program.processing,
-                    "rate": program.rate,
+                    "load_time": program.loading / SECOND,
+                    "processing_time": program.processing / SECOND,
+                    "rate": 3.0 if program.period else None,
                 }
-                for key, program in PROGRAMS.items()
+                for key, program in RecordedCamera.programs.items()
             ],
             transport=self.transport,
             dialect=dialect,
             builtins=False,
-            quirks={"reboot_time": REBOOT_TIME, "overtriggered_time": 0.100213, **quirks},
+            quirks={
+                "reboot_time": RecordedCamera.reboot_time / SECOND,
+                "overtriggered_time": RecordedCamera.calm_after / SECOND,
+                **quirks,
+            },
         )
 
     # ------------------------------------------------------------------ the loop
@@ -252,7 +308,7 @@ class ClientJudge:
         """There is a client, and another has not taken its camera."""
         if self.camera is None:
             return False
-        return not isinstance(self.camera._inbox.end, ConnectionTakenError)
+        return not isinstance(self.camera._waits.end, ConnectionTakenError)
 
     @property
     def can_call(self) -> bool:
@@ -311,7 +367,7 @@ class ClientJudge:
 
     def _begin_trigger(self, timeout: float) -> None:
         assert self.camera is not None
-        self.begin("trigger", self.camera.trigger(timeout=timeout), TRIGGER_ERRORS)
+        self.begin("trigger", self.camera.trigger(timeout=timeout), TRIGGER_OUTCOMES)
 
     def _cancel(self, call: Call) -> None:
         call.cancelled = True
@@ -324,7 +380,7 @@ class ClientJudge:
         async def registered() -> Result:
             return await camera.next_result(timeout=timeout)
 
-        errors = (smartcam.TriggerTimeoutError, *LINK_ERRORS)
+        errors = (smartcam.TriggerTimeoutError, *LINK_LOST)
         self.begin("next_result", registered(), errors)
 
     def _act(self, does: Callable[[], object], is_noted: Callable[[float], object]) -> None:
@@ -333,16 +389,18 @@ class ClientJudge:
         is_noted(self.loop.time())
 
     def _note_cut(self, now: float) -> None:
-        self.model.advance(now)
-        self.model.session = None
+        self.model.at(now).end_session()
+
+    def _note_error(self, on: bool, now: float) -> None:
+        self.model.at(now).set_condition(Status.SYSTEM_ERROR, on)
 
     def _deed(self, what: str) -> tuple[Callable[[], object], Callable[[float], object]]:
         device, model = self.box.device, self.model
         deeds: dict[str, tuple[Callable[[], object], Callable[[float], object]]] = {
-            "trigger": (device.trigger, lambda now: model.trigger(now, None)),
-            "start": (device.start, model.start),
-            "stop": (device.stop, model.stop),
-            "overheat": (lambda: device.set_condition(Status.OVERHEAT, True), model.advance),
+            "trigger": (device.trigger, lambda now: model.at(now).trigger()),
+            "start": (device.start, lambda now: model.at(now).start()),
+            "stop": (device.stop, lambda now: model.at(now).stop()),
+            "overheat": (lambda: device.set_condition(Status.OVERHEAT, True), model.at),
         }
         return deeds[what]
 
@@ -361,7 +419,7 @@ class ClientJudge:
         except smartcam.ConnectFailedError:
             # one that is asked does not name its application while it loads another one, and our
             # own client takes it back meanwhile
-            assert self.box.device.rebooting or self.model.always_runs
+            assert self.box.device.rebooting or self.model.is_bid
 
     # ------------------------------------------------------------------ what must hold
 
@@ -373,7 +431,7 @@ class ClientJudge:
             return False
         camera = self.camera
         # a way back that failed is told to the next command
-        return camera is not None and camera.connected and camera._turns._failed is None
+        return camera is not None and camera.connected and camera._lock._failed is None
 
     def _agrees(self) -> bool:
         """Assert that the client knows the camera's state; whether there is a session."""
@@ -383,13 +441,13 @@ class ClientJudge:
             if not camera.capabilities.status_by_itself:
                 self.run(camera.query_status())
             active = self.run(camera.query_application())
-        except (smartcam.ResponseTimeoutError, *LINK_ERRORS):
+        except (smartcam.ResponseTimeoutError, *LINK_LOST):
             return False  # the next session tells
         self.go(None)
         assert active == camera.active_application == device.active_application
         bits = self.box.spoken.status_bits
         assert camera.status == bits.read(bits.write(device.status))
-        assert not camera._inbox.answers
+        assert not camera._waits._answers
         return True
 
     def _settle_calls(self) -> None:
@@ -424,7 +482,7 @@ class ClientJudge:
         assert self.witness is not None
         sent = sum(keys.count(call.key) for keys in self.witness.sends.values())
         assert sent <= 1 + self.witness.refused, "a trigger was sent twice"
-        return [run for run in self.model.runs if self._owner(run) == call.key]
+        return [run for run in self.model.inspections if self._owner(run) == call.key]
 
     def _owner(self, run: Inspection) -> int | None:
         """Return the call of the present client that triggered an inspection."""
@@ -455,13 +513,10 @@ class ClientJudge:
     def _check_accounts(self) -> None:
         assert self.camera is not None
         count = self.camera.statistics()
-        fates = count.triggered + count.streamed + count.late + count.wrong_application
-        assert count.received == fates + count.uninterpretable + count.unclaimed
+        balance(count)
         assert (
             self.delivered <= count.triggered <= self.delivered + self.undecided + len(self.calls)
         )
-        for one in count.subscribers:
-            assert one.offered == one.taken + one.dropped + one.queued
         for stream in self.streams:
             one = stream.statistics()
             assert one.offered == one.taken + one.dropped + one.queued
@@ -490,7 +545,7 @@ class ClientJudge:
         receivers = [name for name in ours if name.endswith(".receive")]
         jobs = [name for name in ours if name not in {*supervisors, *receivers}]
         assert self.camera is not None
-        ended = isinstance(self.camera._inbox.end, ConnectionTakenError)
+        ended = isinstance(self.camera._waits.end, ConnectionTakenError)
         assert len(supervisors) == (0 if ended else 1)
         assert len(receivers) <= len(supervisors)
         assert len(jobs) <= MOST_CALLS + 1

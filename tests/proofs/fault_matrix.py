@@ -14,7 +14,7 @@ own. Its verdict asks six questions:
 The time is the loop's own, see ``timed_loop.py``; only cells whose camera is a process take real
 time.
 
-Long form: ``python tests/proofs/fault_matrix.py`` (all cells, half an hour; fewer with
+Long form: ``python -m tests.proofs.fault_matrix`` (all cells, half an hour; fewer with
 ``--sample 60``, ``--family "udp link"``, ``--only NAME``; prints a table, exit 1 on a failure).
 """
 
@@ -30,28 +30,33 @@ import time
 import traceback
 import warnings
 from collections import Counter, defaultdict
+from collections.abc import Awaitable, Iterable, Sequence
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if __name__ == "__main__":  # the loop is the tests', too
-    sys.path.append(str(Path(__file__).parent.parent))
-
-from matrix_camera import device_cells, frame_cells, request_cells
-from matrix_cells import datagram_cells, link_cells, places
-from matrix_ops import OPS, TRIGGER_OUTCOMES, ends_of, ops_of, prepare
-from matrix_process import PROCESS_OPS, SIGNALS, ProcessCamera, process_bench, process_cells
-from matrix_world import Bench, Probe, World, bench, caring_for_tasks, come_true
-from timed_loop import TimedLoop
+from typing import Any
 
 from smartcam import exceptions as e
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Iterable, Sequence
-    from contextlib import AbstractAsyncContextManager
-
-    from matrix_cells import Cell
-    from matrix_world import BenchBase
+from tests.proofs.books import TRIGGER_OUTCOMES, LagProbe
+from tests.proofs.matrix_camera import device_cells, frame_cells, request_cells
+from tests.proofs.matrix_cells import (
+    OPS,
+    Cell,
+    datagram_cells,
+    ends_of,
+    link_cells,
+    ops_of,
+    places,
+    prepare,
+)
+from tests.proofs.matrix_process import (
+    PROCESS_OPS,
+    SIGNALS,
+    ProcessCamera,
+    process_bench,
+    process_cells,
+)
+from tests.proofs.matrix_world import Bench, BenchBase, World, bench, caring_for_tasks, come_true
+from tests.timed_loop import TimedLoop
 
 ALLOWANCE = 0.05
 """Seconds that a wait may take longer than its bound and the loop's lag: this proof's own work."""
@@ -136,30 +141,20 @@ def is_apart(cell: Cell) -> bool:
 
 @dataclass(slots=True)
 class Verdict:
-    """What came of a cell.
-
-    Attributes:
-        outcome: of the command: ``value``, or the error's name.
-        wrong: what must not be; empty where the cell has passed.
-        tries: errors until the client worked again.
-        seconds: how long the whole cell took.
-        lag: how late the loop was in it at most, seconds.
-        anew: a status was withheld, and it took a new client to get it.
-        garbled: values that were told with bytes of other frames in them.
-        before: what was wrong when it ran before, and why it was run again.
-        known: it fails, as it is known to.
-    """
+    """What came of a cell."""
 
     cell: Cell
-    outcome: str = "none"
+    outcome: str = "none"  # of the command: ``value``, or the error's name
+    # what must not be; empty where the cell has passed
     wrong: list[str] = field(default_factory=list[str])
-    tries: Counter[str] = field(default_factory=Counter)
-    seconds: float = 0.0
-    lag: float = 0.0
-    anew: bool = False
-    garbled: int = 0
+    tries: Counter[str] = field(default_factory=Counter)  # errors until the client worked again
+    seconds: float = 0.0  # how long the whole cell took
+    lag: float = 0.0  # how late the loop was in it at most, seconds
+    anew: bool = False  # a status was withheld, and it took a new client to get it
+    garbled: int = 0  # values that were told with bytes of other frames in them
+    # what was wrong when it ran before, and why it was run again
     before: list[str] = field(default_factory=list[str])
-    known: bool = False
+    known: bool = False  # it fails, as it is known to
 
     @property
     def passed(self) -> bool:
@@ -170,7 +165,7 @@ class Verdict:
 class Judge:
     """Runs one cell on its bench."""
 
-    def __init__(self, cell: Cell, bench: BenchBase, probe: Probe, verdict: Verdict) -> None:
+    def __init__(self, cell: Cell, bench: BenchBase, probe: LagProbe, verdict: Verdict) -> None:
         self.cell, self.fault, self.op = cell, cell.fault, OPS[cell.op]
         self.bench = bench
         self.probe = probe
@@ -245,7 +240,7 @@ class Judge:
 
     def _in_time(self, begun: float, bound: float) -> None:
         took = self._loop.time() - begun
-        most = bound + HOPS * self.probe.lag_since(begun) + ALLOWANCE
+        most = bound + HOPS * max(self.probe.since(begun)) + ALLOWANCE
         self.bench.demand(took <= most, f"took {took:.3f} s, its bound is {bound:.3f} s")
 
     async def _works_at_once(self) -> bool:
@@ -324,7 +319,7 @@ class Judge:
 # ---------------------------------------------------------------------- running them
 
 
-async def run_cell(cell: Cell, probe: Probe, process: ProcessCamera | None = None) -> Verdict:
+async def run_cell(cell: Cell, probe: LagProbe, process: ProcessCamera | None = None) -> Verdict:
     """Run one cell; with a process, on that camera."""
     verdict = Verdict(cell)
     begun = asyncio.get_running_loop().time()
@@ -347,25 +342,21 @@ async def run_cell(cell: Cell, probe: Probe, process: ProcessCamera | None = Non
         verdict.known = bool(verdict.wrong)
         verdict.wrong = [] if verdict.known else [f"no longer so: {cell.fault.known}"]
     verdict.seconds = asyncio.get_running_loop().time() - begun
-    verdict.lag = probe.lag_since(begun)
+    verdict.lag = max(probe.since(begun))
     return verdict
 
 
 class Runner:
-    """Runs many cells in one loop.
-
-    Attributes:
-        reports: what the loop had to report, and what was thrown away unclosed.
-        worst_lag: seconds.
-    """
+    """Runs many cells in one loop."""
 
     def __init__(self) -> None:
+        # what the loop had to report, and what was thrown away unclosed
         self.reports: list[str] = []
-        self.worst_lag = 0.0
+        self.worst_lag = 0.0  # seconds
 
     async def run(self, chosen: Sequence[Cell], jobs: int = JOBS) -> list[Verdict]:
         """Run cells; those that failed while the loop was late, again."""
-        probe = Probe()
+        probe = LagProbe()
         hook, sys.unraisablehook = sys.unraisablehook, self._on_unraisable
         try:
             with warnings.catch_warnings(), caring_for_tasks() as reports:
@@ -389,7 +380,7 @@ class Runner:
     def _on_unraisable(self, what: Any) -> None:
         self.reports.append(f"{what.err_msg or 'unraisable'}: {what.exc_value!r}")
 
-    async def _run_all(self, chosen: Sequence[Cell], probe: Probe, jobs: int) -> list[Verdict]:
+    async def _run_all(self, chosen: Sequence[Cell], probe: LagProbe, jobs: int) -> list[Verdict]:
         places = asyncio.Semaphore(jobs)
         done: dict[int, Verdict] = {}
         chains: dict[object, list[int]] = defaultdict(list)

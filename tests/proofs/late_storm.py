@@ -1,312 +1,318 @@
 """Storm of late results: no trigger may ever get another one's result.
 
 Results come at random around the trigger's timeout, results and status in both orders, every tenth
-trigger is cancelled at a random moment. The camera knows which trigger began each run and says so
-in the container, beside the number; the client's n-th trigger is the n-th that the camera got.
+trigger is cancelled at a random moment. The camera knows which trigger began each run, and what
+became of each container is compared with what it sent.
 
-Long form: ``python tests/proofs/late_storm.py --triggers 10000 --seed 1`` (per variant; prints a
+Long form: ``python -m tests.proofs.late_storm --triggers 10000 --seed 1`` (per variant; prints a
 table, exit 1 on a violation).
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import itertools
 import statistics
 import sys
-from collections import Counter
-from dataclasses import dataclass, field
-from pathlib import Path
-from random import Random
-from typing import TYPE_CHECKING, Any
-
-if __name__ == "__main__":  # the wire is another camera's, too
-    sys.path.append(str(Path(__file__).parent.parent))
-
-from storm_camera import EXTERNAL, Habits, StormCamera
-from storm_variants import PATIENCE, VARIANTS, make_camera
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import smartcam
 from smartcam import exceptions
-from smartcam.models import Status
-from smartcam.observers import Observer
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable, Sequence
-    from contextlib import AbstractAsyncContextManager
-
-    from storm_variants import Camera, Variant
-
-    from smartcam._client.link import TraceEntry
-    from smartcam.client import SmartCamera
-    from smartcam.models import Result, Statistics
-    from smartcam.streams import Subscription
-
-SLOWEST = 20.0
-"""Times these, where the machine has other things to do."""
+from smartcam.client import SmartCamera
+from smartcam.models import Result, Statistics, Status
+from smartcam.streams import Subscription
+from tests.client.clientkit import Sending, TriggerEar
+from tests.client.line_camera import AGAIN, LAYOUTS, LineCamera, Run, Step
+from tests.proofs.books import BookKeeper
+from tests.proofs.storm import HANG, Figures, Storm, Variant, run_command
 
 CANCEL_EACH = 10
-HANG = 20.0
-"""Seconds after which a call with such a timeout hangs."""
 
-OUTCOMES: tuple[type[exceptions.SmartCamError], ...] = (
-    exceptions.OvertriggeredError,
-    exceptions.NotRunningError,
-    exceptions.CameraBusyError,
-    exceptions.CameraFaultError,
-    exceptions.InputContainerError,
-    exceptions.TriggerTimeoutError,
-    exceptions.WrongApplicationError,
-    exceptions.InterpretationError,
-    exceptions.CommandRejectedError,
-    exceptions.UnsupportedError,
-    exceptions.ConnectionLostError,
-    exceptions.ConnectionTakenError,
-    exceptions.ConnectionClosedError,
+PATIENCE = (0.005, 0.02)
+"""Shortest and longest timeout of a trigger, seconds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LateVariant(Variant):
+    """How a camera is late. Shares are 0 to 1, times seconds."""
+
+    exact: bool = True  # each container's fate is known beforehand, so the counts must agree
+    # share of the runs whose Waiting for Trigger rises before their results
+    waiting_first: float = 0.5
+    apart: float = 0.3  # share of the runs with a pause between results and status
+    longest_pause: float = 0.003  # the longest of these
+    second: float = 0.0  # share of the runs that send a second container
+    second_apart: bool = False  # and pause before it
+    # mean time between two triggers of the digital input, in multiples of what a run takes; 0 for
+    # none
+    external: float = 0.0
+    reads_input: bool = False  # the application has a "receive data" tool
+    # of an emulator, whose quirk it is; None is the camera made by hand
+    order: Literal["result first", "waiting first"] | None = None
+    pushed: bool = False  # of an emulator with ``bid``: a status comes with every change, too
+
+
+def of_bid(name: str, *, waiting_first: float = 0.0, **more: Any) -> LateVariant:
+    """Return a variant with ``bid``, which waits again when it has sent everything."""
+    return LateVariant(name=name, dialect="bid", waiting_first=waiting_first, **more)
+
+
+def best_effort(
+    name: str, *, make: Callable[..., LateVariant] = LateVariant, **more: Any
+) -> LateVariant:
+    """Return a variant where nothing is promised; what is wrong is counted and shown."""
+    return make(name=f"best effort: {name}", rule="count", exact=False, **more)
+
+
+SLOW = (0.002, 0.002)
+TWO: dict[str, Any] = {"exact": False, "wanted": 2, "second": 0.9}
+
+VARIANTS: tuple[LateVariant, ...] = (
+    LateVariant(
+        name="tcp extra slow link",
+        exact=False,
+        share=0.4,
+        # shorter pauses than a trigger's way: the second container always comes before it counts
+        second=0.5,
+        second_apart=True,
+        longest_pause=0.0015,
+        line=SLOW,
+    ),
+    LateVariant(name="tcp slow link", share=0.4, line=SLOW),
+    LateVariant(name="tcp"),
+    LateVariant(name="tcp thesis", dialect="thesis"),
+    LateVariant(name="tcp number", number="int32"),
+    LateVariant(name="tcp number thesis", number="int32", dialect="thesis"),
+    LateVariant(name="tcp number of 8 bits", number="uint8"),
+    LateVariant(name="udp number", number="int32", transport="udp"),
+    LateVariant(name="udp number thesis", number="int32", transport="udp", dialect="thesis"),
+    LateVariant(name="udp number held", number="int32", transport="udp", held=0.3),
+    LateVariant(name="tcp input", reads_input=True),
+    LateVariant(name="udp input number", transport="udp", number="int32", reads_input=True),
+    LateVariant(name="tcp extra", exact=False, second=0.3),
+    LateVariant(
+        name="tcp extra number", exact=False, number="int32", second=0.3, second_apart=True
+    ),
+    LateVariant(name="tcp two results", **TWO),
+    LateVariant(name="tcp two results number", number="int32", second_apart=True, **TWO),
+    LateVariant(name="tcp external number", exact=False, number="int32", external=3.0),
+    LateVariant(
+        name="udp external number",
+        exact=False,
+        number="int32",
+        transport="udp",
+        external=3.0,
+        held=0.1,
+    ),
+    LateVariant(name="emulator", order="result first"),
+    LateVariant(name="emulator waiting first", order="waiting first"),
+    LateVariant(name="emulator number", number="int32", order="waiting first"),
+    LateVariant(name="emulator udp number", number="int32", order="result first", transport="udp"),
+    LateVariant(name="tcp b16", dialect="b16"),
+    LateVariant(name="tcp b16 number", dialect="b16", number="int32"),
+    LateVariant(
+        name="udp b16 number held", dialect="b16", number="int32", transport="udp", held=0.3
+    ),
+    of_bid("tcp bid", share=0.4),
+    of_bid("tcp bid slow link", share=0.4, line=SLOW),
+    of_bid("tcp bid input", share=0.4, reads_input=True),
+    of_bid("tcp bid extra", share=0.4, exact=False, second=0.3, second_apart=True),
+    of_bid("tcp bid two results", share=0.4, second_apart=True, **TWO),
+    of_bid("emulator bid", order="result first"),
+    of_bid("emulator bid pushed", order="waiting first", pushed=True),
+    best_effort("udp bid", make=of_bid, transport="udp"),
+    best_effort("udp bid held", make=of_bid, transport="udp", held=0.3),
+    best_effort("tcp bid external", make=of_bid, external=3.0),
+    best_effort("tcp bid waiting first", make=of_bid, waiting_first=0.5),
+    best_effort("udp", transport="udp"),
+    best_effort("udp held", transport="udp", held=0.3),
+    best_effort("tcp external", external=3.0),
+    best_effort("tcp external tidy", external=3.0, waiting_first=0.0, apart=0.0),
+    best_effort("tcp external slow link", share=0.4, external=3.0, line=SLOW),
+    best_effort("udp external", transport="udp", external=3.0, held=0.1),
+    best_effort("tcp extra apart", second=0.3, second_apart=True),
 )
-"""What a trigger may end with beside a result; the list is closed."""
-
-USUAL = (exceptions.OvertriggeredError, exceptions.InputContainerError)
-"""What else may happen in a storm: nobody stops the camera, and no link breaks."""
 
 
-# ---------------------------------------------------------------------- the client's side
+def _wrong(figures: Figures) -> str:
+    wrong = figures.wrong + figures.fresh
+    share = 100 * wrong / max(1, figures.outcomes["result"])
+    return f"{wrong} ({share:.2f} %)" if wrong else "0"
 
 
-class Ear(Observer):
-    """Counts what the client says."""
-
-    def __init__(self) -> None:
-        self.said: Counter[str] = Counter()
-        self.triggered_at = 0.0
-
-    def on_frame(self, entry: TraceEntry) -> None:
-        if entry.direction == ">":
-            self.said[entry.message] += 1
-            if entry.message == "Trigger":
-                self.triggered_at = asyncio.get_running_loop().time()
+def _median(values: list[float]) -> str:
+    return f"{statistics.median(values):.1f}" if values else "-"
 
 
-@dataclass(slots=True)
-class Figures:
-    """What came of a storm.
+class LateStorm(Storm[LateVariant]):
+    """One client, one call after the other."""
 
-    Attributes:
-        outcomes: of the calls: ``result``, ``cancelled``, or the error's name.
-        given_up: triggers that were sent and whose call was not told anything of its run.
-        lapsed: of these, those that ended by cancellation.
-        wrong: results of another trigger than the call's.
-        stale: wrong ones from a run that nobody of ours asked for.
-        waited_ms: how much later a trigger was sent for a debt that its late result has paid.
-        fenced_ms: and where it took Stop, Query and Start.
-        violations: what must not be, in words.
-    """
+    allowed = (
+        exceptions.OvertriggeredError,
+        exceptions.InputContainerError,
+        exceptions.TriggerTimeoutError,
+    )
+    sent_again = frozenset()
+    columns = (
+        ("calls", lambda one: one.calls),
+        ("triggers", lambda one: one.triggers),
+        ("results", lambda one: one.outcomes["result"]),
+        ("timeouts", lambda one: one.outcomes["TriggerTimeoutError"]),
+        ("cancelled", lambda one: one.outcomes["cancelled"]),
+        ("overtrig", lambda one: one.outcomes["OvertriggeredError"]),
+        ("other", lambda one: one.other),
+        ("sent", lambda one: one.sent),
+        ("late", lambda one: one.late),
+        ("wrong", _wrong),
+        ("seconds", lambda one: f"{one.seconds:.1f}"),
+        ("grace", lambda one: len(one.waited_ms)),
+        ("ms", lambda one: _median(one.waited_ms)),
+        ("fenced", lambda one: len(one.fenced_ms)),
+        ("ms", lambda one: _median(one.fenced_ms)),
+    )
+    _pace = 0.01
+    _owing = False
+    _begun = 0.0
+    _stops = 0
 
-    variant: Variant
-    calls: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    given_up: set[int] = field(default_factory=set)
-    triggers: int = 0
-    wrong: int = 0
-    stale: int = 0
-    late: int = 0
-    sent: int = 0
-    waited_ms: list[float] = field(default_factory=list)
-    fenced_ms: list[float] = field(default_factory=list)
-    violations: list[str] = field(default_factory=list)
-    seconds: float = 0.0
+    def make_camera(self) -> LineCamera | BookKeeper:
+        """Return the camera made by hand, or an emulated one."""
+        variant = self.variant
+        if variant.order is None:
+            camera = LineCamera(
+                dialect=variant.dialect,
+                transport=variant.transport,
+                delay=self.delay,
+                in_order=False,
+                reads_input=variant.reads_input,
+            )
+            camera.plan, camera.network = self._plan, self.network
+            return camera
+        # it keeps one pace: here chance lies with the timeouts
+        return BookKeeper(
+            {1: {"processing_time": sum(PATIENCE) / 4}},
+            marked=bool(variant.number),
+            transport=variant.transport,
+            dialect=variant.dialect,
+            quirks={
+                "waiting_before_result": variant.order == "waiting first",
+                "push_status": variant.pushed,
+            },
+        )
 
-    def demand(self, true: object, text: str) -> None:
-        """Note a violation unless something is true."""
-        if not true:
-            self.violations.append(f"{self.variant.name}: {text}")
+    def _plan(self, _: Run) -> Sequence[Step]:
+        variant, chance = self.variant, self._chance
+        said = [0, 1] if self.happens(variant.second) else [0]
 
+        def pause(what: int) -> float:
+            if what == 1:
+                return chance.uniform(0, variant.longest_pause) * variant.second_apart
+            return self.happens(variant.apart) * chance.uniform(0, variant.longest_pause)
 
-class Storm:
-    """Triggers a camera again and again.
+        waiting = 0 if self.happens(variant.waiting_first) else len(said)
+        return self.steps(self._pace * chance.uniform(0.1, 1.3), waiting, said, pause)
 
-    Args:
-        variant: which kind.
-        camera: it.
-        client: a client in a session with it.
-        ear: hears what the client says.
-        chance: decides about timeouts and cancellations.
-    """
+    async def live(self, calls: int) -> None:
+        """Have one client make all calls."""
+        variant, camera = self.variant, self.camera
+        layout = LAYOUTS[variant.number] if isinstance(camera, LineCamera) else camera.layout
+        options: dict[str, Any] = {"interpret_as": layout, "reconnect": None}
+        async with smartcam.connect(camera.url, observers=[self.ear], **options) as client:
+            listening = contextlib.nullcontext() if variant.exact else _listening(client)
+            async with listening:
+                external = asyncio.create_task(self._digital_input())
+                for _ in range(calls):
+                    await self._call(client)
+                external.cancel()
+                await self.quiet()
+                await client.wait_status(_is_idle)
+                await client.query_application()
+                self.audit(client.statistics())
 
-    def __init__(
-        self, variant: Variant, camera: Camera, client: SmartCamera, ear: Ear, chance: Random
-    ) -> None:
-        self.variant = variant
-        self.camera = camera
-        self.client = client
-        self.ear = ear
-        self.figures = Figures(variant)
-        self._chance = chance
-        self._owing = False
-        self._scale = 1.0
+    async def _digital_input(self) -> None:
+        while self.variant.external:
+            mean = self.variant.external * self._pace
+            await asyncio.sleep(self._chance.expovariate(1 / mean))
+            assert isinstance(self.camera, LineCamera)
+            self.camera.sensor()
 
-    async def run(self, calls: int) -> None:
-        """Trigger so many times, then look at the accounts."""
-        begun = asyncio.get_running_loop().time()
-        for call in range(1, calls + 1):
-            await self._call(call)
-        await self._hear_the_rest()
-        self.figures.seconds = asyncio.get_running_loop().time() - begun
-        self._audit(self.client.statistics())
-
-    async def _call(self, call: int) -> None:
-        patience = self._scale * self._chance.uniform(*PATIENCE)
-        self.camera.pace = patience
-        sent, stops = self.ear.said["Trigger"], self.ear.said["Stop"]
-        begun = asyncio.get_running_loop().time()
-        task = asyncio.create_task(self._trigger(call, patience))
-        cancel = None
-        if call % CANCEL_EACH == 0:
-            when = self._chance.uniform(0, 1.3 * patience)
-            cancel = asyncio.get_running_loop().call_later(when, task.cancel)
-        await asyncio.wait({task}, timeout=HANG)
-        if cancel is not None:
-            cancel.cancel()
+    async def _call(self, client: SmartCamera) -> None:
         self.figures.calls += 1
-        self.figures.sent = len(self.camera.sent)
-        self.figures.demand(task.done(), f"call {call} hangs")
-        count = self.ear.said["Trigger"] - sent
-        self.figures.demand(count <= 1, f"call {call} sent {count} triggers")
-        if count:
-            self._note_cost(begun, fenced=self.ear.said["Stop"] > stops)
-        outcome = self._judge(task, call, self.ear.said["Trigger"] if count else None)
-        self.figures.outcomes[outcome] += 1
-        self._keep_pace(outcome)
+        call = self.figures.calls
+        self._pace = self._scale * self._chance.uniform(*PATIENCE)
+        self._begun, self._stops = asyncio.get_running_loop().time(), self.ear.said["Stop"]
+        options: dict[str, Any] = {"timeout": self._pace}
+        if self.variant.reads_input:
+            options["input"] = call.to_bytes(4, "little")
+        if self.variant.wanted is not None:
+            options["results_per_trigger"] = self.variant.wanted
+        task = asyncio.create_task(client.trigger(**options))
+        cancelled = self._chance.uniform(0, 1.3 * self._pace) if call % CANCEL_EACH == 0 else None
+        outcome = await self.end(task, cancelled)
+        self.keep_pace(outcome)
         if outcome == "InputContainerError":
-            await self.client.switch_application(1)
+            await client.switch_application(1)
             self._owing = False
 
-    def _keep_pace(self, outcome: str) -> None:
-        """Have about as many results as timeouts, also on a slow machine."""
-        change = {"result": 0.9, "TriggerTimeoutError": 1.1}.get(outcome, 1.0)
-        self._scale = min(SLOWEST, max(1.0, self._scale * change))
-
-    async def _trigger(self, call: int, patience: float) -> list[Result]:
-        data = call.to_bytes(4, "little") if self.variant.habits.reads_input else None
-        wanted = self.variant.results
-        if wanted is not None:
-            return await self.client.trigger(
-                timeout=patience, input=data, results_per_trigger=wanted
-            )
-        return [await self.client.trigger(timeout=patience, input=data)]
-
-    def _note_cost(self, begun: float, *, fenced: bool) -> None:
-        cost = 1000 * (self.ear.triggered_at - begun)
-        if fenced:
-            self.figures.fenced_ms.append(cost)
-        elif self._owing:
-            self.figures.waited_ms.append(cost)
-
-    def _judge(self, task: asyncio.Task[list[Result]], call: int, trigger: int | None) -> str:
-        """Return the outcome's name; look whether a result is this call's own."""
+    def after(self, outcome: str, sendings: Sequence[Sending]) -> None:
+        """Note what the trigger had to wait for, and whether its result is owed now."""
         figures = self.figures
-        if not task.done():
-            return "hangs"
-        error = None if task.cancelled() else task.exception()
-        if task.cancelled() or isinstance(error, exceptions.TriggerTimeoutError):
-            if trigger is not None:
-                figures.given_up.add(trigger)
-                self._owing = True
-            return "cancelled" if error is None else "TriggerTimeoutError"
-        if error is not None:
-            name = type(error).__name__
-            figures.demand(isinstance(error, USUAL), f"call {call} ended with {error!r}")
-            self._owing = self._owing or trigger is not None
-            return name
-        self._owing = False
-        figures.demand(trigger is not None, f"call {call} has a result and sent no trigger")
-        self._compare(task.result(), call, trigger)
-        return "result"
+        if sendings:
+            cost = 1000 * (sendings[-1].at - self._begun)
+            if self.ear.said["Stop"] > self._stops:
+                figures.fenced_ms.append(cost)
+            elif self._owing:
+                figures.waited_ms.append(cost)
+        if outcome in {"cancelled", "TriggerTimeoutError"}:
+            figures.given_up |= {sending[:2] for sending in sendings}
+        self._owing = outcome != "result" and (self._owing or bool(sendings))
 
-    def _compare(self, results: Sequence[Result], call: int, trigger: int | None) -> None:
-        figures = self.figures
-        wanted = self.variant.results or 1
-        figures.demand(len(results) == wanted, f"call {call}: {len(results)} of {wanted} results")
-        for result in results:
-            value = result.value
-            if value.trigger != trigger:
-                figures.wrong += 1
-                figures.stale += value.trigger == EXTERNAL
-                text = f"call {call}, trigger {trigger}: a result of trigger {value.trigger}"
-                figures.demand(not self.variant.promised, text)
-            if self.variant.habits.reads_input:
-                figures.demand(value.token == call, f"call {call}: inspected input {value.token}")
-            same = result.sequence == (value.number if self.variant.mark else None)
-            figures.demand(same, f"call {call}: sequence {result.sequence}, not {value.number}")
-        parts = {result.value.part for result in results}
-        figures.demand(len(parts) == len(results), f"call {call}: one container twice")
+    def is_right(self, result: Result, sending: Sending) -> bool:
+        """Look whose a result is, and at its input and its number."""
+        value, call = result.value, self.figures.calls
+        if self.variant.reads_input:
+            text = f"call {call}: inspected input {value.token}"
+            self.figures.demand(value.token == call, text)
+        same = result.sequence == (value.number if self.variant.number else None)
+        text = f"call {call}: sequence {result.sequence}, not {value.number}"
+        self.figures.demand(same, text)
+        return super().is_right(result, sending)
 
-    async def _hear_the_rest(self) -> None:
-        """Have every container that was sent."""
-        self.camera.calm()
-        await self.camera.quiet()
-        await self.client.wait_status(_is_idle)
-        await self.client.query_application()
-
-    def _audit(self, got: Statistics) -> None:
-        figures, camera = self.figures, self.camera
-        figures.triggers, figures.late = camera.triggers, got.late
-        figures.sent = len(camera.sent)
-        said = self.ear.said["Trigger"]
-        figures.demand(said == camera.triggers, f"{said} triggers sent, {camera.triggers} came")
-        figures.demand(
-            got.received == len(camera.sent),
-            f"{len(camera.sent)} containers sent, {got.received} received",
-        )
-        fates = got.triggered + got.streamed + got.late + got.unclaimed
-        figures.demand(got.received == fates, f"the fates do not add up: {got}")
-        for one in got.subscribers:
-            balanced = one.offered == one.taken + one.dropped + one.queued
-            figures.demand(balanced, f"a subscriber's account does not balance: {one}")
-        figures.demand(got.uninterpretable == got.wrong_application == 0, f"odd fates: {got}")
-        figures.demand(got.sessions == 1, f"{got.sessions} sessions: {got.last_error}")
-        self._audit_fates(got)
-
-    def _audit_fates(self, got: Statistics) -> None:
+    def audit(self, got: Statistics) -> None:
         """Compare the fates with what the camera sent."""
-        figures, camera = self.figures, self.camera
-        results = figures.outcomes["result"] * (self.variant.results or 1)
-        raced = got.triggered - results  # came in the same instant as a cancellation or timeout
-        if self.variant.transport == "tcp":
-            figures.demand(
-                got.overtriggers == camera.overtriggers,
-                f"Overtriggered rose {camera.overtriggers} times, {got.overtriggers} seen",
-            )
-        seconds, external = sum(one.part > 0 for one in camera.sent), self.variant.habits.external
+        super().audit(got)
+        figures, camera, variant = self.figures, self.camera, self.variant
+        demand, sent = figures.demand, camera.sent
+        said = self.ear.said["Trigger"]
+        demand(said == camera.triggers, f"{said} triggers sent, {camera.triggers} came")
+        demand(got.received == len(sent), f"{len(sent)} containers sent, {got.received} received")
+        demand(got.wrong_application == 0, f"odd fates: {got}")
+        demand(got.sessions == 1, f"{got.sessions} sessions: {got.last_error}")
+        if variant.transport == "tcp":
+            text = f"Overtriggered rose {camera.overtriggers} times, {got.overtriggers} seen"
+            demand(got.overtriggers == camera.overtriggers, text)
+        seconds = len(sent) - len({one.run.index for one in sent})
         # where a late one is taken for the next one's, that one's own is extra
-        if self.variant.promised and self.variant.transport == "tcp" and not external:
-            figures.demand(
-                got.extra_results <= seconds, f"{got.extra_results} extra, not {seconds}"
-            )
-        if not self.variant.exact:
+        if variant.rule == "own" and variant.transport == "tcp" and not variant.external:
+            demand(got.extra_results <= seconds, f"{got.extra_results} extra, not {seconds}")
+        if not variant.exact:
             return
-        lost = sum(one.trigger in figures.given_up for one in camera.sent)
-        figures.demand(
-            0 <= raced <= figures.outcomes["cancelled"],
-            f"{got.triggered} containers counted as triggered, {results} results",
-        )
-        figures.demand(
-            got.late == lost - raced,
-            f"{lost} containers of given-up triggers, {raced} of them just in time; "
-            f"{got.late} counted as late",
-        )
-        figures.demand(
-            got.streamed + got.unclaimed == 0, f"{got.streamed + got.unclaimed} are nobody's"
-        )
+        results = figures.outcomes["result"] * (variant.wanted or 1)
+        raced = got.triggered - results  # came in the same instant as a cancellation or timeout
+        lost = sum((one.run.session, one.run.trigger) in figures.given_up for one in sent)
+        text = f"{got.triggered} containers counted as triggered, {results} results"
+        demand(0 <= raced <= figures.outcomes["cancelled"], text)
+        text = f"{lost} containers of given-up triggers, {raced} of them just in time"
+        demand(got.late == lost - raced, f"{text}; {got.late} counted as late")
+        nobodys = got.streamed + got.unclaimed
+        demand(nobodys == 0, f"{nobodys} are nobody's")
 
 
 def _is_idle(status: Status) -> bool:
     return Status.WAITING_FOR_TRIGGER in status or Status.RUNNING not in status
-
-
-# ---------------------------------------------------------------------- running them
 
 
 @contextlib.asynccontextmanager
@@ -326,44 +332,6 @@ async def _listening(client: SmartCamera) -> AsyncIterator[None]:
             await asyncio.wait({reader}, timeout=HANG)
 
 
-async def storm(variant: Variant, calls: int, seed: int) -> Figures:
-    """Run one variant."""
-    chance = Random(f"{seed} {variant.name}")  # noqa: S311
-    ear = Ear()
-    camera = make_camera(variant, chance)
-    opened: AbstractAsyncContextManager[Any] = camera
-    async with opened:
-        options: dict[str, Any] = {"interpret_as": variant.layout, "reconnect": None}
-        async with smartcam.connect(camera.url, observers=[ear], **options) as client:
-            one = Storm(variant, camera, client, ear, chance)
-            listening = contextlib.nullcontext() if variant.exact else _listening(client)
-            async with listening:
-                await one.run(round(calls * variant.share))
-    return one.figures
-
-
-async def storms(
-    variants: Iterable[Variant], calls: int, seed: int, *, at_once: int
-) -> list[Figures]:
-    """Run variants, a few at once; what the loop has to report is a violation of the first."""
-    places = asyncio.Semaphore(at_once)
-    reports: list[str] = []
-
-    async def run(variant: Variant) -> Figures:
-        async with places:
-            return await storm(variant, calls, seed)
-
-    loop = asyncio.get_running_loop()
-    handler = loop.get_exception_handler()
-    loop.set_exception_handler(lambda _, context: reports.append(str(context)))
-    try:
-        done = await asyncio.gather(*(run(variant) for variant in variants))
-    finally:
-        loop.set_exception_handler(handler)
-    done[0].violations += reports
-    return done
-
-
 # ---------------------------------------------------------------------- what a debt costs
 
 LONG = 2.0
@@ -373,21 +341,18 @@ LONG = 2.0
 async def debt_cost(late: float, dialect: str = "handbook") -> float:
     """Return how much later a trigger is sent behind one that was given up, milliseconds.
 
-    Args:
-        late: seconds that the result of that one comes after its timeout.
-        dialect: of the camera.
+    The result of that one comes ``late`` seconds after its timeout.
     """
-    ear = Ear()
-    habits = Habits(delays=(1.0, 1.0), waiting_first=0.0, apart=0.0)
-    camera = StormCamera(dialect=dialect, transport="tcp", habits=habits, chance=Random(0))  # noqa: S311
+    ear = TriggerEar()
+    paces = itertools.chain((0.05 + late,), itertools.repeat(0.001))
+    camera = LineCamera(dialect=dialect)
+    camera.plan = lambda _: ((next(paces), 0), (0.0, AGAIN))
     async with camera, smartcam.connect(camera.url, observers=[ear]) as client:
-        camera.pace = 0.05 + late
         with contextlib.suppress(exceptions.TriggerTimeoutError):
             await client.trigger(timeout=0.05)
-        camera.pace = 0.001
         begun = asyncio.get_running_loop().time()
         await client.trigger(timeout=LONG)
-        return 1000 * (ear.triggered_at - begun)
+        return 1000 * (max(one.at for some in ear.sendings.values() for one in some) - begun)
 
 
 async def debt_costs(rounds: int) -> str:
@@ -400,86 +365,12 @@ async def debt_costs(rounds: int) -> str:
     return "\n".join(lines)
 
 
-# ---------------------------------------------------------------------- the table
-
-HEADINGS = (
-    "calls",
-    "triggers",
-    "results",
-    "timeouts",
-    "cancelled",
-    "overtrig",
-    "other",
-    "sent",
-    "late",
-    "wrong",
-    "seconds",
-    "grace",
-    "ms",
-    "fenced",
-    "ms",
-)
-
-
-def row(figures: Figures) -> list[str]:
-    """Return one line of the table."""
-    outcomes = Counter(figures.outcomes)
-    known = ("result", "TriggerTimeoutError", "cancelled", "OvertriggeredError")
-    counts = [outcomes.pop(name, 0) for name in known]
-    wrong = str(figures.wrong)
-    if figures.wrong:
-        share = 100 * figures.wrong / max(1, counts[0])
-        wrong += f" ({share:.2f} %)"
-    return [
-        str(figures.calls),
-        str(figures.triggers),
-        *map(str, counts),
-        str(outcomes.total()),
-        str(figures.sent),
-        str(figures.late),
-        wrong,
-        f"{figures.seconds:.1f}",
-        str(len(figures.waited_ms)),
-        _median(figures.waited_ms),
-        str(len(figures.fenced_ms)),
-        _median(figures.fenced_ms),
-    ]
-
-
-def _median(values: list[float]) -> str:
-    return f"{statistics.median(values):.1f}" if values else "-"
-
-
-def table(done: Sequence[Figures]) -> str:
-    """Return the figures as text."""
-    rows = [["variant", *HEADINGS], *([one.variant.name, *row(one)] for one in done)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for cells in rows:
-        first = cells[0].ljust(widths[0])
-        rest = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
-        lines.append("  ".join([first, *rest]))
-    return "\n".join(lines)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the storm; return 1 where something was that must not be."""
-    parser = argparse.ArgumentParser(description="Storm of late results.")
-    parser.add_argument("--triggers", type=int, default=10_000, help="calls per variant")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--at-once", type=int, default=4, help="variants side by side")
-    parser.add_argument("--only", default="", help="variants with this in their name")
-    options = parser.parse_args(arguments)
-    variants = [one for one in VARIANTS if options.only in one.name]
-    print(f"seed {options.seed}")  # noqa: T201
-    done = asyncio.run(storms(variants, options.triggers, options.seed, at_once=options.at_once))
-    print(table(done))  # noqa: T201
+    about = "Storm of late results."
+    failed = run_command(LateStorm, VARIANTS, arguments, about=about, triggers=10_000, at_once=4)
     print(asyncio.run(debt_costs(10)))  # noqa: T201
-    violations = [text for one in done for text in one.violations]
-    for text in violations[:50]:
-        print(f"VIOLATION {text}")  # noqa: T201
-    print(f"{len(violations)} violations")  # noqa: T201
-    return 1 if violations else 0
+    return failed
 
 
 if __name__ == "__main__":

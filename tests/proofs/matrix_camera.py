@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
-
-from matrix_cells import AT_ONCE, LOST, NONE, SILENT, TWICE, Cell, Fault, Place
-from matrix_ops import OPS, REFUSED, TRIGGER_OUTCOMES
-from matrix_world import AWAY, HOME, PATIENT, SHORT, STRAY
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 from smartcam import exceptions as e
 from smartcam.emulator import faults as f
+from smartcam.emulator.faults._base import MESSAGE_NAMES
 from smartcam.models import Status
-from smartcam.protocols.bvs import ResultCode
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from matrix_cells import Errors
-    from matrix_world import Bench, World
-
-__all__ = ["device_cells", "frame_cells", "request_cells"]
+from smartcam.protocols._bvs import ResultCode
+from tests.proofs.books import TRIGGER_OUTCOMES
+from tests.proofs.matrix_cells import (
+    AT_ONCE,
+    LOST,
+    NONE,
+    OPS,
+    REFUSED,
+    SILENT,
+    TWICE,
+    Cell,
+    Errors,
+    Fault,
+    Place,
+)
+from tests.proofs.matrix_world import AWAY, HOME, PATIENT, SHORT, STRAY, Bench, World
 
 UNREAD: Errors = (e.InterpretationError,)
 DENIED: Errors = (e.CommandRejectedError,)
@@ -130,10 +135,7 @@ def _broken(world: World, place: Place) -> Iterator[_Mangling]:
     on, header, word = _on(place), world.header, world.word
     container = place.frame.message == "ResultContainer"
     unread = UNREAD if container else NONE
-    any_error: dict[str, Any] = {
-        "allowed": (*TRIGGER_OUTCOMES, *SILENT, *DENIED),
-        "garbled": True,
-    }
+    any_error: dict[str, Any] = {"allowed": (*TRIGGER_OUTCOMES, *SILENT, *DENIED), "garbled": True}
     # without a magic number a wrong length shows by nothing but what is missing afterwards, and
     # what is read instead may refuse the session
     shown = {} if world.has_magic else any_error
@@ -194,7 +196,7 @@ def _wrong_words(world: World, place: Place) -> Iterator[_Mangling]:
 
 def _answers_of(world: World) -> dict[str, Mapping[str, int | str]]:
     spoken = world.spoken
-    return {name: one for name, one in ANSWERS.items() if spoken.has(f.MESSAGE_NAMES[name])}
+    return {name: one for name, one in ANSWERS.items() if spoken.has(MESSAGE_NAMES[name])}
 
 
 def _refusals(world: World, place: Place) -> Iterator[_Mangling]:
@@ -360,7 +362,7 @@ def _life_cells(world: World, name: str, place: Place, on: dict[str, Any]) -> It
     if world.transport == "udp":  # nobody tells
         lost, allowed = {"bounds": SHORT}, (*SILENT, e.ConnectFailedError)
     label = f"{place.name} {on['when']}: "
-    reboot = by_camera([f.Reboot(**on, seconds=0.05)], allowed, **lost)
+    reboot = by_camera([f.PowerCycle(**on, seconds=0.05)], allowed, **lost)
     yield Cell(f"{world.transport} reboot", world, name, label + "reboot", reboot)
     other = by_camera([f.SecondClient(**on)], allowed, **lost)
     yield Cell(f"{world.transport} second client", world, name, label + "second client", other)
@@ -375,11 +377,11 @@ def _operator_cells(world: World, name: str, place: Place, on: dict[str, Any]) -
     busy = by_camera([f.BusyForEver(**on)], SILENT, heal=_end_faults)
     yield Cell(f"{world.transport} busy", world, name, label + "busy for ever", busy)
     meddling: dict[str, tuple[f.Fault, Errors, Errors]] = {
-        "stop": (f.Stop(**on), SILENT, STOPPED),
-        "start": (f.Start(**on), (*SILENT, *DENIED), NONE),
-        "switch": (f.SwitchApplication(**on, application=AWAY), (*SILENT, *DENIED), MEDDLED),
+        "stop": (f.OperatorStop(**on), SILENT, STOPPED),
+        "start": (f.OperatorStart(**on), (*SILENT, *DENIED), NONE),
+        "switch": (f.OperatorSwitch(**on, application=AWAY), (*SILENT, *DENIED), MEDDLED),
         "switch and run": (
-            f.SwitchApplication(**on, application=AWAY, running=True),
+            f.OperatorSwitch(**on, application=AWAY, running=True),
             (*SILENT, *DENIED),
             MEDDLED,
         ),

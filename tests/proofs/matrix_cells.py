@@ -1,30 +1,231 @@
-"""The cells of the fault matrix: which fault, at which place of which command, and what may follow.
+"""The fault matrix: what is under test, the faults, and the places at which each happens.
 
-Places are found by a clean run of the same command: it says the same every time.
+A command has a bound and errors that it may end with. Places are found by a clean run of the same
+command: it says the same every time.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
-
-from matrix_ops import OPS, Op, scout
-from matrix_world import PATIENT, SHORT, Bounds, World
+from datetime import datetime
+from typing import Any, Literal, NamedTuple
 
 from smartcam import exceptions as e
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.testing.proxy import rules
+from smartcam.testing.proxy import _rules as rules
+from tests.proofs.books import LINK_LOST, TRIGGER_OUTCOMES
+from tests.proofs.matrix_world import (
+    AWAY,
+    HOME,
+    PATIENT,
+    READING,
+    SHORT,
+    Bench,
+    BenchBase,
+    Bounds,
+    World,
+    bench,
+    come_true,
+)
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from matrix_world import Bench, Heard
-
-__all__ = ["Cell", "Fault", "Place", "datagram_cells", "link_cells", "places"]
+TOKEN = (4711).to_bytes(4, "little")
 
 Errors = tuple[type[e.SmartCamError], ...]
+
+REQUEST: Errors = (e.ResponseTimeoutError, *LINK_LOST)
+CLOCK: Errors = (e.InterpretationError, *REQUEST)
+SWITCH: Errors = (e.CommandRejectedError, *REQUEST)
+HALFWAY: Errors = (e.NotRunningError, e.WrongApplicationError)
+REFUSED: Errors = (e.CommandRejectedError, e.UnsupportedError)
+"""What any answer may say in a dialect with result codes."""
+
+
+class Heard(NamedTuple):
+    """A frame as the client saw it: ``>`` out, ``<`` in."""
+
+    direction: str
+    message: str
+    wire: bytes
+
+
+@dataclass(frozen=True)
+class Op:
+    """A command."""
+
+    run: Callable[[BenchBase], Awaitable[object]]  # it; what it gives is looked at on the way
+    bound: Callable[[Bounds], float]  # seconds that it may take, of the client's bounds
+    ends: Errors  # errors that it may ever end with
+    before: Callable[[BenchBase], Awaitable[object]] | None = None  # what brings the camera there
+    opened: bool = True  # whether the client is open at first
+    home: int = HOME  # the application it begins in
+    # whether results matter to it, so that it is done with and without numbers
+    triggers: bool = False
+    stops: bool = False  # the camera may be stopped afterwards because it was told so
+    closes: bool = False  # the client is closed afterwards
+    mends: Errors = ()  # errors that a user mends who was told that this command failed
+    needs: tuple[type[m.Message], ...] = ()  # messages that a dialect must have for it
+
+
+async def _switch(bench: BenchBase) -> None:
+    await bench.camera.switch_application(AWAY)
+    really = bench.really_active()
+    bench.demand_value(really == AWAY, f"switched to {AWAY}, {really} is active")
+
+
+async def _set_clock(bench: BenchBase) -> None:
+    await bench.camera.set_clock(datetime(2024, 5, 6, 7, 8, 9))  # noqa: DTZ001 - it has no zone
+    await bench.ask_clock()
+
+
+async def _start(bench: BenchBase) -> None:
+    await bench.camera.start(timeout=bench.bounds.switch)
+
+
+async def _stop(bench: BenchBase) -> None:
+    await bench.camera.stop(timeout=bench.bounds.switch)
+
+
+async def _stopped(bench: BenchBase) -> None:
+    bench.stop_camera()
+
+
+async def _failing(bench: BenchBase) -> None:
+    """Have a trigger dropped, which its camera shows until it is told not to."""
+    assert isinstance(bench, Bench)
+    device = bench.box.device
+    assert [device.trigger(), device.trigger()] == [True, False]
+    await come_true(lambda: not device.processing)
+
+
+async def _reset_errors(bench: BenchBase) -> None:
+    assert isinstance(bench, Bench)
+    told = await bench.camera.reset_errors()
+    for status in (told, bench.box.device.status):
+        bench.demand_value(Status.OVERTRIGGERED not in status, f"not reset: {status}")
+
+
+async def _ask_status(bench: BenchBase) -> None:
+    assert isinstance(bench, Bench)
+    bits, device = bench.world.spoken.status_bits, bench.box.device
+    right = [device.status]
+    told = await bench.camera.query_status()
+    right.append(device.status)
+    words = [bits.read(bits.write(status)) for status in right]
+    bench.demand_value(told in words, f"status {told}, {words} is right")
+
+
+async def _visit(bench: BenchBase) -> None:
+    async with bench.camera.application(AWAY):
+        await bench.trigger()
+
+
+OPS: dict[str, Op] = {
+    "open": Op(
+        lambda b: b.camera.open(),
+        lambda t: t.connect + 2 * t.switch + t.close,
+        (e.ConnectFailedError, *SWITCH),
+        opened=False,
+    ),
+    "open stopped": Op(
+        lambda b: b.camera.open(),
+        lambda t: t.connect + 2 * t.switch + t.close,
+        (e.ConnectFailedError, *SWITCH),
+        before=_stopped,
+        opened=False,
+        needs=(m.Start,),
+    ),
+    "trigger": Op(lambda b: b.trigger(), lambda t: t.trigger, TRIGGER_OUTCOMES, triggers=True),
+    "input": Op(
+        lambda b: b.trigger(input=TOKEN),
+        lambda t: t.trigger,
+        TRIGGER_OUTCOMES,
+        home=READING,
+        triggers=True,
+    ),
+    "elsewhere": Op(
+        lambda b: b.trigger(AWAY),
+        lambda t: 2 * t.switch + t.trigger,
+        TRIGGER_OUTCOMES,
+        triggers=True,
+        mends=HALFWAY,
+    ),
+    "visit": Op(
+        _visit,
+        lambda t: 2 * t.switch + t.trigger,
+        (*TRIGGER_OUTCOMES, e.ResponseTimeoutError),
+        triggers=True,
+        mends=HALFWAY,
+    ),
+    "switch": Op(_switch, lambda t: t.switch, SWITCH, mends=HALFWAY),
+    "query": Op(lambda b: b.ask_application(), lambda t: t.request, REQUEST),
+    "clock": Op(lambda b: b.ask_clock(), lambda t: t.request, CLOCK),
+    "set clock": Op(_set_clock, lambda t: 2 * t.request, CLOCK),
+    "start": Op(_start, lambda t: t.switch, REQUEST, before=_stop, mends=HALFWAY, needs=(m.Start,)),
+    "stop": Op(_stop, lambda t: t.switch, REQUEST, stops=True, needs=(m.Stop,)),
+    "reboot": Op(
+        lambda b: b.camera.reboot(), lambda t: t.request + t.close, REQUEST, needs=(m.Reboot,)
+    ),
+    "status": Op(_ask_status, lambda t: t.request, REQUEST, needs=(m.GetStatus,)),
+    "reset errors": Op(
+        _reset_errors, lambda t: t.request, REQUEST, before=_failing, needs=(m.ResetErrors,)
+    ),
+    "set input": Op(
+        lambda b: b.camera.set_input(TOKEN),
+        lambda t: t.request,
+        REQUEST,
+        home=READING,
+        needs=(m.SetInputAnswer,),
+    ),
+    "close": Op(lambda b: b.close(), lambda t: t.switch + t.close, (), closes=True),
+}
+
+
+def ops_of(world: World) -> dict[str, Op]:
+    """Return the commands that a dialect has."""
+    spoken = world.spoken
+    return {name: op for name, op in OPS.items() if all(spoken.has(one) for one in op.needs)}
+
+
+def ends_of(name: str, world: World) -> Errors:
+    """Return the errors that a command may ever end with in a dialect."""
+    ends = OPS[name].ends
+    return (*ends, *REFUSED) if ends and world.spoken.capabilities.result_codes else ends
+
+
+async def scout(world: World, name: str) -> list[Heard]:
+    """Return the frames of an undisturbed command, in the order in which the client sees them."""
+    op = OPS[name]
+    async with bench(world, PATIENT, op.home) as one:
+        begin = await prepare(one, op)
+        async with asyncio.timeout(10):
+            await op.run(one)
+        asked = len(one.ear.frames)
+        asks = not op.closes and name != "reboot"
+        if asks:
+            await one.camera.query_application()  # so that what came last was heard
+        heard = [Heard(f.direction, f.message, bytes.fromhex(f.hex)) for f in one.ear.frames]
+        if asks:
+            assert (heard[asked].message, heard[-1].message) == ("Query", "QueryAnswer")
+            del heard[asked], heard[-1]
+        assert one.wrong == [], one.wrong
+        frames = heard[begin:]
+    return [one for one in frames if name != "reboot" or one.message == "Reboot"]
+
+
+async def prepare(one: BenchBase, op: Op) -> int:
+    """Bring client and camera to where the command begins; return how many frames went by."""
+    if op.opened:
+        await one.camera.open()
+    if op.before is not None:
+        await op.before(one)
+    if op.opened:
+        await one.camera.query_application()  # nothing is under way in either direction
+    return len(one.ear.frames)
+
 
 NONE: Errors = ()
 LOST: Errors = (e.ConnectionLostError,)
@@ -38,39 +239,28 @@ AT_ONCE = 0.5
 class Fault:
     """What is done to a bench, and what may come of it.
 
-    Attributes:
-        arm: does it, before the command under test.
-        fired: whether it happened.
-        allowed: errors that the command and the first triggers behind it may end with.
-        bounds: the client's timeouts.
-        at_once: errors come within this many seconds; None: within the command's own bound.
-        repairs: errors that the user is told to mend, and mends.
-        heal: ends what would last for ever.
-        lasts: seconds after which what it holds back has come; it may harm the client once more.
-        copies: how often a container may come for each time it was sent.
-        strays: a container of no run may be taken for the result of a trigger without a number,
-            and the trigger's own for the next one's.
-        garbled: other bytes stand in a frame's body, which nothing on the wire tells.
-        blind: over TCP a status is withheld or swallowed, against what the camera's manual says:
-            what the client believes of the camera is wrong until a new session tells.
-        known: why it fails as things are; a cell that passes nevertheless is a failure.
-
     ``arm``, ``fired`` and ``heal`` take the kind of bench that their cells have.
     """
 
-    arm: Callable[[Any], None]
-    fired: Callable[[Any], bool]
-    allowed: Errors
-    bounds: Bounds = SHORT
+    arm: Callable[[Any], None]  # does it, before the command under test
+    fired: Callable[[Any], bool]  # whether it happened
+    allowed: Errors  # errors that the command and the first triggers behind it may end with
+    bounds: Bounds = SHORT  # the client's timeouts
+    # errors come within this many seconds; None: within the command's own bound
     at_once: float | None = None
-    repairs: Errors = NONE
-    heal: Callable[[Any], None] | None = None
+    repairs: Errors = NONE  # errors that the user is told to mend, and mends
+    heal: Callable[[Any], None] | None = None  # ends what would last for ever
+    # seconds after which what it holds back has come; it may harm the client once more
     lasts: float = 0.0
-    copies: int = 1
+    copies: int = 1  # how often a container may come for each time it was sent
+    # a container of no run may be taken for the result of a trigger without a number, and the
+    # trigger's own for the next one's
     strays: bool = False
-    garbled: bool = False
+    garbled: bool = False  # other bytes stand in a frame's body, which nothing on the wire tells
+    # over TCP a status is withheld or swallowed, against what the camera's manual says: what the
+    # client believes of the camera is wrong until a new session tells
     blind: bool = False
-    known: str = ""
+    known: str = ""  # why it fails as things are; a cell that passes nevertheless is a failure
 
 
 class Cell(NamedTuple):
@@ -84,29 +274,19 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name."""
         return f"{self.family}/{self.world}/{self.op}/{self.label}".replace(" ", "_")
 
 
 class Place(NamedTuple):
-    """A frame of a command.
-
-    Attributes:
-        number: of its kind, from 1.
-        at: offset of its first byte in what its side says in the command.
-        nth: of all frames of its side, from 1.
-        status: what the camera said last before it.
-        following: bytes of the next frame of its side, 1 where there is none.
-        owed: answers that the camera owes then, its own among them.
-    """
+    """A frame of a command."""
 
     frame: Heard
-    number: int
-    at: int
-    nth: int
-    status: Status
-    following: int
-    owed: frozenset[str]
+    number: int  # of its kind, from 1
+    at: int  # offset of its first byte in what its side says in the command
+    nth: int  # of all frames of its side, from 1
+    status: Status  # what the camera said last before it
+    following: int  # bytes of the next frame of its side, 1 where there is none
+    owed: frozenset[str]  # answers that the camera owes then, its own among them
 
     @property
     def name(self) -> str:
@@ -194,12 +374,12 @@ def _byte_cells(
             end = {"bounds": PATIENT, "at_once": AT_ONCE}
             cut = rules.Cut(direction=one.way, at=at)
             yield Cell("tcp cut", world, name, label, by_rule(op, cut, LOST, **end))
-            reset = rules.Reset(direction=one.way, at=at)
+            reset = rules.ResetConnection(direction=one.way, at=at)
             yield Cell("tcp reset", world, name, label, by_rule(op, reset, LOST, **end))
             stall = rules.Stall(direction=one.way, at=at, both=position in outer)
             yield Cell("tcp stall", world, name, label, by_rule(op, stall, SILENT))
             if position in inner:
-                split = rules.Split(direction=one.way, at=at, pause=0.01)
+                split = rules.SplitBytes(direction=one.way, at=at, pause=0.01)
                 yield Cell(
                     "tcp split", world, name, label, by_rule(op, split, NONE, bounds=PATIENT)
                 )
@@ -209,11 +389,11 @@ def _frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Ce
     """Give each frame together with the next one, and each twice."""
     op = OPS[name]
     for one in found:
-        both = rules.Coalesce(
+        both = rules.CoalesceBytes(
             direction=one.way, at=one.at, size=one.size + one.following, seconds=0.02
         )
         yield Cell("tcp coalesce", world, name, one.name, by_rule(op, both, NONE, bounds=PATIENT))
-        twice = rules.Duplicate(direction=one.way, at=one.at, count=one.size)
+        twice = rules.DuplicateBytes(direction=one.way, at=one.at, count=one.size)
         allowed = TWICE.get(one.frame.message, NONE)
         fault = by_rule(op, twice, allowed, bounds=PATIENT, copies=2)
         yield Cell("tcp twice", world, name, one.name, fault)

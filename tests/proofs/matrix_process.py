@@ -13,37 +13,28 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from matrix_cells import AT_ONCE, LOST, SILENT, Cell, Fault
-from matrix_world import AWAY, HOME, PATIENT, SHORT, BenchBase, own_host, tracked_tasks
+from typing import Any, Self
 
 from smartcam import exceptions as e
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
-    from typing import Self
-
-    from matrix_cells import Place
-    from matrix_world import Bounds, Heard, World
-
-    from smartcam.models import Result
-
-__all__ = ["PROCESS_OPS", "ProcessCamera", "process_bench", "process_cells"]
+from smartcam.models import Result
+from tests.proofs.matrix_cells import AT_ONCE, LOST, SILENT, Cell, Fault, Place
+from tests.proofs.matrix_world import (
+    AWAY,
+    HOME,
+    PATIENT,
+    SHORT,
+    BenchBase,
+    Bounds,
+    World,
+    own_host,
+    tracked_tasks,
+)
 
 PROCESS_OPS = (
-    "open",
-    "trigger",
-    "elsewhere",
-    "switch",
-    "query",
-    "clock",
-    "set clock",
-    "start",
-    "stop",
-    "reboot",
-    "close",
+    *("open", "trigger", "elsewhere", "switch", "query", "clock", "set clock", "start", "stop"),
+    *("reboot", "close"),
 )
 
 STARTING = 30.0
@@ -54,17 +45,13 @@ SIGNALS = hasattr(signal, "SIGKILL") and hasattr(signal, "SIGSTOP")
 
 
 class ProcessCamera:
-    """The command, run again and again on one port.
-
-    Attributes:
-        url: the camera's address.
-        killed: whether it was.
-        frozen: whether it is.
-    """
+    """The command, run again and again on one port."""
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.url = ""
+        self.url = ""  # the camera's address
+        # frozen: whether it is
+        # killed: whether it was
         self.killed = self.frozen = False
         self._process: asyncio.subprocess.Process | None = None
         self._host, self._port = own_host(), 0
@@ -183,7 +170,6 @@ class ProcessBench(BenchBase):
         return answer
 
     async def ask_clock(self) -> None:
-        """Ask for the clock."""
         await self.camera.get_clock()
 
     def really_active(self) -> int:
@@ -223,12 +209,12 @@ def _at_frame(index: int, what: str) -> Fault:
     def arm(bench: Any) -> None:
         left = iter(range(index + 1))
 
-        def hook(_: Heard) -> None:
+        def hook(_: object) -> None:
             if next(left, None) == index:
                 getattr(bench.process, what)()
                 bench.happened = True
 
-        bench.ear.hook = hook
+        bench.ear.at_frame = hook
 
     def fired(bench: Any) -> bool:
         return bool(bench.happened)

@@ -1,8 +1,8 @@
 """What a cell of the fault matrix happens in: a camera that keeps books, a link, and a client.
 
-A container tells which run made it, and the camera knows when each run began. So a result belongs
-to its own trigger if its run began after ``trigger()`` was called and, where the layout has a
-number, carries the number that the client sent with that trigger.
+The camera knows when each of its runs began. So a result belongs to its own trigger if its run
+began after ``trigger()`` was called and, where the layout has a number, carries the number that the
+client sent with that trigger.
 """
 
 from __future__ import annotations
@@ -14,57 +14,25 @@ import itertools
 import sys
 import weakref
 from collections import Counter
-from datetime import timedelta
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from datetime import datetime, timedelta
+from typing import Any, Literal, NamedTuple
 
 import smartcam
 from smartcam.backoff import Backoff
-from smartcam.emulator import Application, EmulatedCamera
-from smartcam.models import Connected, Disconnected, Reconnected
-from smartcam.observers import Observer
-from smartcam.protocols import messages as m
-from smartcam.protocols.bvs import BVS, ResultCode
+from smartcam.client import SmartCamera
+from smartcam.models import Result
+from smartcam.protocols._bvs import BVS, ResultCode
+from smartcam.protocols._framed.dialect import FramedDialect
 from smartcam.testing import LinkProxy
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-    from datetime import datetime
-
-    from smartcam._client.link import TraceEntry
-    from smartcam.client import SmartCamera
-    from smartcam.emulator import LogEntry, Run
-    from smartcam.models import CameraEvent, Result
-    from smartcam.protocols.framed.dialect import FramedDialect
-
-__all__ = [
-    "AWAY",
-    "HOME",
-    "PATIENT",
-    "READING",
-    "SHORT",
-    "STRAY",
-    "Bench",
-    "BenchBase",
-    "BookKeeper",
-    "Bounds",
-    "Ear",
-    "Heard",
-    "Probe",
-    "World",
-    "bench",
-    "caring_for_tasks",
-    "come_true",
-    "own_host",
-    "tracked_tasks",
-]
+from tests.client.clientkit import imbalances, loop_reports
+from tests.proofs.books import BookKeeper, ClientEar, layout_of
 
 HOME, AWAY, READING = 1, 2, 3
 """Applications: the usual one, another one, and one that reads input data."""
 
 STRAY = -7
-"""Serial of a container that no run has made."""
-
-LAYOUT = "number: int32{mark}, serial: int32, token: int32, application: int32"
+"""In place of a run: of a container that none has made."""
 
 SETTLING = 1.5
 """Seconds until nothing is left of a closed client; a proxy's cut connection lingers for 1 s."""
@@ -82,7 +50,6 @@ class World(NamedTuple):
 
     @property
     def spoken(self) -> FramedDialect:
-        """The dialect."""
         return BVS.dialects[self.dialect]
 
     @property
@@ -108,19 +75,15 @@ class World(NamedTuple):
     @property
     def layout(self) -> str:
         """How containers are read."""
-        return LAYOUT.format(mark=" @sequence" if self.numbered else "")
+        return layout_of(self.numbered)
 
 
 class Bounds(NamedTuple):
-    """A client's timeouts, seconds.
-
-    Attributes:
-        connect: three attempts share it.
-    """
+    """A client's timeouts, seconds."""
 
     request: float
     switch: float
-    connect: float
+    connect: float  # three attempts share it
     close: float
     liveness: float
     trigger: float
@@ -133,43 +96,7 @@ SHORT = Bounds(request=0.15, switch=0.4, connect=1.0, close=0.1, liveness=0.3, t
 """Where timeouts are meant to fire."""
 
 
-# ---------------------------------------------------------------------- time and tasks
-
-
-class Probe:
-    """Measures how late the loop is."""
-
-    STEP = 0.005
-
-    def __init__(self) -> None:
-        self.worst = 0.0
-        self._lags: list[tuple[float, float]] = []
-        self._loop = asyncio.get_running_loop()
-        self._due = self._loop.time() + self.STEP
-        self._timer = self._loop.call_at(self._due, self._tick)
-
-    def lag_since(self, begun: float) -> float:
-        """Return the longest time since then that the loop was late, or is now, seconds."""
-        longest = max(0.0, self._loop.time() - self._due)
-        for at, lag in reversed(self._lags):
-            if at < begun:
-                break
-            longest = max(longest, lag)
-        return longest
-
-    def stop(self) -> None:
-        """Measure no more."""
-        self._timer.cancel()
-
-    def _tick(self) -> None:
-        now = self._loop.time()
-        lag = now - self._due
-        self.worst = max(self.worst, lag)
-        self._lags.append((now, lag))
-        if len(self._lags) > 20_000:
-            del self._lags[:10_000]
-        self._due = now + self.STEP
-        self._timer = self._loop.call_at(self._due, self._tick)
+# ---------------------------------------------------------------------- tasks
 
 
 _TASKS: contextvars.ContextVar[weakref.WeakSet[asyncio.Task[Any]] | None] = contextvars.ContextVar(
@@ -181,7 +108,6 @@ _TASKS: contextvars.ContextVar[weakref.WeakSet[asyncio.Task[Any]] | None] = cont
 def caring_for_tasks() -> Iterator[list[str]]:
     """Have the loop note whose each task is; gives what the loop itself had to report."""
     loop = asyncio.get_running_loop()
-    reports: list[str] = []
 
     def make(
         loop: asyncio.AbstractEventLoop, coro: Coroutine[Any, Any, Any], **options: Any
@@ -192,194 +118,39 @@ def caring_for_tasks() -> Iterator[list[str]]:
             mine.add(task)
         return task
 
-    handler, factory = loop.get_exception_handler(), loop.get_task_factory()
-    loop.set_exception_handler(lambda _, context: reports.append(str(context)))
+    factory = loop.get_task_factory()
     loop.set_task_factory(make)  # type: ignore[arg-type] # a protocol nobody can name
     try:
-        yield reports
+        with loop_reports() as reports:
+            yield reports
     finally:
-        loop.set_exception_handler(handler)
         loop.set_task_factory(factory)
-
-
-# ---------------------------------------------------------------------- who knows the truth
-
-
-class BookKeeper(EmulatedCamera):
-    """An emulated camera that knows when each of its runs began.
-
-    Attributes:
-        began: by the run's serial, seconds of the device's time.
-    """
-
-    def __init__(self, world: World, **options: Any) -> None:
-        self.began: dict[int, float] = {}
-        super().__init__(
-            [self._application(number, world) for number in (HOME, AWAY, READING)],
-            builtins=False,
-            running=True,
-            dialect=world.dialect,
-            transport=world.transport,
-            quirks={
-                "reboot_time": 0.05,
-                "overtriggered_time": 0.02,
-                # the order is not known, so each dialect has one of the two
-                "waiting_before_result": world.dialect == "thesis",
-            },
-            **options,
-        )
-
-    def _application(self, number: int, world: World) -> Application:
-        return Application(
-            id=number,
-            layout=world.layout,
-            generator=self._values,
-            parameters={"application": number},
-            processing_time=0.01,
-            load_time=0.01,
-            input="token: int32" if number == READING else None,
-        )
-
-    def _values(self, run: Run) -> dict[str, int]:
-        serial = len(self.began) + 1
-        self.began[serial] = run.time
-        return {
-            "number": run.number & 0x7FFFFFFF,
-            "serial": serial,
-            "token": 0 if run.input is None else run.input["token"],
-            "application": run.parameters["application"],
-        }
-
-    @property
-    def time(self) -> float:
-        """The device's time now, seconds."""
-        with self.step():
-            pass
-        return self.device.time
-
-    def has_sent(self, data: bytes) -> bool:
-        """Whether a container had exactly these bytes."""
-        return any(data == sent for _, sent in self._containers())
-
-    def sent(self) -> Counter[int]:
-        """Return how often each container was said to a client, by serial."""
-        return Counter(serial_of(data) for _, data in self._containers())
-
-    def sent_whole(self, peers: list[str]) -> Counter[int]:
-        """Return how often each container went out over some links as it is, by serial."""
-        return Counter(
-            serial_of(data)
-            for entry, data in self._containers()
-            if entry.peer in peers and entry.wire is None
-        )
-
-    def _containers(self) -> Iterator[tuple[LogEntry, bytes]]:
-        for entry in self.log:
-            if isinstance(entry.message, m.ResultContainer) and entry.direction == "out":
-                yield entry, entry.message.data
-
-
-def serial_of(data: bytes) -> int:
-    """Return the serial that a container tells."""
-    return int.from_bytes(data[4:8], "little", signed=True)
-
-
-class Heard(NamedTuple):
-    """A frame as the client saw it: ``>`` out, ``<`` in."""
-
-    direction: str
-    message: str
-    wire: bytes
-
-
-class Ear(Observer):
-    """Hears what one client says and what it is told.
-
-    Args:
-        world: what is spoken.
-
-    Attributes:
-        frames: every whole frame.
-        number: the sequence number that was set last.
-        got: containers of sessions, by serial; of the session that is open, ``now``.
-        hook: called with each frame.
-    """
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self.frames: list[Heard] = []
-        self.number: int | None = None
-        self.got: Counter[int] = Counter()
-        self.now: Counter[int] = Counter()
-        self.closing = False
-        self.hook: Callable[[Heard], None] | None = None
-        self._adopted = False
-
-    @property
-    def received(self) -> int:
-        """Containers that came over links with a session."""
-        return self.got.total() + (self.now.total() if self._adopted else 0)
-
-    def on_frame(self, entry: TraceEntry) -> None:
-        if entry.direction == "!":
-            self._take_back(entry.hex)
-            return
-        heard = Heard(entry.direction, entry.message, bytes.fromhex(entry.hex))
-        self.frames.append(heard)
-        if heard.direction == ">" and heard.message == "Connect" and not self._adopted:
-            self.now = Counter()  # an attempt; in a session it asks for the status
-        elif heard.message == "SetSequenceNumber":
-            self.number = entry.fields["number"]
-        elif heard.message == "ResultContainer" and not self.closing and entry.fields is not None:
-            self.now[serial_of(bytes.fromhex(entry.fields["data"]))] += 1
-        if self.hook is not None:
-            self.hook(heard)
-
-    def _take_back(self, payload: str) -> None:
-        """A frame was refused: a container where there is no session is none."""
-        last = self.frames[-1] if self.frames else None
-        container = last is not None and last.message == "ResultContainer"
-        header, word = self._world.header, self._world.word
-        if last is not None and container and last.wire[header:].hex() == payload:
-            self.now[serial_of(last.wire[header + word :])] -= 1
-
-    def on_state(self, event: CameraEvent) -> None:
-        if isinstance(event, (Connected, Reconnected)):
-            self._adopted = True
-        elif isinstance(event, Disconnected):
-            self.got += self.now
-            self.now, self._adopted = Counter(), False
 
 
 # ---------------------------------------------------------------------- the bench
 
 
 class BenchBase:
-    """A client of a camera, and what was found to be wrong.
-
-    Attributes:
-        wrong: what must not be, in words.
-        happened: the fault did, where nothing else tells.
-        strays: a container of no run may be taken for a result: nothing tells it from one.
-        garbled: frames are broken so that other bytes stand in their bodies, and the protocol has
-            no checksum.
-        taken_in: how often such a value was told.
-    """
+    """A client of a camera, and what was found to be wrong."""
 
     def __init__(self, world: World, bounds: Bounds, url: str, application: int) -> None:
         self.world = world
         self.bounds = bounds
         self.home = application
-        self.wrong: list[str] = []
+        self.wrong: list[str] = []  # what must not be, in words
+        # garbled: frames are broken so that other bytes stand in their bodies, and the protocol has
+        # no checksum
+        # strays: a container of no run may be taken for a result: nothing tells it from one
+        # happened: the fault did, where nothing else tells
         self.strays = self.garbled = self.happened = False
-        self.taken_in = 0
+        self.taken_in = 0  # how often such a value was told
         self._url = url
-        self.ear = Ear(world)
+        self.ear = ClientEar()
         self.camera: SmartCamera = self._connect()
 
     def _connect(self) -> SmartCamera:
         bounds = self.bounds
-        self.ear = Ear(self.world)
+        self.ear = ClientEar()
         return smartcam.connect(
             self._url,
             observers=[self.ear],
@@ -395,11 +166,7 @@ class BenchBase:
         )
 
     async def renew(self) -> None:
-        """Have a new client instead of one that is over.
-
-        Raises:
-            SmartCamError: it cannot be opened.
-        """
+        """Have a new client instead of one that is over."""
         await self.close()
         self.camera = self._connect()
         await self.camera.open()
@@ -420,9 +187,7 @@ class BenchBase:
     def audit(self) -> None:
         """Look at the client's accounts."""
         got = self.camera.statistics()
-        fates = (got.triggered, got.streamed, got.late, got.wrong_application)
-        total = sum(fates) + got.uninterpretable + got.unclaimed
-        self.demand(got.received == total, f"the fates do not add up: {got}")
+        self.wrong += imbalances(got)
         heard = self.ear.received
         self.demand(got.received == heard, f"{heard} containers heard, {got.received} in account")
 
@@ -433,10 +198,10 @@ class BenchBase:
         try:
             yield
         finally:
-            frames = ear.frames[before:]
+            frames = [*ear.frames][before:]
             said = sum(one.message == "Trigger" for one in frames)
-            answers = [one.wire[header:] for one in frames if one.message == "TriggerAnswer"]
-            refused = answers.count(ResultCode.BUSY.to_bytes(2, "little"))
+            answers = [one.hex[2 * header :] for one in frames if one.message == "TriggerAnswer"]
+            refused = answers.count(ResultCode.BUSY.to_bytes(2, "little").hex())
             text = f"one call sent {said} triggers, {refused} were refused"
             self.demand(said <= 1 + refused, text)
 
@@ -487,20 +252,20 @@ class Bench(BenchBase):
                 application, timeout=self.bounds.trigger, **options
             )
         value = result.value
-        if self.garbled and not self.box.has_sent(result.raw):
+        if self.garbled and all(result.raw != one.data for one in self.box.sent):
             self.taken_in += 1
             return result
-        if value.serial == STRAY and self.strays:
+        if value.run == STRAY and self.strays:
             self.taken_in += 1
             return result
-        began = self.box.began.get(value.serial)
-        self.demand(began is not None, f"a result of no run: {value}")
-        if began is not None:
-            late = begun - began
+        run = self.box.runs.get(value.run)
+        self.demand(run is not None, f"a result of no run: {value}")
+        if run is not None:
+            late = begun - run.began
             if late > 0 and self.strays:
                 self.taken_in += 1  # its own trigger has got the stray one
                 return result
-            self.demand(late <= 0, f"a stale result: run {value.serial} began {late:.3f} s before")
+            self.demand(late <= 0, f"a stale result: run {value.run} began {late:.3f} s before")
         if self.world.numbered:
             ours = self.ear.number
             self.demand(result.sequence == ours, f"number {result.sequence}, {ours} was set")
@@ -545,19 +310,19 @@ class Bench(BenchBase):
         return self.box.device.active_application
 
     def audit_containers(self, copies: int) -> None:
-        """Compare what came with what was sent; the session that is open has lost nothing.
+        """Compare what came with what was sent, where each container may come ``copies`` times.
 
-        Args:
-            copies: how often each container may come for each time that it was sent.
+        The session that is open has lost nothing.
         """
-        sent = self.box.sent()
-        for serial, count in (self.ear.got + self.ear.now).items():
-            if serial != STRAY and not self.garbled:
-                text = f"container {serial} came {count} times, sent {sent[serial]} times"
-                self.demand(count <= copies * sent[serial], text)
+        sent = Counter(one.run.index for one in self.box.sent)
+        for run, count in (self.ear.got + self.ear.now).items():
+            if run != STRAY and not self.garbled:
+                text = f"container {run} came {count} times, sent {sent[run]} times"
+                self.demand(count <= copies * sent[run], text)
         if self.world.transport == "tcp":
             sessions = self.box.sessions
-            missing = self.box.sent_whole(sessions) - self.ear.now
+            whole = [one for one in self.box.sent if one.whole and one.peer in sessions]
+            missing = Counter(one.run.index for one in whole) - self.ear.now
             self.demand(len(sessions) == 1, f"sessions in the end: {sessions}")
             # behind a broken frame without a magic number whole ones are read as its body
             swallowed = self.garbled and not self.world.has_magic
@@ -594,11 +359,29 @@ def own_host() -> str:
     return own if sys.platform == "linux" else "127.0.0.1"
 
 
+def _program(number: int) -> dict[str, Any]:
+    reads = "token: int32" if number == READING else None
+    return {"processing_time": 0.01, "load_time": 0.01, "input": reads}
+
+
 @contextlib.asynccontextmanager
 async def bench(world: World, bounds: Bounds, application: int) -> AsyncIterator[Bench]:
     """Have a bench; what its client leaves behind is found to be wrong."""
     async with tracked_tasks() as left:
-        box = BookKeeper(world, active=application, host=own_host())
+        box = BookKeeper(
+            {number: _program(number) for number in (HOME, AWAY, READING)},
+            marked=world.numbered,
+            dialect=world.dialect,
+            transport=world.transport,
+            quirks={
+                "reboot_time": 0.05,
+                "overtriggered_time": 0.02,
+                # the order is not known, so each dialect has one of the two
+                "waiting_before_result": world.dialect == "thesis",
+            },
+            active=application,
+            host=own_host(),
+        )
         async with box, LinkProxy(box.host, box.port, transport=world.transport) as proxy:
             made = Bench(world, bounds, box, proxy, application)
             try:

@@ -1,6 +1,6 @@
 """Mutants: small mistakes put into the code, one at a time. Does a test notice?
 
-``python tests/proofs/mutants.py --count 40 --seed 1`` draws that many mistakes for each room of
+``python -m tests.proofs.mutants --count 40 --seed 1`` draws that many mistakes for each room of
 :data:`ROOMS` and runs the room's tests on a copy of the tree with each. It prints those that no
 test noticed, which is no error: some change nothing that anybody could notice. ``--tests FOLDER``
 takes the tests of another checkout, to compare; ``--only`` repeats some by name. The tests run once
@@ -20,15 +20,13 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-ROOT = Path(__file__).parent.parent.parent
+from tests import ROOT
 
 TAKEN = ("smartcam", "tests", "examples", "docs", "pyproject.toml", "README.md")
 """What a copy of the tree has."""
@@ -47,14 +45,15 @@ class Room(NamedTuple):
 ROOMS = {
     "protocols": Room(("protocols/**/*.py",), ("tests/protocols",)),
     "layout": Room(
-        ("layout/*.py", "interpreters/*.py"), ("tests/test_layout*", "tests/interpreters")
+        ("layout/*.py", "interpreters/*.py"),
+        ("tests/layout", "tests/interpreters", "tests/test_examples.py"),
     ),
     "emulator": Room(("emulator/**/*.py",), ("tests/emulator",)),
     "client": Room(
         ("client.py", "streams.py", "_client/*.py"),
-        ("tests/test_*.py", "tests/client", "tests/proofs/test_cancel_sweep.py"),
+        ("tests/client", "tests/test_streams.py", "tests/proofs/test_cancel_sweep.py"),
     ),
-    "calibration": Room(("calibration/**/*.py",), ("tests/calibration",)),
+    "calibration": Room(("calibration/**/*.py",), ("tests/calibration", "tests/test_examples.py")),
 }
 AWAY = ("test_docs.py", "test_exports.py", "test_pytest_plugin.py", "test_dissector.py")
 """Tests of no room."""
@@ -154,7 +153,6 @@ class Mutant(NamedTuple):
 
 
 def named(name: str) -> Mutant:
-    """Return the mutant of a name."""
     room, _, rest = name.partition(":")
     module, _, place = rest.partition(":")
     if room in ROOMS and place.isdecimal() and (ROOT / module).is_file():

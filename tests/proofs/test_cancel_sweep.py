@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 import pytest
-from cancel_sweep import CALLS, ID, SMART, WIRES, Wire, calls_over, missing_calls, run_sweep
+
+from tests.proofs.cancel_sweep import (
+    CALLS,
+    ID,
+    SMART,
+    WIRES,
+    Wire,
+    calls_over,
+    missing_calls,
+    run_sweep,
+)
 
 pytestmark = pytest.mark.long
 

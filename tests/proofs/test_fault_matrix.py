@@ -8,27 +8,23 @@ import socket
 import sys
 from dataclasses import replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import fault_matrix
 import pytest
-from fault_matrix import Runner, cells, is_apart, sample
-from matrix_camera import by_camera
-from matrix_cells import LOST, NONE, SILENT, Cell, Fault, by_rule, places
-from matrix_ops import OPS, ops_of
-from matrix_world import PATIENT, BookKeeper, Ear, World
 
 import smartcam
 from smartcam.client import SmartCamera
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
-from smartcam.protocols.bvs import BVS, ResultCode
-from smartcam.testing.proxy import rules
-
-if TYPE_CHECKING:
-    from matrix_world import Bench
-
-    from smartcam._client.link import TraceEntry
+from smartcam.observers import TraceEntry
+from smartcam.protocols._bvs import BVS, ResultCode
+from smartcam.testing.proxy import _rules as rules
+from tests.proofs import fault_matrix
+from tests.proofs.books import BookKeeper, ClientEar
+from tests.proofs.fault_matrix import Runner, cells, is_apart, sample
+from tests.proofs.matrix_camera import by_camera
+from tests.proofs.matrix_cells import LOST, NONE, OPS, SILENT, Cell, Fault, by_rule, ops_of, places
+from tests.proofs.matrix_world import PATIENT, Bench, World
 
 STRIDE = 260
 """Of some 49,000 cells; the short form takes seconds."""
@@ -152,13 +148,13 @@ async def test_clock_that_is_not_the_cameras_is_wrong(monkeypatch: pytest.Monkey
 async def test_container_that_the_client_counts_and_nobody_hears_is_wrong(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    on_frame = Ear.on_frame
+    on_frame = ClientEar.on_frame
 
-    def deaf(ear: Ear, entry: TraceEntry) -> None:
+    def deaf(ear: ClientEar, entry: TraceEntry) -> None:
         if entry.message != "ResultContainer":
             on_frame(ear, entry)
 
-    monkeypatch.setattr(Ear, "on_frame", deaf)
+    monkeypatch.setattr(ClientEar, "on_frame", deaf)
     found = await judged(CUT)
     assert "0 containers heard, 2 in account" in found
     assert "lost without a loss of the link" in found

@@ -11,38 +11,28 @@ from __future__ import annotations
 
 import asyncio
 import functools
+from collections.abc import Callable, Iterator
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import pytest
-from client_judge import (
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from smartcam import Result, Status, UnsupportedError
+from tests.proofs.books import TRIGGER_OUTCOMES
+from tests.proofs.client_judge import (
     COMMAND_ERRORS,
     FED,
     FREE,
     LACKING,
     LINE,
     OTHER,
-    TRIGGER_ERRORS,
     ClientJudge,
+    RecordedCamera,
 )
-from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import (
-    RuleBasedStateMachine,
-    initialize,
-    invariant,
-    precondition,
-    rule,
-)
-
-from smartcam import (
-    Result,
-    Status,
-    UnsupportedError,
-)
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+from tests.protocols.camera_model import Options
 
 pytestmark = pytest.mark.long
 
@@ -87,10 +77,10 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         if name == "bid":  # the model does not say when it is too busy for a switch
             quirks.pop("busy_while_processing", None)
         self.box = self._make_box(name, quirks)
-        self.model.always_runs = name == "bid"
+        self.model = RecordedCamera(Options(**quirks), is_bid=name == "bid")
         self.run(self.box.start())
         self.origin = self.loop.time()
-        self.act(None, self.box.device.start, self.model.start)
+        self.act(None, *self._deed("start"))
         self.connect(application, restore=restore)
 
     @precondition(lambda self: not self.is_alive)
@@ -122,7 +112,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
                 input=None if part is None else part.to_bytes(4, "little"),
                 when_busy="wait" if wait else "refuse",
             )
-            self.begin("trigger", call, TRIGGER_ERRORS, part=part)
+            self.begin("trigger", call, TRIGGER_OUTCOMES, part=part)
         self.go(steps)
 
     @precondition(lambda self: self.can_call)
@@ -184,7 +174,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
     def trigger_in(self, application: int, timeout: float, steps: int | None) -> None:
         assert self.camera is not None
         call = self.camera.trigger(application, timeout=timeout)
-        self.begin("trigger", call, TRIGGER_ERRORS)
+        self.begin("trigger", call, TRIGGER_OUTCOMES)
         self.go(steps)
 
     @precondition(lambda self: self.can_call)
@@ -302,10 +292,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
     # ------------------------------------------------------------------ the operator
 
     def act(
-        self,
-        steps: int | None,
-        does: Callable[[], object],
-        is_noted: Callable[[float], object],
+        self, steps: int | None, does: Callable[[], object], is_noted: Callable[[float], object]
     ) -> None:
         """Do something to the camera, and tell the model at the same instant."""
 
@@ -345,7 +332,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         self.act(
             steps,
             lambda: self.box.device.switch_application(application, running=running),
-            lambda now: self.model.switch(now, application, running=running),
+            lambda now: self.model.at(now).switch_application(application, running=running),
         )
 
     @rule(seconds=st.sampled_from([0.05, 0.3]), steps=turns)
@@ -355,7 +342,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
             self.act(
                 steps,
                 functools.partial(self.box.device.set_condition, Status.SYSTEM_ERROR, on),
-                functools.partial(self.model.fault, on=on),
+                functools.partial(self._note_error, on),
             )
             self.run(asyncio.sleep(seconds if on else 0))
 
@@ -366,7 +353,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
             case "cut":
                 self.act(steps, self._cut, self._note_cut)
             case "reboot":
-                self.act(steps, self.box.device.reboot, self.model.reboot)
+                self.act(steps, self.box.device.reboot, lambda now: self.model.at(now).reboot())
             case "visit":
                 self.run(self._visit())
                 self.go(steps)
@@ -379,7 +366,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         """The session ends and the next one has lasted long enough not to be taken."""
         self.disturbance(what, None)
         self.run(asyncio.sleep(11.0))
-        self.act(None, self.box.device.start, self.model.start)
+        self.act(None, *self._deed("start"))
 
     # ------------------------------------------------------------------ time
 
@@ -406,14 +393,14 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         assert camera is not None
         if not self._is_alone() or not self._agrees():
             return
-        assert not camera._inbox._status_waiters
-        assert not camera._turns._lock.locked()
+        assert not camera._waits._statuses
+        assert not camera._lock._lock.locked()
         takes_one = device.running and device.applications[device.active_application].triggered
         if takes_one and Status.SYSTEM_ERROR not in device.status:
             self._begin_trigger(5.0)
             task = self.calls[-1].task
             self.run(asyncio.wait({task}))
-            if camera._inbox.expected in {None, camera.active_application}:
+            if camera._state.wanted.application in {None, camera.active_application}:
                 assert task.exception() is None, repr(task.exception())
 
     @precondition(lambda self: self.is_alive)
@@ -432,7 +419,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         assert camera is not None
         if not self._is_alone() or not self._agrees():
             return
-        expected, runs = camera._inbox.expected, camera._talk.wants_running
+        expected, runs = camera._state.wanted.application, camera._state.wanted.running
         before = (device.active_application, device.running, expected)
         allowed = [before]
         if camera.settings.restore and ending == "lost":
@@ -452,7 +439,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         self._settle_calls()
         assert not self.calls
         if camera.connected and self._agrees():
-            after = (device.active_application, device.running, camera._inbox.expected)
+            after = (device.active_application, device.running, camera._state.wanted.application)
             assert after in allowed, (allowed, after)
 
     @invariant()

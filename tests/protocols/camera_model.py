@@ -1,27 +1,23 @@
 """A camera as plain as it can be written: what it does, and what it must say.
 
 Made from the protocol's description (docs/protocol.md), not from the code: of the package it uses
-the words and no behaviour. Time goes millisecond by millisecond.
+the words and no behaviour. Time is whole numbers, of milliseconds where nobody says otherwise.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-__all__ = ["PROGRAMS", "CameraModel", "Options"]
-
 
 class Program(NamedTuple):
-    """An application; times are milliseconds, ``period`` makes it free-running."""
+    """An application; ``period`` makes it free-running."""
 
     loading: int
     processing: int
@@ -38,8 +34,6 @@ PROGRAMS = {
 }
 CYCLE = (10, -20, 30)
 DEPTH = 2
-CALM_AFTER = 100
-REBOOT = 300
 LOST = datetime(1970, 1, 1, tzinfo=UTC)
 LATEST = datetime.max.replace(tzinfo=UTC)
 
@@ -76,23 +70,21 @@ class CameraModel:
     """The camera: what it is doing, and what it must say.
 
     What falls on one instant happens in the order of ``ORDER``, as the emulator documents it.
-
-    Args:
-        options: the open questions.
-        is_bid: it is a BVS ID: it always runs, and every request is answered.
-        coded: answers have result codes.
     """
 
     ORDER = ("inspected", "calm", "loaded", "booted", "next run")
+    programs: ClassVar[Mapping[int, Program]] = PROGRAMS
+    calm_after = 100
+    reboot_time = 300
 
     def __init__(self, options: Options, *, is_bid: bool, coded: bool) -> None:
-        self.options = options
-        self.is_bid = is_bid
-        self.coded = coded
+        self.options = options  # the open questions
+        self.is_bid = is_bid  # it is a BVS ID: it always runs, and every request is answered
+        self.coded = coded  # answers have result codes
         self.now = 0
         self.due: dict[str, int] = {}
         self.mode: Literal["stopped", "running", "switching", "rebooting"] = "stopped"
-        self.active = 1
+        self.active = next(iter(self.programs))
         self.session = False
         self.endian = 0
         self.number = self.turn = 0
@@ -111,7 +103,7 @@ class CameraModel:
 
     @property
     def program(self) -> Program:
-        return PROGRAMS[self.active]
+        return self.programs[self.active]
 
     @property
     def status(self) -> Status:
@@ -244,7 +236,7 @@ class CameraModel:
         how = self.options.switch_while_running if must_stop else "allow"
         if self.mode == "switching":
             return
-        if target not in PROGRAMS or how == "refuse":
+        if target not in self.programs or how == "refuse":
             code = 0x1A if self.coded else 1
             self._say(m.SwitchAnswer(code=code, application=self.active))
         elif how == "allow":
@@ -298,7 +290,7 @@ class CameraModel:
         if self.run is not None:
             self.over = True
             if not self.is_bid:
-                self.due["calm"] = self.now + CALM_AFTER
+                self.due["calm"] = self.now + self.calm_after
             self._report()
             return False
         self._begin_run()
@@ -314,7 +306,7 @@ class CameraModel:
     def reboot(self) -> None:
         if self.mode != "rebooting":
             self.mode, self.session, self.run = "rebooting", False, None
-            self.due = {"booted": self.now + REBOOT}
+            self.due = {"booted": self.now + self.reboot_time}
 
     def set_condition(self, what: Status, on: bool) -> None:
         if what == 0x001:
@@ -331,11 +323,12 @@ class CameraModel:
 
     # ------------------------------------------------------------------ time
 
-    def pass_time(self, milliseconds: int) -> None:
-        for _ in range(milliseconds):
-            self.now += 1
-            if self.now in self.due.values():
-                self._happen()
+    def pass_time(self, ticks: int) -> None:
+        end = self.now + ticks
+        while self.due and min(self.due.values()) <= end:
+            self.now = min(self.due.values())
+            self._happen()
+        self.now = end
 
     @property
     def next_event_in(self) -> int | None:
@@ -361,7 +354,7 @@ class CameraModel:
         self._void()
         self.due.pop("next run", None)
         self.mode, self.load = "switching", load
-        self.due["loaded"] = self.now + PROGRAMS[load.target].loading
+        self.due["loaded"] = self.now + self.programs[load.target].loading
         self._report()
         self._happen()
 
@@ -420,11 +413,7 @@ class CameraModel:
         assert run is not None
         if self.options.waiting_before_result:
             self._report()
-        values = {
-            "number": run.number,
-            "input": run.value,
-            "cycle": CYCLE[run.turn % len(CYCLE)],
-        }
+        values = {"number": run.number, "input": run.value, "cycle": CYCLE[run.turn % len(CYCLE)]}
         if self.program.result is not None:
             word = values[self.program.result] % (1 << 32)
             data = word.to_bytes(4, self._byte_order)

@@ -10,22 +10,14 @@ from __future__ import annotations
 import struct
 from typing import Any, Literal, NamedTuple
 
+from hypothesis import strategies as st
+
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.framed.machine import LinkEnded
-
-__all__ = [
-    "ENDED",
-    "WIRES",
-    "CameraEnd",
-    "ClientEnd",
-    "Wire",
-    "framed",
-    "masked",
-    "meaning",
-    "packed",
-]
+from smartcam.protocols._framed.machine import LinkEnded
+from tests.machines import EXAMPLES
+from tests.protocols.camera_model import PROGRAMS
 
 # ---------------------------------------------------------------------- the wire
 
@@ -87,23 +79,14 @@ _SC_SILENT = frozenset({0x02, 0x33, 0x34, 0x35, 0x40, 0x41, 0x42, 0x43})
 
 
 class Wire(NamedTuple):
-    """What frames look like, and what is in them.
+    """What frames look like, and what is in them."""
 
-    Attributes:
-        magic: the magic number's bytes.
-        counted: how many bytes beside the body the length field counts.
-        word: ``struct`` letter of the header's and the bodies' integers.
-        bodies: the messages.
-        silent: ids of the requests that nobody waits for an answer to.
-        is_bid: the status word is that of BVS ID.
-    """
-
-    magic: bytes
-    counted: int
-    word: Literal["I", "H"]
-    bodies: dict[type[m.Message], Body]
-    silent: frozenset[int]
-    is_bid: bool = False
+    magic: bytes  # the magic number's bytes
+    counted: int  # how many bytes beside the body the length field counts
+    word: Literal["I", "H"]  # ``struct`` letter of the header's and the bodies' integers
+    bodies: dict[type[m.Message], Body]  # the messages
+    silent: frozenset[int]  # ids of the requests that nobody waits for an answer to
+    is_bid: bool = False  # the status word is that of BVS ID
 
     @property
     def header(self) -> int:
@@ -233,21 +216,14 @@ def meaning(wire: Wire, sender: m.Sender, frame: Frame) -> m.Message:
 
 
 class Reading(NamedTuple):
-    """What a stream says so far.
+    """What a stream says so far."""
 
-    Attributes:
-        frames: the whole frames.
-        intact: how many of them stand before the first broken place; None: nothing is broken.
-        breaks: places where no frame begins.
-        skipped: bytes from there to where one may begin.
-        rest: bytes of an unfinished frame.
-    """
-
-    frames: list[Frame]
+    frames: list[Frame]  # the whole frames
+    # how many of them stand before the first broken place; None: nothing is broken
     intact: int | None
-    breaks: int
-    skipped: int
-    rest: int
+    breaks: int  # places where no frame begins
+    skipped: int  # bytes from there to where one may begin
+    rest: int  # bytes of an unfinished frame
 
 
 def read_stream(wire: Wire, stream: bytes, limit: int) -> Reading:
@@ -317,8 +293,8 @@ class _End:
 
     def __init__(self, wire: Wire, *, datagrams: bool, limit: int) -> None:
         self.wire = wire
-        self.datagrams = datagrams
-        self.limit = limit
+        self.datagrams = datagrams  # one frame each, not a stream
+        self.limit = limit  # most bytes of a body
         self.phase: Phase = "idle"
         self.stream = b""
         self.frames_received = 0
@@ -371,20 +347,16 @@ class _End:
 
 
 class ClientEnd(_End):
-    """The client's end.
-
-    Attributes:
-        owed: ids of the answers that are owed to it.
-        unknown: messages with an unknown id that came.
-        unasked: answers that came and nobody had asked for.
-        long: bodies that were longer than documented.
-    """
+    """The client's end."""
 
     hears = m.Sender.CAMERA
 
     def __init__(self, wire: Wire, *, datagrams: bool, limit: int) -> None:
         super().__init__(wire, datagrams=datagrams, limit=limit)
-        self.owed: set[int] = set()
+        self.owed: set[int] = set()  # ids of the answers that are owed to it
+        # long: bodies that were longer than documented
+        # unasked: answers that came and nobody had asked for
+        # unknown: messages with an unknown id that came
         self.unknown = self.unasked = self.long = 0
 
     def may_say(self, message: m.Message, answered: bool | None = None) -> bool:
@@ -459,20 +431,13 @@ class ClientEnd(_End):
 
 
 class CameraEnd(_End):
-    """The camera's end: what is broken or out of place is ignored.
-
-    Args:
-        wire: what frames look like.
-        datagrams: one frame each, not a stream.
-        limit: most bytes of a body.
-        tells: bodies of a wrong length are told.
-    """
+    """The camera's end: what is broken or out of place is ignored."""
 
     hears = m.Sender.CLIENT
 
     def __init__(self, wire: Wire, *, datagrams: bool, limit: int, tells: bool) -> None:
         super().__init__(wire, datagrams=datagrams, limit=limit)
-        self.tells = tells
+        self.tells = tells  # bodies of a wrong length are told
 
     def hear(self, data: bytes) -> list[m.Message]:
         """Take bytes; return the messages that count."""
@@ -523,3 +488,145 @@ class CameraEnd(_End):
             case _ if self.phase in {"idle", "disconnected"}:
                 return None
         return message
+
+
+LIMIT = 64
+"""Bytes of payload that both machines take."""
+
+TIMES = st.one_of(
+    st.sampled_from([1, 10, 25, 30, 39, 40, 41, 50, 100, 150, 300]), st.integers(0, 120)
+)
+"""Milliseconds."""
+
+# ---------------------------------------------------------------------- what is said
+
+ORDERS: st.SearchStrategy[m.Message] = st.sampled_from(
+    [
+        *(m.Start(), m.Trigger(), m.Query(), m.Start(), m.Trigger(), m.GetClock(), m.Stop()),
+        *(m.GetStatus(), m.ResetErrors()),  # of one dialect; elsewhere they must be refused
+    ]
+)
+SESSIONS: st.SearchStrategy[m.Message] = st.sampled_from([m.Connect(), m.Connect(), m.Disconnect()])
+_CLOCKS = st.builds(
+    m.SetClock,
+    year=st.sampled_from([0, 1970, 2016, 2023, 9999, 10000, 0xFFFFFFFF]),
+    month=st.sampled_from([0, 2, 12, 13]),
+    day=st.sampled_from([0, 1, 28, 30, 31]),
+    hour=st.sampled_from([0, 23, 24]),
+    minute=st.sampled_from([0, 59, 60]),
+    second=st.sampled_from([0, 59, 60]),
+)
+SETTINGS: st.SearchStrategy[m.Message] = st.one_of(
+    st.builds(
+        m.SwitchApplication, application=st.sampled_from([*PROGRAMS, *PROGRAMS, 0, 6, 1 << 31])
+    ),
+    st.builds(
+        m.SetSequenceNumber,
+        number=st.sampled_from([0, 7, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF])
+        | st.integers(0, 0xFFFFFFFF),
+    ),
+    st.builds(m.SetInput, data=st.binary(min_size=4, max_size=4) | st.binary(max_size=6)),
+    _CLOCKS,
+)
+_INPUTS: st.SearchStrategy[m.Message] = st.builds(
+    m.SetInput, data=st.binary(min_size=4, max_size=4)
+)
+INSPECTIONS: st.SearchStrategy[list[m.Message]] = st.one_of(
+    st.sampled_from([[m.Trigger()], [m.Start(), m.Trigger()], [m.Trigger(), m.Trigger()]]),
+    st.tuples(_INPUTS, st.just(m.Trigger())).map(list),
+    st.lists(_INPUTS, max_size=3),
+)
+WORK: st.SearchStrategy[list[m.Message]] = st.one_of(
+    st.lists(ORDERS | SETTINGS, min_size=1, max_size=4),
+    st.sampled_from(
+        [
+            [m.Stop(), m.SwitchApplication(application=one), *then]
+            for one in PROGRAMS
+            for then in ([], [m.Start()])
+        ]
+    ),
+    st.sampled_from(
+        [
+            [m.SetSequenceNumber(number=0xFFFFFFFF), m.Start(), m.Trigger()],
+            [m.SetClock(year=2024, month=2, day=29, hour=23, minute=59, second=59), m.GetClock()],
+        ]
+    ),
+)
+MISFITS: tuple[m.Message, ...] = (
+    m.SwitchApplication(application=-1),
+    m.SwitchApplication(application=1 << 32),
+    m.SetSequenceNumber(number=1 << 32),
+    m.UnknownMessage(message_id=1 << 32, payload=b""),
+    m.UnknownMessage(message_id=-1, payload=b""),
+)
+
+# ---------------------------------------------------------------------- what is broken
+
+IDS = sorted({body.message_id for wire in WIRES.values() for body in wire.bodies.values()})
+_SIZES = st.sampled_from([0, 1, 3, 4, 5, 8, 9, 24, 25, LIMIT, LIMIT + 1])
+PAYLOADS = _SIZES.flatmap(lambda size: st.binary(min_size=size, max_size=size))
+
+
+class Extra(NamedTuple):
+    """A whole frame of any message, perhaps with something behind its body."""
+
+    message: m.Message
+    more: bytes
+
+
+class Bomb(NamedTuple):
+    """A header with any length field, the limit broken or not."""
+
+    length: int
+    message_id: int
+
+
+class Magic(NamedTuple):
+    """Some bytes and the beginning of a magic number."""
+
+    before: bytes
+    size: int
+
+
+_UNKNOWN: st.SearchStrategy[m.Message] = st.builds(
+    m.UnknownMessage,
+    message_id=st.sampled_from([0x00, 0x21, 0x77, 0xFFFFFFFF]),
+    payload=st.binary(max_size=6),
+)
+_REPORTS: st.SearchStrategy[m.Message] = st.sampled_from(
+    [one for one in EXAMPLES if getattr(one, "sender", None) is m.Sender.CAMERA]
+)
+SURPRISES = st.builds(
+    Extra, message=_UNKNOWN | _REPORTS, more=st.sampled_from([b"", b"", b"\0", b"more"])
+)
+NOISE: st.SearchStrategy[Any] = st.one_of(
+    SURPRISES,
+    st.builds(Extra, message=st.sampled_from(EXAMPLES), more=st.binary(max_size=2)),
+    st.tuples(st.sampled_from([*IDS, 0x00, 0x77, 0xFFFFFFFF]), PAYLOADS),
+    st.binary(min_size=1, max_size=20),
+    st.builds(
+        Bomb,
+        length=st.sampled_from([0, 1, 3, LIMIT, LIMIT + 5, 1 << 20, 0xFFFFFFFF]),
+        message_id=st.sampled_from(IDS),
+    ),
+    st.builds(Magic, before=st.binary(max_size=4), size=st.integers(0, 4)),
+)
+
+
+def noise(wire: Wire, what: Any) -> bytes:
+    """Return the bytes of some noise."""
+    match what:
+        case bytes():
+            return what
+        case Extra(message=message, more=more):
+            message_id, payload = framed(wire, message)
+            return packed(wire, (masked(wire, message_id), payload + more))
+        case Bomb(length=length, message_id=message_id):
+            numbers = (masked(wire, length), message_id)
+            numbers = numbers if wire.magic else numbers[::-1]
+            return wire.magic + struct.pack(f"<2{wire.word}", *numbers)
+        case Magic(before=before, size=size):
+            return before + wire.magic[:size]
+        case _:
+            message_id, payload = what
+            return packed(wire, (masked(wire, message_id), payload))

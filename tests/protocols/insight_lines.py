@@ -6,13 +6,13 @@ import struct
 from typing import TYPE_CHECKING
 
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.framed.machine import Event, State
-from smartcam.protocols.insight.dialect import NATIVE, InSightDialect
-from smartcam.protocols.insight.machine import InSightMachine
+from smartcam.protocols._base import Role, Transport
+from smartcam.protocols._framed.machine import Event, State
+from smartcam.protocols._insight.dialect import NATIVE, InSightDialect
+from smartcam.protocols._insight.machine import InSightMachine
 
 if TYPE_CHECKING:
-    from smartcam.protocols.framed.framing import Frame
+    from smartcam.protocols._framed.framing import Frame
 
 GREETING = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "
 LOGIN = GREETING + b"Password: User Logged In\r\n"

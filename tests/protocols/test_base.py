@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
-from machines import CODE, NO_ID
 
 from smartcam.exceptions import ConfigurationError, FrameError, MessageError
 from smartcam.models import Capabilities, Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import (
+from smartcam.protocols._base import (
     POLICIES,
     UNDOCUMENTED,
-    Code,
+    CodeMeaning,
     Dialect,
     Policy,
     Protocol,
@@ -24,13 +24,10 @@ from smartcam.protocols.base import (
     Transport,
     Verdict,
 )
-from smartcam.protocols.bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols.framed.machine import Machine
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from smartcam.protocols.framed.framing import Frame
+from smartcam.protocols._bvs import B16, BID, BVS, HANDBOOK, THESIS
+from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._framed.machine import Machine
+from tests.machines import CODE, NO_ID
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
 TCP, UDP = Transport.TCP, Transport.UDP
@@ -58,7 +55,7 @@ def test_policies_only_a_client_on_tcp_fails_and_only_a_camera_wants_exact_lengt
 
 def test_verdicts_are_the_four_that_a_request_can_have() -> None:
     assert [one.value for one in Verdict] == ["done", "busy", "unknown", "refused"]
-    assert Code("not documented", Verdict.REFUSED) == UNDOCUMENTED
+    assert CodeMeaning("not documented", Verdict.REFUSED) == UNDOCUMENTED
 
 
 # ---------------------------------------------------------------------- a dialect of another kind
@@ -78,7 +75,7 @@ class Spoken(Dialect):
     def application_ids(self) -> range:
         return range(10)
 
-    def code(self, code: int, request: type[m.Message] | None = None) -> Code:
+    def code(self, code: int, request: type[m.Message] | None = None) -> CodeMeaning:
         return UNDOCUMENTED
 
     def has(self, message_type: type[m.Message]) -> bool:
@@ -99,7 +96,8 @@ class Spoken(Dialect):
     def with_parameters(self, parameters: Mapping[str, str]) -> Spoken:
         if parameters.get("room") == "":
             raise ConfigurationError("a room has a name")
-        return dataclasses.replace(self, **dict(parameters))
+        options: dict[str, Any] = dict(parameters)
+        return dataclasses.replace(self, **options)
 
 
 SPOKEN = Spoken(name="spoken", about="words", source="made for the tests")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import pytest
-from machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, NO_ID, camera, client, label
 
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Protocol, Transport
-from smartcam.protocols.bvs import (
+from smartcam.protocols._base import Protocol, Transport
+from smartcam.protocols._bvs import (
     B16,
     BID,
     BVS,
@@ -19,11 +18,10 @@ from smartcam.protocols.bvs import (
     THESIS,
     MessageId,
 )
-from smartcam.protocols.framed.framing import HeaderLayout
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import HeaderLayout
 from smartcam.registry import PROTOCOLS
-
-if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
+from tests.machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, NO_ID, camera, client, label
 
 each_dialect = pytest.mark.parametrize("dialect", DIALECTS, ids=label)
 
@@ -78,12 +76,7 @@ def test_bvs_message_ids_are_the_documents() -> None:
 
 @pytest.mark.parametrize(
     ("dialect", "without"),
-    [
-        (HANDBOOK, {0x16}),
-        (THESIS, {0x16}),
-        (B16, {0x16}),
-        (BID, {0x35, 0x41, 0x42, 0x43}),
-    ],
+    [(HANDBOOK, {0x16}), (THESIS, {0x16}), (B16, {0x16}), (BID, {0x35, 0x41, 0x42, 0x43})],
     ids=label,
 )
 def test_bvs_dialects_have_the_documents_ids(dialect: FramedDialect, without: set[int]) -> None:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING
 
 import pytest
-from machines import DIALECTS
 
 from smartcam.exceptions import FrameError
-from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
-
-if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
+from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
+from tests.machines import DIALECTS
 
 MAGIC = bytes.fromhex("50535642")
 STATUS = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")
@@ -266,6 +263,7 @@ def test_framer_without_magic_looks_at_lengths_only() -> None:
     ("data", "skipped", "left"),
     [
         (b"noise" + STATUS, 5, STATUS),
+        (b"x" + STATUS, 1, STATUS),
         (b"noise" + MAGIC[:3], 5, MAGIC[:3]),
         (b"noise" + MAGIC[:1], 5, MAGIC[:1]),
         (b"PSVxPSV", 4, b"PSV"),

@@ -10,22 +10,25 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from insight_lines import BITMAP, DIGITS, GREETING, IMAGE_LINES, LOGIN, Talk, with_cells
 
-from smartcam.exceptions import (
-    ConfigurationError,
-    FrameError,
-    LocalProtocolError,
-    UnsupportedError,
-)
+from smartcam.exceptions import ConfigurationError, FrameError, LocalProtocolError, UnsupportedError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.framed.framing import Frame
-from smartcam.protocols.framed.machine import Event, LinkEnded, LinkFailed, State
-from smartcam.protocols.insight.dialect import INSIGHT, NATIVE
-from smartcam.protocols.insight.machine import READ_SIZE, Command, InSightMachine, Piece, Reply
-from smartcam.protocols.insight.words import MAX_LINE
+from smartcam.protocols._base import Role, Transport
+from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._framed.machine import Event, LinkEnded, LinkFailed, State
+from smartcam.protocols._insight.dialect import INSIGHT, NATIVE
+from smartcam.protocols._insight.machine import READ_SIZE, Command, InSightMachine, Piece, Reply
+from smartcam.protocols._insight.words import MAX_LINE
+from tests.protocols.insight_lines import (
+    BITMAP,
+    DIGITS,
+    GREETING,
+    IMAGE_LINES,
+    LOGIN,
+    Talk,
+    with_cells,
+)
 
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 WELCOME = m.ConnectAnswer(code=1, version=1)

@@ -12,16 +12,16 @@ import itertools
 import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from insight_lines import LOGIN, Talk, with_cells
 
-from smartcam.emulator.clock import NANOSECONDS
-from smartcam.emulator.insight.commands import Commands
-from smartcam.emulator.insight.device import InSightDevice
+from smartcam.emulator._clock import NANOSECONDS
+from smartcam.emulator._insight.commands import InSightCommands
+from smartcam.emulator._insight.device import InSightDevice
 from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import messages as m
-from smartcam.protocols.framed.machine import Event, State
-from smartcam.protocols.insight.machine import ONLINE, Command, Reply
-from smartcam.protocols.insight.words import LineReader
+from smartcam.protocols._framed.machine import Event, State
+from smartcam.protocols._insight.machine import ONLINE, Command, Reply
+from smartcam.protocols._insight.words import LineReader
+from tests.protocols.insight_lines import LOGIN, Talk, with_cells
 
 REQUESTS: list[m.Message] = [
     m.GetStatus(),
@@ -59,7 +59,7 @@ class Wires(RuleBasedStateMachine):
         job = {"cells": {"A1": lambda _: next(runs)}, "load_time": 0.3}
         jobs = [{**job, "file": file} for file in ("7bolts.job", "12nuts.job", "spare.job")]
         self.device = InSightDevice(jobs, online=True)
-        self.commands = Commands(self.device)
+        self.commands = InSightCommands(self.device)
         self.heard = LineReader(nul_ends=True)
         self.busy = self.going = False
         self.to_camera, self.to_client = bytearray(), bytearray(LOGIN)

@@ -4,11 +4,33 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from typing import TYPE_CHECKING
 
 import pytest
-from grids import over
-from machines import (
+
+from smartcam.exceptions import (
+    FrameError,
+    LocalProtocolError,
+    MessageError,
+    RemoteProtocolError,
+    UnsupportedError,
+)
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import Policy, Role, Transport
+from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame
+from smartcam.protocols._framed.machine import (
+    TRANSITIONS,
+    Counters,
+    Event,
+    LinkEnded,
+    LinkFailed,
+    Machine,
+    ResultBurst,
+    State,
+)
+from tests.machines import (
     BIG_ENDIAN_NUMBER,
     CODE,
     DIALECTS,
@@ -23,32 +45,7 @@ from machines import (
     label,
     machine,
 )
-
-from smartcam.exceptions import (
-    FrameError,
-    LocalProtocolError,
-    MessageError,
-    RemoteProtocolError,
-    UnsupportedError,
-)
-from smartcam.models import Status
-from smartcam.protocols import messages as m
-from smartcam.protocols.base import Policy, Role, Transport
-from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame
-from smartcam.protocols.framed.machine import (
-    TRANSITIONS,
-    Counters,
-    LinkEnded,
-    LinkFailed,
-    Machine,
-    ResultBurst,
-    State,
-)
-
-if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
-    from smartcam.protocols.framed.machine import Event
+from tests.strategies import over
 
 TCP, UDP = Transport.TCP, Transport.UDP
 CLIENT, CAMERA = m.Sender.CLIENT, m.Sender.CAMERA
@@ -573,10 +570,7 @@ def test_trace_sees_each_frame_of_both_directions(role: Role, dialect: FramedDia
     ours: m.Message = m.Trigger() if role is Role.CLIENT else STATUS_MESSAGE
     made.send(ours)
     made.receive_data(dialect.encode(theirs))
-    assert seen == [
-        (role.sends, dialect.to_frame(ours)),
-        (role.receives, dialect.to_frame(theirs)),
-    ]
+    assert seen == [(role.sends, dialect.to_frame(ours)), (role.receives, dialect.to_frame(theirs))]
 
 
 def test_trace_sees_the_error_for_bytes_that_make_no_frame() -> None:

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from machines import DIALECTS, camera, client, feed, label, machine, one_by_one
-from strategies import bodies, chunkings, garbage, messages, split, streams
 
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Policy, Role, Transport
-from smartcam.protocols.bvs import HANDBOOK
-from smartcam.protocols.framed.framing import Frame, Framer
-from smartcam.protocols.framed.machine import LinkEnded, LinkFailed, Machine, State
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from smartcam.protocols.framed.dialect import FramedDialect
-    from smartcam.protocols.framed.machine import Event
+from smartcam.protocols._base import Policy, Role, Transport
+from smartcam.protocols._bvs import HANDBOOK
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import Frame, Framer
+from smartcam.protocols._framed.machine import Event, LinkEnded, LinkFailed, Machine, State
+from tests.machines import DIALECTS, camera, client, feed, label, machine, one_by_one
+from tests.strategies import bodies, chunkings, garbage, messages, split, streams
 
 MAX_LENGTH = 64
 STATUS = bytes.fromhex("50535642 08000000 12000000 80020000 00000000")

@@ -9,30 +9,25 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Iterator
 from itertools import cycle
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unittest import mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from machines import DIALECTS, client, label, one_by_one
 
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Policy
-from smartcam.protocols.bvs import HANDBOOK, THESIS
-from smartcam.protocols.framed import framing, machine
-from smartcam.protocols.framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer
-from smartcam.protocols.framed.machine import LinkFailed, ResultBurst, State
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from smartcam.protocols.framed.dialect import FramedDialect
-    from smartcam.protocols.framed.framing import HeaderLayout
-    from smartcam.protocols.framed.machine import Machine
+from smartcam.protocols._base import Policy
+from smartcam.protocols._bvs import HANDBOOK, THESIS
+from smartcam.protocols._framed import framing, machine
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
+from smartcam.protocols._framed.machine import LinkFailed, Machine, ResultBurst, State
+from tests.machines import DIALECTS, client, label, one_by_one
 
 LARGE, FIRST_READ, MOST_READ = 32, 32, 128
 SIZES = st.one_of(

@@ -10,14 +10,29 @@ from __future__ import annotations
 
 import itertools
 import sys
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import pytest
-from camera_model import PROGRAMS, Options
-from core_lines import Line, Way, refused
-from core_model import ENDED, WIRES, packed
-from core_station import Station
-from core_words import (
+from hypothesis import HealthCheck, seed, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from smartcam.emulator._bvs.device import OPERATOR_CONDITIONS
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import Role, Transport
+from tests.machines import EXAMPLES
+from tests.protocols.camera_model import PROGRAMS, Options
+from tests.protocols.core_model import (
+    ENDED,
     IDS,
     INSPECTIONS,
     LIMIT,
@@ -29,28 +44,12 @@ from core_words import (
     SETTINGS,
     SURPRISES,
     TIMES,
+    WIRES,
     WORK,
     noise,
+    packed,
 )
-from hypothesis import HealthCheck, seed, settings
-from hypothesis import strategies as st
-from hypothesis.stateful import (
-    RuleBasedStateMachine,
-    initialize,
-    invariant,
-    precondition,
-    rule,
-    run_state_machine_as_test,
-)
-from machines import EXAMPLES
-
-from smartcam.emulator.bvs.device import OPERATOR_CONDITIONS
-from smartcam.models import Status
-from smartcam.protocols import messages as m
-from smartcam.protocols.base import Role, Transport
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from tests.protocols.core_station import Line, Station, Way, refused
 
 PROFILE = settings()
 IS_NIGHTLY = PROFILE.max_examples >= settings.get_profile("nightly").max_examples
@@ -76,11 +75,7 @@ KINDS = {
 }
 """What happens in a history beside a client that asks and a camera that answers."""
 
-FAMILIES = {
-    "magic": ("handbook", "thesis"),
-    "b16": ("b16", "b16 with quirk code"),
-    "bid": ("bid",),
-}
+FAMILIES = {"magic": ("handbook", "thesis"), "b16": ("b16", "b16 with quirk code"), "bid": ("bid",)}
 """Dialects that share their tests."""
 assert {name for names in FAMILIES.values() for name in names} == {*WIRES}
 
@@ -125,12 +120,7 @@ class Cores(RuleBasedStateMachine):
         warm=st.booleans(),
     )
     def switch_on(
-        self,
-        which: int,
-        options: Options,
-        cuts: list[int],
-        keep: int | None,
-        warm: bool,
+        self, which: int, options: Options, cuts: list[int], keep: int | None, warm: bool
     ) -> None:
         dialect = self.dialects[which % len(self.dialects)]
         self.dialect = dialect

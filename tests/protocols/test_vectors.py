@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import re
 import tomllib
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
-from grids import over
-from machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, NO_ID, camera, client, feed, receiver_of
 
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols.framed.framing import Frame, Framer
-from smartcam.protocols.framed.machine import TRANSITIONS, Machine, State
+from smartcam.protocols._base import Role, Transport
+from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
+from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._framed.framing import Frame, Framer
+from smartcam.protocols._framed.machine import TRANSITIONS, Machine, State
+from tests import ROOT
+from tests.machines import (
+    BIG_ENDIAN_NUMBER,
+    CODE,
+    DIALECTS,
+    NO_ID,
+    camera,
+    client,
+    feed,
+    receiver_of,
+)
+from tests.strategies import over
 
-if TYPE_CHECKING:
-    from smartcam.protocols.framed.dialect import FramedDialect
-
-FOLDER = Path(__file__).parent.parent / "vectors"
-FILES = {
+ROWS = tomllib.loads((ROOT / "tests" / "data" / "vectors.toml").read_text(encoding="utf-8"))
+TABLES = {
     "bvs_handbook": HANDBOOK,
     "bvs_thesis": THESIS,
     "bvs_b16": B16,
@@ -38,7 +45,7 @@ PUBLISHED = {
     "bvs_b16_big_endian_number": {"B-6"},
     "bvs_bid": {f"I-{number}" for number in range(1, 12)},
 }
-"""The published vectors that the files hold; the others hold none."""
+"""The published vectors that the tables hold; the others hold none."""
 
 HEADER_SIZES = {"handbook": 12, "thesis": 12, "b16": 4, "bid": 4}
 ID_PLACES = {"handbook": 8, "thesis": 8, "b16": 0, "bid": 0}
@@ -57,8 +64,7 @@ class Vector(NamedTuple):
 
 
 def read_vectors(name: str) -> list[Vector]:
-    text = (FOLDER / f"{name}.toml").read_text(encoding="utf-8")
-    return [read_vector(FILES[name], row) for row in tomllib.loads(text)["vector"]]
+    return [read_vector(TABLES[name], row) for row in ROWS[name]]
 
 
 def read_vector(dialect: FramedDialect, row: dict[str, Any]) -> Vector:
@@ -66,7 +72,7 @@ def read_vector(dialect: FramedDialect, row: dict[str, Any]) -> Vector:
         "name", "sender", "hex", "message", "fields", "meaning", "source", "grade"
     }  # fmt: skip
     message_type: type[m.Message] = getattr(m, row["message"])
-    fields: dict[str, Any] = row["fields"]
+    fields: dict[str, Any] = {**row["fields"]}
     for name, wire in m.wire_fields(message_type):
         if name in fields and wire is m.Wire.DATA:
             fields[name] = bytes.fromhex(fields[name])
@@ -83,21 +89,21 @@ def read_vector(dialect: FramedDialect, row: dict[str, Any]) -> Vector:
     )
 
 
-VECTORS = [vector for name in FILES for vector in read_vectors(name)]
+VECTORS = [vector for name in TABLES for vector in read_vectors(name)]
 
 each_vector = over("vector", VECTORS, lambda one: f"{one.dialect.label}: {one.name}")
-each_file = pytest.mark.parametrize("name", FILES)
+each_table = pytest.mark.parametrize("name", TABLES)
 
 
-def test_vectors_have_a_file_for_each_dialect_and_quirk() -> None:
-    assert {path.stem for path in FOLDER.glob("*.toml")} == {*FILES}
-    assert {*FILES.values()} == {*DIALECTS}
+def test_vectors_have_a_table_for_each_dialect_and_quirk() -> None:
+    assert {*ROWS} == {*TABLES}
+    assert {*TABLES.values()} == {*DIALECTS}
 
 
-@each_file
+@each_table
 def test_vectors_of_a_dialect_hold_every_message_of_its_table(name: str) -> None:
     """Those of a quirk hold what differs by it."""
-    dialect = FILES[name]
+    dialect = TABLES[name]
     rows = {*dialect.table} - ({*B16.table} if dialect.quirks else set())
     vectors = read_vectors(name)
     switch = {m.SwitchAnswer} if dialect is CODE else set()  # the codes differ, not the layout
@@ -105,7 +111,7 @@ def test_vectors_of_a_dialect_hold_every_message_of_its_table(name: str) -> None
     assert len({one.name for one in vectors}) == len(vectors)
 
 
-@each_file
+@each_table
 def test_vectors_hold_what_is_published_and_say_what_is_not(name: str) -> None:
     vectors = read_vectors(name)
     assert {one.grade for one in vectors} <= {"published", "derived", "inferred"}

@@ -6,8 +6,8 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import smartcam
-from smartcam._client.link import TraceEntry
 from smartcam.models import CameraEvent, Connected
+from smartcam.observers import TraceEntry
 from smartcam.recording import Recorder, load_recording
 
 if TYPE_CHECKING:

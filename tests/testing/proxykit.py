@@ -6,16 +6,13 @@ import asyncio
 import contextlib
 import socket
 import struct
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any, NamedTuple
 
 import pytest
 
 from smartcam.testing import LinkProxy
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
-
-    from smartcam.testing.proxy.rules import Rule
+from smartcam.testing.proxy._rules import Rule
 
 HOST = "127.0.0.1"
 SHORT = 0.05
@@ -35,18 +32,14 @@ async def until(condition: Callable[[], object], seconds: float = 5) -> None:
 
 
 class End(asyncio.Protocol):
-    """One end of a connection; it closes nothing by itself.
-
-    Attributes:
-        chunks: what came, delivery by delivery, and the loop time of each in ``times``.
-        eof: FIN came.
-        lost: what ended it, None while it is open; "closed" where no error did.
-    """
+    """One end of a connection; it closes nothing by itself."""
 
     def __init__(self, *, echo: bool = False) -> None:
+        # what came, delivery by delivery, and the loop time of each in ``times``
         self.chunks: list[bytes] = []
         self.times: list[float] = []
-        self.eof = False
+        self.eof = False  # FIN came
+        # what ended it, None while it is open; "closed" where no error did
         self.lost: str | None = None
         self.transport: Any = None
         self._echo = echo
@@ -223,7 +216,6 @@ class Mailbox(asyncio.DatagramProtocol):
         self.error = exc
 
     def send(self, *datagrams: bytes) -> None:
-        """Send."""
         for one in datagrams:
             self.transport.sendto(one)
 

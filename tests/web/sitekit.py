@@ -5,16 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from collections.abc import AsyncIterator, Callable
+from typing import Any, NamedTuple, Self
 from urllib.parse import quote
 
 import aiohttp
 
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.web import EmulatorSite
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
 
 TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
 
@@ -145,7 +143,7 @@ class Raw:
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
 
-    async def ask(self, *lines: str) -> tuple[int, bytes]:
+    async def call(self, *lines: str) -> tuple[int, bytes]:
         """Send a request's head and return the answer's status and body."""
         self.writer.write("\r\n".join((*lines, "", "")).encode())
         async with asyncio.timeout(60):

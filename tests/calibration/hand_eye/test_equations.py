@@ -1,0 +1,235 @@
+"""The equations of a camera and a robot, their derivatives, and what no method can make up for."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
+from smartcam.calibration._hand_eye.closed_forms import LINEAR, check_motion, solve_linear
+from smartcam.calibration._hand_eye.equations import (
+    Observations,
+    PixelObservations,
+    PoseObservations,
+    RobotNoise,
+    RobotPoses,
+    RobotSigmas,
+    Solution,
+    adjust,
+    carried,
+    sums,
+)
+from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
+from smartcam.calibration._lens.model import CameraModel
+from tests.calibration.scenes import CAMERA, SHEET, refused, scene
+
+vectors = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(np.array)
+
+
+def problem(in_hand: bool, seed: int = 5, poses: int = 7) -> tuple[RobotPoses, Rigid, Rigid, Rigid]:
+    """Return a robot, the camera, the target, and the views' poses."""
+    truth = scene("eye-in-hand" if in_hand else "eye-to-hand", seed=seed, poses=poses)
+    robot = RobotPoses(Rigid.stacked(one.rigid for one in truth.robot_poses), in_hand)
+    camera, target = truth.camera_pose.rigid, truth.target_pose.rigid
+    return robot, camera, target, carried(camera, robot, target)
+
+
+def pixels(
+    seen: Rigid, model: CameraModel = CAMERA, free: tuple[int, ...] = ()
+) -> PixelObservations:
+    points = np.broadcast_to(SHEET.points, (len(seen.translation), len(SHEET.points), 3))
+    before = points @ np.swapaxes(seen.rotation, 1, 2) + seen.translation[:, None]
+    shown = model.project(before.reshape(-1, 3)).reshape(*points.shape[:2], 2)
+    white = np.broadcast_to(np.eye(2) / 0.1, (*points.shape[:2], 2, 2))
+    return PixelObservations(white, model, points, shown, free=free)
+
+
+def poses(seen: Rigid, free: tuple[int, ...] = ()) -> PoseObservations:
+    white = np.broadcast_to(np.diag([1e3] * 6), (len(seen.translation), 6, 6))
+    return PoseObservations(white, seen, free=free)
+
+
+@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "free"),
+    [("pixels", ()), ("pixels", (0, 1, 2, 3, 4, 5, 6, 7, 8)), ("poses", ()), ("poses", (0,))],
+)
+def test_derivatives_are_those_of_small_steps(
+    in_hand: bool, kind: str, free: tuple[int, ...]
+) -> None:
+    robot, camera, target, seen = problem(in_hand)
+    observed: Any = pixels(seen, free=free) if kind == "pixels" else poses(seen, free)
+    # away from the truth, and with corrections
+    random = np.random.default_rng(1)
+    near = Solution(camera.turned_before(random.normal(scale=2e-3, size=6)), target)
+    start = adjust(robot, observed, near, RobotNoise(RobotSigmas(1e-2, 1e-3)))
+    at = dataclasses.replace(
+        start,
+        corrections=random.normal(scale=1e-2, size=start.corrections.shape),
+        camera=camera.turned_before(random.normal(scale=2e-3, size=6)),
+    )
+    total = sums(robot, observed, at)[0]
+    unknown = 12 + observed.extra
+
+    def cost(steps: Any, own: Any) -> float:
+        corrected = RobotPoses(robot.poses.turned_before(at.corrections + own), in_hand)
+        moved = carried(
+            at.camera.turned_before(steps[:6]), corrected, at.target.turned_before(steps[6:12])
+        )
+        return float((observed.evaluate(moved, at.change + steps[12:])[0] ** 2).sum())
+
+    right = total[:, :, -1] + (total[:, :, :6] @ at.corrections[..., None])[..., 0]
+    scale = np.full(unknown, 1e-6)
+    scale[13:17] = 1e-3
+    for index in range(unknown):
+        step = np.zeros(unknown)
+        step[index] = scale[index] if observed.extra else 1e-6
+        slope = (cost(step, 0.0) - cost(-step, 0.0)) / (4 * step[index])
+        assert slope == pytest.approx(right[:, 6 + index].sum(), rel=1e-4, abs=1e-2)
+    for index in range(6):
+        own = np.zeros_like(at.corrections)
+        own[2, index] = 1e-6
+        slope = (cost(np.zeros(unknown), own) - cost(np.zeros(unknown), -own)) / 4e-6
+        assert slope == pytest.approx(right[2, index], rel=1e-4, abs=1e-2)
+
+
+@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize("noise", [None, RobotNoise(RobotSigmas(1e-3, 1e-3))])
+def test_adjust_of_exact_samples_finds_the_truth(in_hand: bool, noise: RobotNoise | None) -> None:
+    robot, camera, target, seen = problem(in_hand)
+    observed: Observations
+    for observed in (pixels(seen), poses(seen)):
+        step = np.array([0.05, -0.04, 0.03, 0.01, 0.02, -0.01])
+        start = Solution(camera.turned_before(step), target.turned_before(-step))
+        found = adjust(robot, observed, start, noise)
+        assert found.cost < 1e-9
+        np.testing.assert_allclose(found.camera.translation, camera.translation, atol=1e-8)
+        np.testing.assert_allclose(found.target.translation, target.translation, atol=1e-8)
+        np.testing.assert_allclose(found.corrections, 0.0, atol=1e-8)
+
+
+def test_adjust_that_begins_behind_the_camera_has_no_cost() -> None:
+    robot, camera, target, seen = problem(in_hand=True)
+    turned = camera.turned_before(np.array([math.pi, 0, 0, 0, 0, 0]))
+    found = adjust(robot, pixels(seen), Solution(turned, target))
+    assert found.cost == math.inf
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_evaluate_of_no_lens_and_no_target_is_nan(number: int) -> None:
+    *_, seen = problem(True)
+    observed = pixels(seen, free=(0, 1, 2))
+    change = np.zeros(3)
+    change[number] = -2000.0
+    off, slopes = observed.evaluate(seen, change)
+    fits = observed.evaluate(seen, np.zeros(3))
+    assert np.isnan(off).all()
+    assert np.isnan(slopes).all()
+    assert [off.shape, slopes.shape] == [one.shape for one in fits]
+
+
+def test_adjust_corrects_a_robot_that_is_off() -> None:
+    robot, camera, target, seen = problem(in_hand=False, poses=12)
+    off = np.random.default_rng(2).normal(scale=[1e-3] * 3 + [3e-4] * 3, size=(12, 6))
+    said = RobotPoses(robot.poses.turned_before(off), in_hand=False)
+    truth = Solution(camera, target)
+    found = adjust(said, pixels(seen), truth, RobotNoise(RobotSigmas(1e-3, 3e-4)))
+    plain = adjust(said, pixels(seen), truth)
+    kept = [np.linalg.norm(one.camera.translation - camera.translation) for one in (found, plain)]
+    assert kept[0] < kept[1] / 1.5
+    assert np.corrcoef(found.corrections[:, :3].ravel(), -off[:, :3].ravel())[0, 1] > 0.6
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_noise_of_the_robot_is_told(*, shared: bool) -> None:
+    robot, camera, target, seen = problem(in_hand=True, poses=30)
+    random = np.random.default_rng(3)
+    sigmas = RobotSigmas(4e-4, 2e-4)
+    off = random.normal(scale=np.repeat(sigmas, 3), size=(30, 6))
+    said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
+    observed = pixels(seen)
+    noise = 0.1 * random.normal(size=observed.pixels.shape)
+    blurred = dataclasses.replace(observed, pixels=observed.pixels + noise)
+    found = adjust_noisy(said, blurred, Solution(camera, target), shared=shared)
+    assert found.noise is not None
+    np.testing.assert_allclose(found.noise.robot, sigmas, rtol=0.3)
+    assert found.noise.shared == pytest.approx(1.0, abs=0.8 if shared else 0.0)
+
+
+def test_noise_that_a_views_points_share_is_told() -> None:
+    """Each view is shifted as a whole by ten times what its points' noise explains."""
+    robot, camera, target, seen = problem(in_hand=True, poses=20)
+    random = np.random.default_rng(4)
+    observed = pixels(seen)
+    points = len(SHEET.points)
+    shift = random.normal(scale=0.1 * 10 / math.sqrt(points), size=(20, 6))
+    from_pixels = np.array([1 / 1200 / 0.05] * 3 + [0.5 / 1200] * 3)
+    moved = Rigid(
+        exp_rotation(shift[:, :3] * from_pixels[:3]) @ seen.rotation,
+        seen.translation + shift[:, 3:] * from_pixels[3:],
+    )
+    shown = pixels(moved).pixels + 0.1 * random.normal(size=observed.pixels.shape)
+    blurred = dataclasses.replace(observed, pixels=shown)
+    found = adjust_noisy(robot, blurred, Solution(camera, target), shared=True)
+    assert found.noise is not None
+    assert found.noise.shared > 3.0
+    assert found.noise.robot.translation < 2e-4
+
+
+@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize("name", LINEAR)
+def test_closed_forms_of_exact_samples_find_the_truth(name: str, in_hand: bool) -> None:
+    robot, camera, target, seen = problem(in_hand)
+    found = solve_linear(name, robot, seen)
+    assert found is not None
+    np.testing.assert_allclose(found[0].rotation, camera.rotation, atol=1e-6)
+    np.testing.assert_allclose(found[0].translation, camera.translation, atol=1e-6)
+    np.testing.assert_allclose(found[1].translation, target.translation, atol=1e-6)
+
+
+def test_closed_forms_are_the_ones_that_were_named() -> None:
+    """OpenCV takes a method without its name for an output, and always solves by Tsai."""
+    robot, _, _, seen = problem(in_hand=True)
+    shaken = RobotPoses(
+        robot.poses.turned_before(np.random.default_rng(5).normal(scale=1e-3, size=(7, 6))), True
+    )
+    found = {name: solve_linear(name, shaken, seen) for name in LINEAR}
+    places = {tuple(one[0].translation.round(9)) for one in found.values() if one is not None}
+    assert len(places) >= 6
+    trap = cv2.calibrateHandEye(  # type: ignore[call-overload]
+        list(shaken.poses.rotation),
+        list(shaken.poses.translation),
+        list(seen.rotation),
+        list(seen.translation),
+        cv2.CALIB_HAND_EYE_PARK,
+    )
+    tsai = found["tsai"]
+    assert tsai is not None
+    np.testing.assert_allclose(trap[1].ravel(), tsai[0].translation, atol=1e-12)
+
+
+def test_closed_forms_that_give_no_rotation_give_nothing() -> None:
+    robot, _, _, seen = problem(in_hand=True)
+    same = RobotPoses(Rigid(robot.poses.rotation[[0] * 7], robot.poses.translation), True)
+    still = Rigid(seen.rotation[[0] * 7], seen.translation)
+    with np.errstate(all="ignore"):
+        for name in LINEAR:
+            found = solve_linear(name, same, still)
+            if found is not None:
+                assert np.isfinite(found[0].translation).all()
+
+
+@given(st.floats(0.0, 2 * math.pi), vectors)
+def test_motion_about_any_single_axis_is_refused(angle: float, axis: Any) -> None:
+    length = float(np.linalg.norm(axis))
+    axis = axis / length if length > 1e-3 else np.array([0.0, 0.0, 1.0])
+    turns = exp_rotation(np.outer(angle + 0.2 * np.arange(6), axis))
+    with refused("INSUFFICIENT_ROTATION", "turns about two axes or more"):
+        check_motion(RobotPoses(Rigid(turns, np.random.default_rng(1).normal(size=(6, 3))), True))

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from smartcam.calibration._least_squares import (
+    Normal,
+    inverse_scaled,
+    minimize,
+    solve_scaled,
+)
+from smartcam.exceptions import CalibrationError
+
+RANDOM = np.random.default_rng(2)
+SHARED = RANDOM.normal(size=(30, 4))
+OWN = RANDOM.normal(size=(3, 10, 2))
+DENSE = np.zeros((30, 10))
+"""All columns: the shared ones, then two of each of three poses."""
+
+DENSE[:, :4] = SHARED
+for number in range(3):
+    DENSE[10 * number : 10 * number + 10, 4 + 2 * number : 6 + 2 * number] = OWN[number]
+
+
+def normal(residuals: np.ndarray) -> Normal:
+    parts = SHARED.reshape(3, 10, 4)
+    off = residuals.reshape(3, 10, 1)
+    turned = OWN.swapaxes(1, 2)
+    return Normal(
+        float((residuals**2).sum()),
+        SHARED.T @ SHARED,
+        SHARED.T @ residuals,
+        turned @ OWN,
+        (turned @ off)[..., 0],
+        turned @ parts,
+    )
+
+
+def test_step_without_damping_is_that_of_all_unknowns_at_once() -> None:
+    residuals = RANDOM.normal(size=30)
+    shared, own = normal(residuals).step(0.0)
+    expected = np.linalg.lstsq(DENSE, residuals, rcond=None)[0]
+    np.testing.assert_allclose(np.concatenate([shared, own.ravel()]), expected)
+
+
+def test_covariance_is_the_blocks_of_the_whole_inverse() -> None:
+    shared, own = normal(np.zeros(30)).covariance()
+    expected = np.linalg.inv(DENSE.T @ DENSE)
+    np.testing.assert_allclose(shared, expected[:4, :4])
+    for number, block in enumerate(own):
+        some = slice(4 + 2 * number, 6 + 2 * number)
+        np.testing.assert_allclose(block, expected[some, some])
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_minimize_takes_back_what_does_not_gain(*, fails: bool) -> None:
+    """Of x^2 + 1000 (y - x^2)^2, whose valley is bent; steps beyond a wall lead nowhere."""
+
+    def evaluate(at: np.ndarray) -> Normal:
+        x, y = at
+        residuals = np.array([-x, np.sqrt(1000.0) * (x * x - y)])
+        jacobian = np.array([[1.0, 0.0], [-2 * np.sqrt(1000.0) * x, np.sqrt(1000.0)]])
+        return Normal.nothing(2, 1, 0)._replace(
+            cost=float((residuals**2).sum()),
+            shared=jacobian.T @ jacobian,
+            shared_right=jacobian.T @ residuals,
+        )
+
+    def moved(at: np.ndarray, shared: np.ndarray, _own: np.ndarray) -> np.ndarray:
+        if fails and np.abs(shared).max() > 2.0:
+            raise CalibrationError("too far")
+        there: np.ndarray = at + shared
+        return there
+
+    found, last = minimize(np.array([3.0, 5.0]), evaluate, moved, gain=1e-12)
+    np.testing.assert_allclose(found, 0.0, atol=1e-6)
+    assert last.cost < 1e-12
+
+
+def test_minimize_of_what_has_no_cost_gives_it_back() -> None:
+    nothing = Normal.nothing(2, 1, 6)._replace(cost=np.inf)
+    found, last = minimize(7, lambda _: nothing, lambda at, _shared, _own: at, gain=1e-9)
+    assert (found, last.cost) == (7, np.inf)
+    assert np.isnan(last.covariance()[0]).all()
+
+
+def test_scaled_equations_of_many_units_are_solved() -> None:
+    matrix = np.array([[1e12, 1e3], [1e3, 1e-4]])
+    expected = np.array([2e-9, -3e7])
+    np.testing.assert_allclose(solve_scaled(matrix, matrix @ expected), expected, rtol=1e-6)
+    inverse = np.array([[1e-4, -1e3], [-1e3, 1e12]]) / 9.9e7
+    np.testing.assert_allclose(inverse_scaled(matrix), inverse, rtol=1e-9)

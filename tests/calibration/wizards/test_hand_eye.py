@@ -1,0 +1,181 @@
+"""The wizard of a camera on a robot, with a rendered sheet and a robot that knows its poses."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._hand_eye.result import HandEyeCalibration
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration.formats._robots import ROBOTS, pose_to
+from smartcam.calibration.simulation._images import render
+from smartcam.calibration.wizards._hand_eye import SUGGESTIONS, hand_eye_wizard
+from smartcam.calibration.wizards._journal import Journal
+from smartcam.calibration.wizards._sequence import WizardSession
+from tests.calibration.scenes import SHEET, scene
+from tests.calibration.wizards.bench import say
+
+CAMERA = CameraModel(size=(480, 360), matrix=np.array([[450.0, 0, 240], [0, 447, 176], [0, 0, 1]]))
+TRUTH = scene("eye-in-hand", poses=6, seed=7)
+
+
+@functools.cache
+def picture(number: int) -> Any:
+    """Return what the camera sees at a pose of the robot."""
+    return render(SHEET, CAMERA, TRUTH.seen(TRUTH.robot_poses[number]), blur=0.7)
+
+
+class Cell:
+    """A robot with a camera; each picture is taken at the next pose."""
+
+    def __init__(self) -> None:
+        self.left = list(range(len(TRUTH.robot_poses)))
+        self.hidden = 0
+
+    async def take_picture(self) -> Any:
+        if self.hidden:
+            self.hidden -= 1
+            return np.full(CAMERA.size[::-1], 128, dtype=np.uint8)
+        return picture(self.left[0])
+
+    async def read_robot(self) -> Transform:
+        return self.pose if self.hidden else TRUTH.robot_poses[self.left.pop(0)]
+
+    @property
+    def pose(self) -> Transform:
+        return TRUTH.robot_poses[self.left[0]]
+
+
+def begin(folder: Path, cell: Cell, journal: Path | None = None) -> WizardSession:
+    wizard = hand_eye_wizard(
+        target=SHEET,
+        take_picture=cell.take_picture,
+        read_robot=cell.read_robot,
+        save_to=lambda name: folder / f"{name}.json",
+        camera=CAMERA,
+    )
+    opened = None if journal is None else Journal(journal)
+    return WizardSession(wizard, opened, parameters={"name": "gripper"})
+
+
+async def test_views_taken_give_a_calibration_in_a_file(tmp_path: Path) -> None:
+    session = begin(tmp_path, Cell())
+    view = await say(session, {"setup": "eye-in-hand"})
+    for number in range(6):
+        assert view["step"] == f"view-{number + 1}"
+        assert SUGGESTIONS[number] in view["description"]
+        view = await say(session)
+    view = await say(session, {"next": "calculate"})
+    assert view["step"] == "calculate"
+    view = await say(session)
+    assert (view["step"], view["defaults"]["next"]) == ("review", "accept")
+    assert any("mm rms on the sheet, at views that were left out" in one for one in view["notes"])
+    view = await say(session)
+    assert view["step"] == "save"
+    view = await say(session)
+    assert view["type"] == "result", view
+    found = HandEyeCalibration.load(tmp_path / "gripper.json")
+    assert TRUTH.errors(found.camera_pose)[1] < 2e-4
+    assert len(found.views) == 6
+
+
+async def test_view_without_a_sheet_is_taken_again(tmp_path: Path) -> None:
+    cell = Cell()
+    session = begin(tmp_path, cell)
+    await say(session)
+    cell.hidden = 1
+    view = await session.submit(session.token, None)
+    assert "base" in view["errors"]
+    assert view["step"] == "view-1"
+    cell.hidden = 0
+    assert (await say(session))["step"] == "view-2"
+
+
+async def test_view_removed_is_calculated_without(tmp_path: Path) -> None:
+    session = begin(tmp_path, Cell())
+    await say(session)
+    for _ in range(5):
+        await say(session)
+    await say(session, {"next": "calculate"})
+    await say(session)
+    view = await say(session, {"next": "remove", "view": 2})
+    assert (view["step"], view["notes"]) == ("calculate", ["4 views"])
+    view = await say(session)
+    assert view["notes"][0].startswith("4 views, ")
+    view = await say(session, {"next": "more"})
+    assert view["step"] == "view-5"
+
+
+async def test_views_that_give_nothing_say_why(tmp_path: Path) -> None:
+    cell = Cell()
+    cell.left = [0] * 3
+    session = begin(tmp_path, cell)
+    for _ in range(4):
+        await say(session)
+    await say(session, {"next": "calculate"})
+    view = await say(session)
+    assert view["notes"][0].startswith("POSES_TOO_SIMILAR: hand-eye: expected at least 3")
+    assert view["defaults"]["next"] == "more"
+
+
+async def test_views_are_there_again_after_a_crash(tmp_path: Path) -> None:
+    cell = Cell()
+    session = begin(tmp_path, cell, tmp_path / "journal")
+    for _ in range(4):
+        view = await say(session)
+    left = len(cell.left)
+    session.close()
+    again = begin(tmp_path, cell, tmp_path / "journal")
+    assert again.current["step"] == view["step"] == "view-4"
+    assert len(cell.left) == left
+    again.close()
+
+
+async def test_poses_typed_as_the_robot_writes_them_are_the_same(tmp_path: Path) -> None:
+    cell = Cell()
+    wizard = hand_eye_wizard(
+        suggested=SHEET,
+        take_picture=cell.take_picture,
+        save_to=lambda name: tmp_path / f"{name}.json",
+        camera=CAMERA,
+    )
+    session = WizardSession(wizard, parameters={"name": "gripper", "robot": "kuka"})
+    for step in ("about", "sheet", "rulers"):
+        assert session.current["step"] == step
+        await say(session)
+    for number in range(6):
+        view = session.current
+        assert ("svg" in (view["preview"] or {})) == (number > 0)
+        await say(session, typed(cell.pose))
+        cell.left.pop(0)
+    view = await session.submit(session.token, {"next": "view", "x": 1.0})
+    assert view["errors"]["a"] == "no answer"
+    await say(session, {"next": "calculate"})
+    for _ in range(3):
+        await say(session)
+    found = HandEyeCalibration.load(tmp_path / "gripper.json")
+    assert TRUTH.errors(found.camera_pose)[1] < 2e-4
+    assert found.robot_poses[0].source == "flange"
+
+
+async def test_pose_typed_that_is_none_costs_no_picture(tmp_path: Path) -> None:
+    cell = Cell()
+    wizard = hand_eye_wizard(
+        target=SHEET, take_picture=cell.take_picture, save_to=lambda name: tmp_path / name
+    )
+    session = WizardSession(wizard, parameters={"robot": "xyzw"})
+    await say(session)
+    pose = dict.fromkeys(("x", "y", "z", "qx", "qy", "qz"), 0.1)
+    cell.hidden = 1
+    view = await session.submit(session.token, {**pose, "qw": 0.2})
+    assert "a quaternion of length 1" in view["errors"]["base"]
+    assert cell.hidden == 1
+    session.close()
+
+
+def typed(pose: Transform) -> dict[str, float]:
+    return dict(zip(ROBOTS["kuka"].numbers, pose_to("kuka", pose), strict=True))

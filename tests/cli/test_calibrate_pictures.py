@@ -1,0 +1,205 @@
+"""``smartcam calibrate --wizard sheet``, ``hand-eye``: pictures of a folder or a camera."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from smartcam._cli.calibrate import calibrate
+from smartcam.calibration._detection.find import find_target
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._optional_imports import load
+from smartcam.calibration._sheet.calibration import SheetCalibration, calibrate_sheet, fit_corners
+from smartcam.calibration._targets import Checkerboard, target_to_data
+from smartcam.calibration.formats._cameras import write_camera_info
+from smartcam.calibration.simulation._images import render
+from smartcam.emulator._insight.camera import EmulatedInSight
+from tests.cli.commandline import closed_port, emulators, run
+from tests.processes import Outcome, Process
+
+TARGET = Checkerboard(columns=9, rows=6, square=0.025, origin_mark=True)
+CAMERA = CameraModel(
+    size=(640, 480), matrix=np.array([[700.0, 0, 320], [0, 700.0, 240], [0, 0, 1]])
+)
+SEEN = Transform("camera", "target", np.diag([1.0, -1.0, -1.0]), np.array([-0.1, 0.06, 0.5]))
+OFFSET = np.array([0.4, -0.1, 0.02])
+"""Where the origin of the sheet lies before the robot; its axes are the robot's."""
+
+ABOUT = {"unit": "m", "side": "-z", "touch_sigma": 0.1}
+
+
+def bitmap(width: int = 640) -> bytes:
+    image = render(TARGET, CAMERA, SEEN)[:, :width]
+    data: bytes = load("cv2").imencode(".bmp", image)[1].tobytes()
+    return data
+
+
+def calibrating(folder: Path, lines: list[Any], *options: str) -> Outcome:
+    """Run the command with these answers."""
+    stdin = "".join(f"{json.dumps(one)}\n" for one in lines).encode()
+    arguments = ("--folder", str(folder / "kept"), "--json", *options)
+    return run(*arguments, stdin=stdin, main=lambda: calibrate(prog_name="smartcam calibrate"))
+
+
+def answers(*given: dict[str, Any]) -> list[dict[str, Any]]:
+    return [{"answers": one} for one in given]
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[str]:
+    """Options: what is on the sheet, the lens, and where pictures come."""
+    target, lens, pictures = (tmp_path / name for name in ("target.json", "lens.yaml", "ftp"))
+    target.write_text(json.dumps(target_to_data(TARGET)))
+    write_camera_info(lens, CAMERA)
+    pictures.mkdir()
+    return ["--target", str(target), "--lens", str(lens), "--pictures", str(pictures)]
+
+
+def test_calibrate_by_a_sheet_and_a_folder_gives_a_calibration(
+    tmp_path: Path, files: list[str]
+) -> None:
+    options = ["--wizard", "sheet", "--json", "--folder", str(tmp_path / "kept"), *files]
+    with Process("smartcam", "calibrate", *options) as process:
+        number = shots = 0
+        while True:
+            number += 1
+            view = json.loads(process.read_until(b"\n", count=number).splitlines()[-1])
+            if view["type"] == "result":
+                break
+            assert view["errors"] == {}
+            answer: dict[str, Any] = ABOUT if view["step"] == "about" else {}
+            if view["step"].startswith("touch-"):
+                index = 9 * (view["defaults"]["row"] - 1) + view["defaults"]["column"] - 1
+                answer = dict(zip("xyz", (OFFSET + TARGET.points[index]).tolist(), strict=True))
+            process.write(json.dumps({"answers": answer}).encode() + b"\n")
+            # a camera that goes on taking pictures: some come behind the button
+            while view["step"] == "picture" and not process.says(0.5):
+                (tmp_path / "ftp" / f"shot{shots}.bmp").write_bytes(bitmap())
+                shots += 1
+    assert view["result"]["file"] == "sheet.json"
+    found = SheetCalibration.load(tmp_path / "kept" / "sheet.json")
+    place = found.transform(CAMERA.project(SEEN.apply(TARGET.points[[10]])))[0]
+    assert place == pytest.approx(OFFSET + TARGET.points[10], abs=1e-5)
+
+
+def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) -> None:
+    plane = fit_corners(TARGET, [0, 8, 53], OFFSET + TARGET.points[[0, 8, 53]])
+    path = tmp_path / "sheet.json"
+    calibrate_sheet(find_target(render(TARGET, CAMERA, SEEN), TARGET), plane).save(path)
+    options = ("--interpret-as", "localizations", "--calibration", str(path))
+    with closed_port() as url:
+        run("trigger", url, *options).failed(2, "it was made with --y-down: give it here, too")
+        run("trigger", url, *options, "--y-down").failed(3)
+
+
+def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
+    tmp_path: Path, files: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from smartcam.calibration.wizards import _pictures as pictures
+
+    monkeypatch.setattr(pictures, "DEADLINE", 0.3)
+    monkeypatch.setattr(pictures.PictureFolder.__init__, "__kwdefaults__", {"deadline": 0.3})
+    lines = [*answers(ABOUT, {}, {}, {}), {"do": "abort"}]
+    done = calibrating(tmp_path, lines, "--wizard", "sheet", *files)
+    assert done.code == 130
+    assert [line.get("step") for line in done.lines[-3:]] == ["picture", "picture", None]
+    assert "within 0.3 s" in done.lines[-2]["errors"]["base"]
+
+
+def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(
+    tmp_path: Path, files: list[str]
+) -> None:
+    lines = [
+        *answers({"robot": "kuka", "setup": "eye-to-hand"}, {}, {}, {"x": 1.0}),
+        {"do": "abort"},
+    ]
+    done = calibrating(tmp_path, lines, "--wizard", "hand-eye", *files)
+    assert [line.get("step") for line in done.lines] == [
+        "about", "sheet", "rulers", "view-1", "view-1", None,
+    ]  # fmt: skip
+    properties = done.lines[3]["schema"]["properties"]
+    assert list(properties) == ["x", "y", "z", "a", "b", "c"]
+    assert (properties["x"]["x-unit"], "x-unit" in properties["a"]) == ("mm", False)
+    assert set(done.lines[4]["errors"]) == {"y", "z", "a", "b", "c"}
+
+
+def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_says_so(
+    tmp_path: Path, files: list[str]
+) -> None:
+    lines = [*answers(ABOUT, {}, {}, {}), {"do": "abort"}]
+    with emulators(tmp_path, ()) as urls:
+        done = calibrating(tmp_path, lines, urls[0], "--wizard", "sheet", *files[:4])
+    assert (
+        "its protocol sends no pictures; expected one that does, or --pictures FOLDER"
+        in (done.lines[-2]["errors"]["base"])
+    )
+
+
+@pytest.mark.real_time
+async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
+    tmp_path: Path, files: list[str]
+) -> None:
+    lines = [*answers(ABOUT, {}, {}, {}), {"do": "abort"}]
+    options = ["--wizard", "sheet", *files[:4]]
+    async with EmulatedInSight(image=render(TARGET, CAMERA, SEEN), online=True) as emulator:
+        command = ("calibrate", emulator.url, "--json", "--folder", str(tmp_path), *options)
+        with Process("smartcam", *command) as process:
+            process.write("".join(f"{json.dumps(one)}\n" for one in lines).encode())
+            views = (await asyncio.to_thread(process.wait)).lines
+    assert [view.get("step") for view in views] == [
+        "about", "sheet", "rulers", "picture", "touch-1", None,
+    ]  # fmt: skip
+    assert views[4]["notes"][0] == "54 of 54 points of the target seen"
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--wizard", "sheet"], "a URL is missing"),
+        (["--pictures", "."], "a URL is missing"),
+        (["bvs://x", "--check", "t", "--wizard", "sheet"], "no --wizard beside it"),
+    ],
+)
+def test_calibrate_with_options_that_contradict_says_so(
+    tmp_path: Path, options: list[str], text: str
+) -> None:
+    done = calibrating(tmp_path, [], *options)
+    assert done.code == 2
+    assert text in done.err
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--wizard", "sheet", "--pictures", "nowhere"], "nowhere: expected a folder"),
+        (["bvs://x", "--target", "nowhere"], "--target nowhere: No such file"),
+        (["bvs://x", "--lens", "nowhere"], "--lens nowhere: No such file"),
+    ],
+)
+def test_calibrate_with_options_that_cannot_work_says_so(
+    tmp_path: Path, options: list[str], text: str
+) -> None:
+    calibrating(tmp_path, [], *options).failed(2, text)
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [("{", "no JSON"), ("[]", "expected what smartcam sheet"), ("{}", "expected a kind of")],
+)
+def test_calibrate_with_a_target_that_is_none_says_so(
+    tmp_path: Path, content: str, text: str
+) -> None:
+    (tmp_path / "target.json").write_text(content)
+    options = ("bvs://x", "--target", str(tmp_path / "target.json"))
+    calibrating(tmp_path, [], *options).failed(2, "target.json: ", text)
+
+
+def test_calibrate_with_a_lens_that_is_none_says_so(tmp_path: Path) -> None:
+    (tmp_path / "lens.yaml").write_text("no: lens\n")
+    calibrating(tmp_path, [], "bvs://x", "--lens", str(tmp_path / "lens.yaml")).failed(2, "--lens:")

@@ -1,0 +1,127 @@
+"""``smartcam demo --pick``: seven parts picked by a robot that knew nothing of the table."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import xml.etree.ElementTree as ET
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numpy.typing import NDArray
+
+from smartcam._cli import demo_pick
+from smartcam._cli.demo_pick import SimulatedRobot, nine_marks, pick
+from smartcam._cli.options import Options
+from smartcam.emulator._scene import PIECES, TABLE_SIZE, TablePose, TableScene
+from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.models import Header, Localization, Pose, Position, Quaternion
+from tests.cli.commandline import run
+
+NOON = datetime(2026, 3, 4, 12, tzinfo=UTC)
+
+
+async def picked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int = 1
+) -> list[dict[str, Any]]:
+    """Run the demo with JSON and return its lines."""
+    await pick(Options(as_json=True), str(tmp_path / "pick.svg"), seed)
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+async def test_pick_takes_all_seven_and_says_how_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = await picked(tmp_path, capsys)
+    assert [line["step"] for line in lines if "step" in line] == [1, 2, 3, 4, 5, 6]
+    (picks,) = (line["picks"] for line in lines if "picks" in line)
+    assert {one["part"] for one in picks} == set(PIECES)
+    assert all(one["taken"] and one["error"] < 3 * one["predicted"] < 1e-3 for one in picks)
+    assert max(abs(one["turned"]) for one in picks) < math.radians(0.6)
+    (left,) = (line["left"] for line in lines if "left" in line)
+    assert left == 0
+
+
+async def test_pick_prediction_holds_over_many_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    errors, predicted = 0.0, 0.0
+    for seed in range(10):
+        (one,) = (x for x in await picked(tmp_path, capsys, seed) if "predicted" in x)
+        assert one["picked"] == 7
+        errors, predicted = errors + one["error"] ** 2, predicted + one["predicted"] ** 2
+    assert 0.8 < math.sqrt(errors / predicted) < 1.25
+
+
+async def test_pick_tells_its_story_and_writes_a_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "pick.svg"
+    await pick(Options(), str(path), 1)
+    out = capsys.readouterr().out
+    for text in ("9 marks", "Calibrated (similarity)", "7 of 7 picked", "0 parts", str(path)):
+        assert text in out
+    texts = {node.text for node in ET.parse(path).getroot().iter() if node.tag.endswith("text")}  # noqa: S314
+    assert {"1", "9", "parallelogram", "robot x", "camera x"} <= texts
+
+
+class _Bumpy(SimulatedRobot):
+    """The mark in the middle lies 2 mm above the table."""
+
+    def touch(self, mark: TablePose) -> NDArray[Any]:
+        middle = mark == nine_marks()["mark_5"]
+        return super().touch(mark) - 0.002 * middle * self.tool_z
+
+
+async def test_pick_warns_of_marks_that_lie_in_no_plane(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demo_pick, "SimulatedRobot", _Bumpy)
+    await pick(Options(), str(tmp_path / "pick.svg"), 1)
+    out = capsys.readouterr().out
+    assert "   NOT_PLANAR: " in out
+    assert "point 5 is the furthest" in out
+
+
+async def test_pick_with_a_picture_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"--picture .*: No such file"):
+        await pick(Options(as_json=True), str(tmp_path / "no" / "pick.svg"), 1)
+
+
+async def test_pick_without_the_extra_names_it_before_anything_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    with pytest.raises(MissingExtraError, match=r"scipy: pip install .smartcam\[calibration\]"):
+        await pick(Options(), str(tmp_path / "pick.svg"), 1)
+    assert capsys.readouterr().out == ""
+
+
+def test_marks_lie_over_the_whole_table() -> None:
+    marks = nine_marks()
+    assert len({(mark.x, mark.y) for mark in marks.values()}) == 9
+    assert marks["mark_1"] == TablePose(0.025, 0.025, 0.0)
+    assert marks["mark_9"] == pytest.approx((TABLE_SIZE[0] - 0.025, TABLE_SIZE[1] - 0.025, 0))
+
+
+def test_robot_that_goes_beside_a_part_misses_it() -> None:
+    scene = TableScene()
+    robot = SimulatedRobot(scene, seed=1)
+    square = scene.pieces["square"]
+    beside = robot.table.apply([square.x + 0.0021, square.y, 0.0]).tolist()
+    header = Header(1, NOON, "robot")
+    pose = Pose(header, Position(*beside), Quaternion())
+    found = robot.pick(Localization("square", 1.0, 0, pose), 1e-4)
+    assert not found.taken
+    assert found.error == pytest.approx(0.0021)
+    assert "square" in scene.pieces
+
+
+def test_demo_with_pick_is_a_command(tmp_path: Path) -> None:
+    picture = tmp_path / "seen.svg"
+    out = run("demo", "--pick", "--picture", str(picture), "--seed", "4").done().out
+    assert "7 of 7 picked" in out
+    assert picture.read_text(encoding="utf-8").startswith("<svg ")

@@ -1,0 +1,387 @@
+"""Every way to fail or be ended: exit code, one line on stderr, in time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.cli.commandline import (
+    ACTIVE_21,
+    BOMB,
+    BUSY,
+    CONNECT,
+    CONNECTED,
+    DIE,
+    DISCONNECT,
+    HELLO_WORLD,
+    INSPECTING,
+    QUERY,
+    SCENARIO,
+    SESSION,
+    STOPPED,
+    TRIGGER,
+    WAITING,
+    Peer,
+    closed_port,
+    each,
+    emulators,
+    run,
+    run_as_far_as,
+)
+from tests.processes import PATIENCE, Process, script
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+COMMANDS = [
+    ("status", []),
+    ("trigger", []),
+    ("watch", []),
+    ("start", []),
+    ("stop", []),
+    ("switch", ["3"]),
+    ("probe", []),
+]
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with emulators(tmp_path_factory.mktemp("errors"), ()) as (one,):
+        yield one
+
+
+# ---------------------------------------------------------------------- no session: 3
+
+
+def test_command_nothing_listens_exits_3() -> None:
+    for command, more in COMMANDS:
+        with each(command), closed_port() as address:
+            outcome = run(command, f"bvs://{address}", *more, "--timeout", "0.3")
+            outcome.failed(3, address, "b16 or bid over TCP: opening the link: ")
+            assert command == "probe" or outcome.out == ""
+
+
+def test_status_silent_peer_exits_3() -> None:
+    with Peer() as peer:
+        step = "waiting for the answer to Connect"
+        outcome = run_as_far_as(step, "status", f"bvs://{peer.host_and_port}")
+    outcome.failed(3, step, "silence")
+
+
+def test_status_silent_udp_peer_exits_3() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        url = f"bvs+udp://127.0.0.1:{silent.getsockname()[1]}"
+        outcome = run_as_far_as("thesis over UDP", "status", url)
+    outcome.failed(3, "handbook over UDP", "thesis over UDP", "silence")
+
+
+def test_status_garbage_exits_3() -> None:
+    with Peer(greeting=b"HTTP/1.1 400 Bad Request\r\n\r\n") as peer:
+        outcome = run_as_far_as("wrong magic", "status", f"bvs://{peer.host_and_port}")
+    outcome.failed(3, "wrong magic number: 48 54 54 50")
+
+
+def test_status_length_bomb_at_connect_exits_3() -> None:
+    with Peer(greeting=BOMB) as peer:
+        outcome = run_as_far_as("announces", "status", peer.url)
+    outcome.failed(3, "announces 4294967295 bytes")
+
+
+def test_status_peer_closes_at_once_exits_3() -> None:
+    with Peer({CONNECT: DIE}) as peer:
+        run_as_far_as("answer to Connect", "status", peer.url).failed(3, "answer to Connect")
+
+
+def test_status_no_first_status_exits_3() -> None:
+    with Peer({CONNECT: CONNECTED}) as peer:
+        run_as_far_as("first status", "status", peer.url).failed(3, "waiting for the first status")
+
+
+def test_status_no_answer_to_query_exits_3() -> None:
+    with Peer({CONNECT: SESSION[CONNECT]}) as peer:
+        outcome = run_as_far_as("to Query", "status", peer.url)
+    outcome.failed(3, "waiting for the answer to Query")
+
+
+def test_trigger_length_bomb_exits_3() -> None:
+    with Peer({**SESSION, TRIGGER: BOMB}) as peer:
+        outcome = run("trigger", peer.url, "--timeout", "60")
+    outcome.failed(3, "announces 4294967295 bytes")
+
+
+def test_trigger_garbage_exits_3() -> None:
+    with Peer({**SESSION, TRIGGER: b"garbage"}) as peer:
+        run("trigger", peer.url, "--timeout", "60").failed(3, "wrong magic number")
+
+
+def test_trigger_connection_reset_exits_3() -> None:
+    with Peer({**SESSION, TRIGGER: DIE}) as peer:
+        run("trigger", peer.url, "--timeout", "60").failed(3, "the link is gone")
+
+
+def test_trigger_emulator_killed_exits_3(tmp_path: Path) -> None:
+    scenario = tmp_path / "slow.yaml"
+    scenario.write_text(SCENARIO, encoding="utf-8")
+    with Process("smartcam-emulator", str(scenario), "--debug") as emulator:
+        url = emulator.read_until(b"\n").strip()
+        with Process("smartcam", "trigger", url, "--application", "6") as command:
+            emulator.read_until(b"Trigger", stream="stderr")
+            emulator.send_signal(signal.SIGKILL)
+            command.wait().failed(3, "the link is gone")
+
+
+# ---------------------------------------------------------------------- a wait ran out: 4
+
+
+def test_trigger_busy_for_ever_exits_4() -> None:
+    with Peer({**SESSION, CONNECT: CONNECTED + BUSY}) as peer:
+        outcome = run_as_far_as("did not wait", "trigger", peer.url)
+    outcome.failed(4, "did not wait for a trigger within ", "status: BUSY")
+
+
+def test_trigger_switch_never_answered_exits_4() -> None:
+    with Peer({**SESSION, CONNECT: CONNECTED + STOPPED}) as peer:
+        outcome = run_as_far_as("no answer", "trigger", peer.url, "--application", "5")
+    outcome.failed(4, "no answer to SwitchApplication (0x31)")
+
+
+def test_trigger_switch_while_busy_for_ever_exits_4() -> None:
+    with Peer({**SESSION, CONNECT: CONNECTED + BUSY}) as peer:
+        outcome = run_as_far_as("to be loaded", "trigger", peer.url, "--application", "5")
+    outcome.failed(4, "for the application to be loaded; status: BUSY")
+
+
+def test_start_never_running_exits_4() -> None:
+    with Peer({**SESSION, CONNECT: CONNECTED + BUSY}) as peer:
+        run_as_far_as("after Start", "start", peer.url).failed(4, "after Start")
+
+
+def test_trigger_no_result_exits_4() -> None:
+    with Peer(SESSION) as peer:
+        outcome = run_as_far_as("no result", "trigger", peer.url)
+    outcome.failed(4, "no result within ", "WAITING_FOR_TRIGGER")
+
+
+def test_trigger_free_running_exits_4_and_says_so(url: str) -> None:
+    outcome = run_as_far_as("runs free", "trigger", url, "--application", "5")
+    outcome.failed(4, "runs free")
+
+
+def test_watch_count_without_result_exits_4() -> None:
+    with Peer(SESSION) as peer:
+        outcome = run_as_far_as("no result", "watch", peer.url, "--count", "1")
+    outcome.failed(4, "no result within ", "WAITING_FOR_TRIGGER")
+
+
+# ---------------------------------------------------------------------- refused, not running: 5
+
+
+def test_command_unknown_application_exits_5(url: str) -> None:
+    for application, text in (("0", "id 0"), ("99", "refused to switch to application 99")):
+        for command in ("switch", "trigger", "watch"):
+            option = [] if command == "switch" else ["--application"]
+            with each(command, application):
+                run(command, url, *option, application).failed(5, text)
+
+
+def test_trigger_stopped_exits_5_and_tells_how_to_start(url: str) -> None:
+    run("switch", url, "2").done()
+    run("stop", url).done()
+    outcome = run("trigger", url)
+    outcome.failed(5, "application 2 is stopped", f"smartcam start '{url}'", "--application 2")
+
+
+# ---------------------------------------------------------------------- not interpretable: 6
+
+
+@pytest.mark.parametrize("command", ["trigger", "watch"])
+def test_command_layout_too_long_exits_6(url: str, command: str) -> None:
+    application = "2" if command == "trigger" else "5"
+    layout = "n: int32, more: real32"
+    outcome = run(command, url, "--application", application, "--interpret-as", layout)
+    outcome.failed(6, "'more' (real32) at offset 4", "expected 4 bytes, got 0")
+
+
+def test_trigger_layout_too_short_exits_6(url: str) -> None:
+    run("trigger", url, "--application", "2", "--interpret-as", "n: int16").failed(6, "got 4")
+
+
+# ---------------------------------------------------------------------- wrong usage: 2
+
+
+def test_trigger_wrong_layout_text_exits_2_with_the_position() -> None:
+    # nothing listens on port 1: what is wrong is seen before anything is tried
+    outcome = run("trigger", "bvs://127.0.0.1:1", "--interpret-as", "n: int33")
+    outcome.failed(2, "'int33'", "did you mean int32?", "at character 3")
+
+
+@pytest.mark.parametrize("spec", ["nonsense", ""])
+def test_watch_unknown_interpreter_exits_2_and_lists_known_ones(spec: str) -> None:
+    outcome = run("watch", "bvs://127.0.0.1:1", "--interpret-as", spec)
+    outcome.failed(2, f"{spec!r} is unknown", "localizations, raw, record, strings50, table")
+
+
+BAD_URLS = {
+    "": "no host",
+    "ftp://127.0.0.1": "known are bvs://, bvs+udp://",
+    "bvs://": "no host",
+    "bvs://127.0.0.1:99999": "ort",
+    "bvs://127.0.0.1/path": "a path",
+    "bvs://127.0.0.1?dialect=latin": "handbook, thesis",
+    "bvs://127.0.0.1?colour=red": "known are 'dialect', 'quirks'",
+}
+
+
+def test_command_bad_url_exits_2() -> None:
+    for command, more in COMMANDS:
+        for url, text in BAD_URLS.items():
+            with each(command, url):
+                run(command, url, *more).failed(2, "camera address" if command == "probe" else text)
+
+
+BAD_OPTIONS = [
+    ("--count", "0"),
+    ("--count", "many"),
+    ("--seconds", "0"),
+    ("--seconds", "-1"),
+    ("--seconds", "nan"),
+    ("--timeout", "0"),
+    ("--timeout", "inf"),
+    ("--timeout", "nan"),
+    ("--application", "-1"),
+    ("--application", "4294967296"),
+    ("--trace", "/"),
+]
+
+
+def test_command_bad_option_exits_2() -> None:
+    for command in ("trigger", "watch"):
+        for option, value in BAD_OPTIONS:
+            with each(command, option, value):
+                outcome = run(command, "bvs://127.0.0.1:1", option, value)
+                assert (outcome.code, outcome.out) == (2, "")
+                last = outcome.err.splitlines()[-1]
+                assert last.startswith("Error: ")
+                assert option in last
+
+
+def test_trigger_bad_input_exits_2() -> None:
+    run("trigger", "bvs://127.0.0.1:1", "--input", "4g").failed(2, "--input", "'4g' is no hex")
+
+
+def test_trigger_trace_unwritable_exits_2(tmp_path: Path) -> None:
+    path = tmp_path / "missing" / "trace.jsonl"
+    outcome = run("trigger", "bvs://127.0.0.1:1", "--trace", str(path))
+    outcome.failed(2, f"--trace {path}: No such file or directory")
+
+
+def test_unexpected_error_exits_1_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("smartcam._cli.demo.EmulatedCamera", None)
+    run("demo").failed(1, "unexpected TypeError", "--debug shows where")
+
+
+def test_status_debug_shows_the_traceback() -> None:
+    with Process("smartcam", "status", "bvs://127.0.0.1:1", "--debug") as command:
+        outcome = command.wait()
+    assert outcome.code == 3
+    assert "Traceback" in outcome.err
+    assert outcome.err.splitlines()[-1].startswith("smartcam: error: ")
+
+
+# ----------------------------------------------------------------------
+# Ctrl-C, SIGTERM, and a reader of stdout that goes away.
+
+
+WORKING = {**SESSION, QUERY: ACTIVE_21 + HELLO_WORLD, TRIGGER: INSPECTING + HELLO_WORLD + WAITING}
+"""A camera that sends a result by itself, and one for every trigger."""
+
+
+@pytest.mark.parametrize(
+    ("command", "number", "code"),
+    [
+        ("watch", signal.SIGINT, 0),
+        ("watch", signal.SIGTERM, 143),
+        ("trigger", signal.SIGINT, 130),
+        ("trigger", signal.SIGTERM, 143),
+    ],
+)
+def test_command_signal_says_disconnect(command: str, number: int, code: int) -> None:
+    with (
+        Peer(WORKING) as peer,
+        Process("smartcam", command, peer.url, "--count", "1000000") as process,
+    ):
+        process.read_until(b"\n")
+        process.send_signal(number)
+        outcome = process.wait()
+        peer.wait_last(DISCONNECT)
+    assert (outcome.code, outcome.err) == (code, "")
+
+
+def test_trigger_interrupted_while_it_waits_says_disconnect() -> None:
+    with Peer(SESSION) as peer, Process("smartcam", "trigger", peer.url) as process:
+        peer.wait_received(TRIGGER)
+        process.send_signal(signal.SIGINT)
+        outcome = process.wait()
+        peer.wait_last(DISCONNECT)
+    assert outcome == (130, "", "")
+
+
+def test_status_interrupted_during_connect_says_disconnect() -> None:
+    with Peer() as peer, Process("smartcam", "status", peer.url) as process:
+        peer.wait_received(CONNECT)
+        process.send_signal(signal.SIGINT)
+        outcome = process.wait()
+        peer.wait_last(DISCONNECT)
+    assert outcome == (130, "", "")
+
+
+def test_command_interrupted_during_import_exits_130(tmp_path: Path) -> None:
+    (tmp_path / "click.py").write_text("raise KeyboardInterrupt\n", encoding="utf-8")
+    env = {"PYTHONPATH": str(tmp_path)}
+    with Process("smartcam", "protocols", env=env, fresh=True) as process:
+        assert process.wait() == (130, "", "")
+
+
+@pytest.mark.parametrize("command", ["trigger", "probe"])
+def test_command_stdout_closed_ends_quietly_and_says_disconnect(command: str) -> None:
+    more = ["--count", "1000000"] if command == "trigger" else []
+    with Peer(WORKING) as peer, Process("smartcam", command, peer.url, *more) as process:
+        process.close_stdout()
+        outcome = process.wait()
+        peer.wait_last(DISCONNECT)
+    assert (outcome.code, outcome.err) == (0, "")
+
+
+def test_trigger_into_head_ends_quietly() -> None:
+    with Peer(WORKING) as peer:
+        outcome = subprocess.run(  # noqa: S602 - a shell's pipe is what is tested
+            '"$SMARTCAM" trigger "$URL" --count 1000000 --json | head -n 1',  # noqa: S607
+            shell=True,
+            env={**os.environ, "SMARTCAM": script("smartcam"), "URL": peer.url},
+            capture_output=True,
+            timeout=PATIENCE,
+            check=True,
+        )
+        peer.wait_last(DISCONNECT)
+    assert outcome.stdout.count(b"\n") == 1
+    assert outcome.stderr == b""
+
+
+def test_trigger_narrow_encoding_escapes_what_it_lacks() -> None:
+    text = "Größe→".encode().ljust(20, b"\0")
+    answers = {**WORKING, TRIGGER: INSPECTING + HELLO_WORLD[:-20] + text + WAITING}
+    with (
+        Peer(answers) as peer,
+        Process(
+            "smartcam", "trigger", peer.url, "--interpret-as", "t: string[20]",
+            env={"PYTHONIOENCODING": "latin-1", "PYTHONUTF8": "0"}, fresh=True,
+        ) as process,
+    ):  # fmt: skip
+        process.read_until(b"t = Gr\xf6\xdfe\\u2192\n")

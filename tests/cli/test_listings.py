@@ -1,0 +1,172 @@
+"""Commands that need no camera: lists, help, the demo, and what is said without the extra."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+from click.testing import CliRunner
+
+import smartcam
+from smartcam._cli.dissector import dissector
+from smartcam._dissector import lua_source
+from smartcam.registry import INTERPRETERS, PROTOCOLS
+from tests.cli.commandline import each, run, run_emulator
+from tests.processes import Process
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from click.testing import Result
+
+CONNECTING = ("probe", "status", "trigger", "watch", "switch", "start", "stop")
+OTHERS = ("decode", "protocols", "interpreters", "demo")
+
+
+def test_protocols_lists_dialects_and_transports() -> None:
+    out = run("protocols").done().out
+    for text in ("bvs (built-in)", "bvs://", "bvs+udp://", "36701", "BVS002C", "thesis"):
+        assert text in out
+
+
+def test_protocols_json_has_one_object_for_each() -> None:
+    (bvs,) = [one for one in run("protocols", "--json").done().lines if one["name"] == "bvs"]
+    assert (bvs["default_port"], bvs["schemes"]) == (36701, ["bvs", "bvs+udp"])
+    assert [one["name"] for one in bvs["dialects"]][:2] == ["handbook", "thesis"]
+    assert all(one["about"] and one["source"] for one in bvs["dialects"])
+
+
+def test_interpreters_lists_the_built_in_ones() -> None:
+    names = {"localizations", "raw", "record", "strings50", "table"}
+    lines = run("interpreters", "--json").done().lines
+    assert {line["name"] for line in lines if line["origin"] == "built-in"} == names
+    out = run("interpreters").done().out
+    assert {line.split()[0] for line in out.splitlines()} >= names
+
+
+@pytest.fixture
+def broken_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Install plug-ins that end the program, or are none."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "hurt_module.py").write_text("import sys\nsys.exit(3)\n")
+    (tmp_path / "dull_module.py").write_text("f = 5\n")
+    for name in ("hurt", "dull"):
+        info = tmp_path / f"{name}-0.1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+        points = f"{name} = {name}_module:f\n"
+        (info / "entry_points.txt").write_text(
+            f"[smartcam.interpreters]\n{points}[smartcam.protocols]\n{points}"
+        )
+    for registry in (PROTOCOLS, INTERPRETERS):
+        registry.refresh()
+    yield
+    for registry in (PROTOCOLS, INTERPRETERS):
+        registry.refresh()
+    sys.modules.pop("dull_module", None)
+
+
+@pytest.mark.usefixtures("broken_plugins")
+@pytest.mark.parametrize(("command", "good"), [("protocols", "bvs"), ("interpreters", "raw")])
+def test_broken_plugins_are_listed_with_their_reasons(command: str, good: str) -> None:
+    lines = {one["name"]: one for one in run(command, "--json").done().lines}
+    assert lines["hurt"]["error"].endswith("'hurt' of hurt failed to load: SystemExit(3)")
+    assert (lines["dull"]["origin"], "5" in lines["dull"]["error"]) == ("dull", True)
+    assert "error" not in lines[good]
+    out = run(command).done().out
+    assert "hurt  (hurt: hurt_module:f) cannot be used: smartcam." in out
+
+
+def test_demo_tells_its_story() -> None:
+    out = run("demo").done().out
+    for text in ("BUSY", "7 parts", "parallelogram", "1. ", "6. Disconnected", "received 12 = "):
+        assert text in out
+
+
+def test_demo_json_is_json_with_a_balanced_account() -> None:
+    lines = run("demo", "--json").done().lines
+    assert [line["step"] for line in lines if "step" in line] == [1, 2, 3, 4, 5, 6]
+    (result,) = [line["result"] for line in lines if "result" in line]
+    assert len(result["value"]) == 7
+    account = lines[-1]["statistics"]
+    fates = (
+        "triggered",
+        "streamed",
+        "unclaimed",
+        "late",
+        "wrong_application",
+        "uninterpretable",
+    )
+    assert account["received"] == sum(account[fate] for fate in fates) == 12
+
+
+def test_help_of_every_command_warns_where_it_connects() -> None:
+    for command in (*CONNECTING, *OTHERS):
+        for option in ("--help", "-h"):
+            with each(command, option):
+                text = " ".join(run(command, option).done().out.split())
+                assert f"Usage: smartcam {command} " in text
+                warned = "Connecting takes the camera from another client" in text
+                assert warned is (command in CONNECTING)
+
+
+def test_help_names_every_command_and_exit_code() -> None:
+    text = " ".join(run("--help").done().out.split())
+    for word in (*CONNECTING, *OTHERS):
+        assert f" {word} " in text
+    for code in range(7):
+        assert f"{code} " in text.partition("Exit codes:")[2]
+    assert "Usage: smartcam-emulator " in run_emulator("--help").done().out
+
+
+def test_version_is_told() -> None:
+    assert run("--version").done().out == f"smartcam, version {smartcam.__version__}\n"
+    assert smartcam.__version__ in run_emulator("--version").done().out
+
+
+def test_unknown_command_exits_2() -> None:
+    outcome = run("dance")
+    assert outcome.code == 2
+    assert "No such command 'dance'" in outcome.err
+
+
+@pytest.mark.parametrize("missing", ["click", "yaml"])
+@pytest.mark.parametrize("program", ["smartcam", "smartcam-emulator"])
+def test_command_without_the_extra_exits_2_and_names_it(
+    tmp_path: Path, program: str, missing: str
+) -> None:
+    shim = f'raise ModuleNotFoundError("{missing}")\n'
+    (tmp_path / f"{missing}.py").write_text(shim, encoding="utf-8")
+    with Process(program, "--version", env={"PYTHONPATH": str(tmp_path)}, fresh=True) as process:
+        outcome = process.wait()
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err == f'{program}: needs the extra "cli": pip install "smartcam[cli]"\n'
+
+
+# ---------------------------------------------------------------------- ``smartcam dissector``
+
+
+def give(*options: str) -> Result:
+    return CliRunner().invoke(dissector, options)
+
+
+def test_dissector_is_printed() -> None:
+    done = give()
+    assert (done.exit_code, done.output) == (0, lua_source())
+
+
+def test_dissector_is_written_to_a_file_and_nothing_is_printed(tmp_path: Path) -> None:
+    path = tmp_path / "smartcam.lua"
+    done = give("-o", str(path))
+    assert (done.exit_code, done.output) == (0, "")
+    assert path.read_text(encoding="ascii") == lua_source()
+
+
+def test_dissector_that_cannot_be_written_is_a_usage_error(tmp_path: Path) -> None:
+    path = tmp_path / "missing" / "smartcam.lua"
+    done = give("-o", str(path))
+    text = f"smartcam: error: --output {path}: No such file or directory\n"
+    assert done.exit_code == 2
+    assert done.output == text  # both streams, in every click

@@ -1,0 +1,43 @@
+"""What the doctor's tests share: a whole examination, and picking its findings."""
+
+from __future__ import annotations
+
+from contextlib import aclosing
+from typing import TYPE_CHECKING, Any
+
+from smartcam.doctor import Finding, examine
+
+if TYPE_CHECKING:
+    from smartcam.doctor._findings import Exit, Severity
+
+STEP = 1.0
+"""Seconds of a step that is not meant to run out."""
+
+SHORT = 0.2
+"""Seconds of one that is; all ways to speak to an address share it."""
+
+WATCH = 0.05
+"""Seconds that a camera is watched."""
+
+
+async def examined(url: str, **options: Any) -> list[Finding]:
+    """Return everything that an examination finds."""
+    options = {"timeout": STEP, "seconds": WATCH, **options}
+    async with aclosing(examine(url, **options)) as findings:
+        return [finding async for finding in findings]
+
+
+def of(findings: list[Finding], check: str) -> Finding:
+    """Return the one finding of a check."""
+    (found,) = [finding for finding in findings if finding.check == check]
+    return found
+
+
+def errors(findings: list[Finding]) -> list[tuple[str, Exit]]:
+    """Return the checks that found an error, with their exit codes."""
+    return [(one.check, one.exit_code) for one in findings if one.severity == "error"]
+
+
+def severities(findings: list[Finding], check: str) -> list[Severity]:
+    """Return the severities of a check's findings."""
+    return [one.severity for one in findings if one.check == check]

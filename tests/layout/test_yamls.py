@@ -1,0 +1,155 @@
+"""YAML from anywhere: bombs, giants and nonsense end in a typed error that names the line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from smartcam.calibration.formats._plain import load_yaml as load_plain
+from smartcam.emulator import EmulatedCamera, load_scenarios
+from smartcam.exceptions import CalibrationError, ConfigurationError
+from smartcam.layout import Layout
+from smartcam.layout import _yamls as yamls
+from smartcam.layout._yamls import BadYamlError, load
+
+
+def laughs(levels: int) -> str:
+    """Return lists of ten of the one before."""
+    rows = [
+        f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, levels)
+    ]
+    return "\n".join(["a0: &a0 [1, 2]", *rows])
+
+
+def merges(levels: int) -> str:
+    """Return mappings, each merged of the one before, twice."""
+    rows = [
+        f"m{level}: &m{level}\n  <<: [*m{level - 1}, *m{level - 1}]\n  k{level}: 1"
+        for level in range(1, levels)
+    ]
+    return "\n".join(["m0: &m0 {x: 1}", *rows])
+
+
+@pytest.mark.parametrize("text", [laughs(30), merges(40), laughs(9), "- a\n" * 6000])
+def test_load_of_a_bomb_is_refused_with_its_line(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(yamls, "MAX_NODES", 5000)
+    with pytest.raises(BadYamlError, match=r"expected 5000 values at most") as told:
+        load(text)
+    assert told.value.line is not None
+    assert 1 < told.value.line <= text.count("\n") + 1
+
+
+def test_load_of_too_long_a_text_is_refused() -> None:
+    with pytest.raises(BadYamlError, match="8388609 characters, expected 8388608 at most"):
+        load(" " * (yamls.MAX_YAML_TEXT + 1))
+
+
+@pytest.mark.parametrize(
+    "text", ["a: &a [*a]", "a: &a {b: *a}", "a: &a\n  <<: *a", "&a [*a, [*a]]"]
+)
+def test_load_of_what_contains_itself_is_refused(text: str) -> None:
+    with pytest.raises(BadYamlError, match="an alias of what it stands in"):
+        load(text)
+
+
+@pytest.mark.parametrize(
+    "number", ["9" * 5000, "0x" + "f" * 4000, "-" + "1" * 30, "0b1" + "0" * 64]
+)
+def test_load_of_a_giant_is_refused_with_its_line(number: str) -> None:
+    with pytest.raises(BadYamlError, match="characters, expected 64 bits at most") as told:
+        load(f"a: 1\nb: {number}\n")
+    assert told.value.line == 2
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 5000, "a: b: c", "!!int x", "!!python/name:os.system", "\0"]
+)
+def test_load_of_no_yaml_is_refused(text: str) -> None:
+    with pytest.raises(BadYamlError):
+        load(text)
+
+
+def test_load_aliases_and_merges_of_people_are_taken() -> None:
+    text = "base: &b {x: 1, y: 0x7fffffffffffffff}\nall:\n- {<<: *b, x: 2}\n- *b\n"
+    assert load(text) == {
+        "base": {"x": 1, "y": 2**63 - 1},
+        "all": [{"x": 2, "y": 2**63 - 1}, {"x": 1, "y": 2**63 - 1}],
+    }
+    assert load("") is None
+
+
+def scenario(tmp_path: Path, text: str) -> str:
+    """Return what a scenario file is refused with, behind its name."""
+    path = tmp_path / "s.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as told:
+        load_scenarios(path)
+    assert str(told.value).startswith(f"scenario {path}, line ")
+    return str(told.value).partition("s.yaml, ")[2]
+
+
+def test_scenario_bombs_and_giants_name_the_line(tmp_path: Path) -> None:
+    assert "expected 500000 values at most" in scenario(tmp_path, merges(40))
+    assert "expected 500000 values at most" in scenario(tmp_path, laughs(30))
+    assert scenario(tmp_path, f"builtins: true\nactive: 0x{'f' * 4000}\n") == (
+        "line 2: the number 0xffffffffffffffffff... of 4002 characters, expected 64 bits at most"
+    )
+    assert scenario(tmp_path, f"active: {2**63}\n").startswith(
+        "line 1: active: no application has such an id; there are "
+    )
+
+
+def test_scenario_of_many_mistakes_tells_the_first_ones(tmp_path: Path) -> None:
+    told = scenario(tmp_path, "applications:\n" + "- {id: x}\n" * 100)
+    assert told.count("applications.") == 20
+
+
+def test_scenario_doubles_are_found_among_many(tmp_path: Path) -> None:
+    rows = [f"- {{id: {number}, constant: [1], layout: 'n: int32'}}" for number in range(1, 300)]
+    text = "\n".join(["applications:", *rows, rows[7]])
+    assert "application id 8 is there twice" in scenario(tmp_path, text)
+
+
+def test_emulated_camera_giant_active_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="active: no application has such an id"):
+        EmulatedCamera(active=10**5000)
+
+
+@pytest.mark.parametrize("text", [laughs(30), merges(40), f"fields: 0x{'f' * 4000}"])
+def test_layout_bombs_are_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match="nor is it YAML: line"):
+        Layout.from_yaml(text)
+
+
+def test_calibration_formats_bombs_are_refused() -> None:
+    for text in (laughs(30), merges(40)):
+        with pytest.raises(CalibrationError) as told:
+            load_plain(text)
+        assert told.value.code == "MALFORMED"
+
+
+class _Count:
+    """A value that counts how often it is compared."""
+
+    compared = 0
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __hash__(self) -> int:
+        return hash(self.number)
+
+    def __eq__(self, other: object) -> bool:
+        _Count.compared += 1
+        return bool(isinstance(other, _Count) and self.number == other.number)
+
+
+def test_scenario_ids_are_compared_once_each() -> None:
+    from smartcam.emulator._scenario.scenario import _first_double
+
+    _Count.compared = 0
+    assert _first_double(_Count(number) for number in range(5000)) is None
+    assert _Count.compared < 5000

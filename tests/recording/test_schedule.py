@@ -1,0 +1,210 @@
+"""Which container belongs to which trigger, and what came by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.models import CameraEvent, Connected, Disconnected, Reconnected, Status
+from smartcam.observers import TraceEntry
+from smartcam.recording._schedule import Change, ReplayPlan, Take, plan_replay
+from tests.recording.recordingkit import URL, at, container, frame, session, status, write
+
+WAITS = ("RUNNING", "WAITING_FOR_TRIGGER")
+
+
+def happened(text: str) -> Iterator[TraceEntry]:
+    """Read ``1 > Trigger, 1.5 RUNNING, 2 'a'``: after which second a frame, status or container."""
+    for one in text.split(", "):
+        seconds, what = one.split(" ", 1)
+        if what.startswith(">"):
+            yield frame(float(seconds), what)
+        elif what.startswith("'"):
+            yield container(float(seconds), what.strip("'").encode())
+        else:
+            yield status(float(seconds), *what.replace("WAITS", " ".join(WAITS)).split())
+
+
+def plan(
+    path: Path, *items: TraceEntry | CameraEvent | str, first: tuple[str, ...] = WAITS
+) -> ReplayPlan:
+    """Return the plan of a session that begins at 0 s and has these items, or what texts say."""
+    read = [happened(one) if isinstance(one, str) else [one] for one in items]
+    return plan_replay(write(path / "run.mcap", [*session(URL, *first), *chain(*read)]))
+
+
+def rounded(takes: list[Take]) -> list[tuple[list[bytes], float, float, int]]:
+    return [
+        (take.containers, round(take.seconds, 6), round(take.gap, 6), take.drops) for take in takes
+    ]
+
+
+def test_plan_trigger_has_its_container_and_latency(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 > Trigger, 1 RUNNING, 1.25 'a', 1.25 WAITS, 2 > Trigger, 2.5 'b'")
+    app = made.applications[5]
+    assert rounded(app.triggered) == [([b"a"], 0.25, 0, 0), ([b"b"], 0.5, 0, 0)]
+    assert (app.unasked, app.waits) == ([], True)
+    assert (made.active, made.running, made.dialect, made.transport) == (5, True, "handbook", "tcp")
+    assert round(made.seconds, 6) == 2.5
+
+
+def test_plan_more_containers_of_one_trigger_stay_together(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 > Trigger, 1 RUNNING, 1.1 'a', 1.2 'b', 1.2 WAITS")
+    assert rounded(made.applications[5].triggered) == [([b"a", b"b"], 0.1, 0, 0)]
+
+
+def test_plan_late_container_belongs_to_its_trigger(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 > Trigger, 7 'late', 8 > Trigger, 8.1 'b'")
+    assert rounded(made.applications[5].triggered) == [([b"late"], 6, 0, 0), ([b"b"], 0.1, 0, 0)]
+
+
+@pytest.mark.parametrize(
+    "end", [frame(3, "> Stop"), status(3, "BUSY"), status(3, "SYSTEM_ERROR", "RUNNING")]
+)
+def test_plan_trigger_whose_inspection_is_void_has_no_result(
+    tmp_path: Path, end: TraceEntry
+) -> None:
+    made = plan(tmp_path, frame(1, "> Trigger"), end)
+    assert rounded(made.applications[5].triggered) == [([], 2, 0, 0)]
+
+
+@pytest.mark.parametrize("following", [frame(3, "> Trigger"), frame(3, "> Stop")])
+def test_plan_trigger_that_gave_nothing_lasts_until_the_camera_waits(
+    tmp_path: Path, following: TraceEntry
+) -> None:
+    made = plan(tmp_path, "1 > Trigger, 1 RUNNING, 1.25 WAITS", following, "4 > Trigger, 4.5 'b'")
+    takes = rounded(made.applications[5].triggered)
+    assert (takes[0], takes[-1]) == (([], 0.25, 0, 0), ([b"b"], 0.5, 0, 0))
+
+
+def test_plan_trigger_under_way_at_the_end_is_left_out(tmp_path: Path) -> None:
+    assert plan(tmp_path, frame(1, "> Trigger")).applications[5].triggered == []
+
+
+def test_plan_trigger_of_a_lost_link_is_left_out(tmp_path: Path) -> None:
+    made = plan(
+        tmp_path,
+        frame(1, "> Trigger"),
+        Disconnected(camera="left", at=at(1), reason="gone", expected=False),
+        frame(2, "> Connect"),
+        frame(2, "< ConnectAnswer"),
+        Reconnected(camera="left", at=at(2), url=URL),
+        "3 > Trigger, 3.5 'b'",
+    )
+    assert rounded(made.applications[5].triggered) == [([b"b"], 0.5, 0, 0)]
+
+
+def test_plan_dropped_trigger_is_noted_before_the_next(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 > Trigger, 1 WAITS OVERTRIGGERED, 1.1 WAITS, 2 > Trigger, 2.5 'a'")
+    assert rounded(made.applications[5].triggered) == [([b"a"], 0.5, 0, 1)]
+
+
+def test_plan_trigger_dropped_by_the_one_before_needs_no_help(tmp_path: Path) -> None:
+    made = plan(
+        tmp_path, "1 > Trigger, 1 RUNNING, 1.1 > Trigger, 1.1 RUNNING OVERTRIGGERED, 1.5 'a'"
+    )
+    assert rounded(made.applications[5].triggered) == [([b"a"], 0.5, 0, 0)]
+
+
+def test_plan_sensor_result_counts_from_the_one_before(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 RUNNING, 1.25 'a', 1.25 WAITS, 3 'b'")  # no status showed the last
+    app = made.applications[5]
+    assert (app.triggered, app.waits) == ([], True)
+    assert rounded(app.unasked) == [([b"a"], 0.25, 1, 0), ([b"b"], 0, 1.75, 0)]
+
+
+def test_plan_trigger_dropped_by_a_sensor_leaves_the_container_to_it(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 > Trigger, 1 RUNNING, 1 RUNNING OVERTRIGGERED, 1.5 'sensor'")
+    app = made.applications[5]
+    assert app.triggered == []
+    assert rounded(app.unasked) == [([b"sensor"], 0.5, 1, 0)]
+
+
+def test_plan_free_run_counts_from_its_start_and_ignores_triggers(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 > Start, 2 RUNNING, 2 > Trigger, 2.5 'a', 3.5 'b'", first=())
+    app = made.applications[5]
+    assert (app.triggered, app.waits) == ([], False)
+    assert rounded(app.unasked) == [([b"a"], 0, 0.5, 0), ([b"b"], 0, 1, 0)]
+
+
+def test_plan_switch_has_its_time_and_each_application_its_list(tmp_path: Path) -> None:
+    made = plan(
+        tmp_path,
+        frame(1, "> SwitchApplication", application=7),
+        "1 BUSY, 1.4 WAITS",
+        frame(1.5, "< SwitchAnswer", code=0, application=7),
+        frame(2, "> SwitchApplication", application=8),
+        frame(2.1, "< SwitchAnswer", code=1, application=7),  # refused
+        frame(3, "> Trigger"),
+        container(3.5, b"a", application=7),
+    )
+    assert list(made.applications) == [5, 7]
+    assert made.applications[7].load_time == pytest.approx(0.5)
+    assert made.applications[5].load_time is None
+    assert made.active == 7
+
+
+def test_plan_conditions_come_with_their_times(tmp_path: Path) -> None:
+    changes = "1 WAITS, 2 WAITS SYSTEM_ERROR, 3 WAITS OVERHEAT"
+    made = plan(tmp_path, changes, first=(*WAITS, "OVERHEAT"))
+    assert made.conditions == Status.OVERHEAT
+    assert made.changes == (
+        Change(1, Status.OVERHEAT, on=False),
+        Change(2, Status.SYSTEM_ERROR, on=True),
+        Change(3, Status.OVERHEAT, on=True),
+        Change(3, Status.SYSTEM_ERROR, on=False),
+    )
+
+
+def test_plan_without_a_container_is_as_the_camera_was(tmp_path: Path) -> None:
+    stopped = plan_replay(write(tmp_path / "a.mcap", session(URL, endian=1)))
+    running = plan_replay(write(tmp_path / "b.mcap", session(URL, "RUNNING")))
+    assert (stopped.active, stopped.running, stopped.endian) == (5, False, 1)
+    assert (running.active, running.running, running.endian) == (5, True, 0)
+
+
+def test_plan_url_tells_dialect_quirks_and_transport(tmp_path: Path) -> None:
+    url = "bvs+udp://192.168.0.10:36701?dialect=b16&quirks=code,no_id"
+    nameless = frame(1.5, "< ResultContainer", application=-1, data="61")
+    items = [*session(url, *WAITS), frame(1, "> Trigger"), nameless]
+    made = plan_replay(write(tmp_path / "run.mcap", items))
+    assert (made.dialect, made.quirks, made.transport) == ("b16", ("code", "no_id"), "udp")
+    assert rounded(made.applications[5].triggered) == [([b"a"], 0.5, 0, 0)]
+
+
+def test_plan_application_id_nobody_can_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="application id 0 cannot be emulated in dialect"):
+        plan(tmp_path, container(1, b"a", application=0))
+    nothing = plan(tmp_path / "..", frame(1, "< QueryAnswer", application=0))
+    assert list(nothing.applications) == [5]
+
+
+@pytest.mark.parametrize(
+    ("items", "text"),
+    [
+        ([frame(0, "> Connect")], "there was no session with camera 'left'"),
+        (
+            [*session(), frame(1, "< ResultContainer", application=5)],
+            "a ResultContainer has not the fields of one: {'application': 5}",
+        ),
+        (
+            [Connected(camera="left", at=at(0), url="bvs://h:1?dialect=new")],
+            "bvs has no dialect 'new'",
+        ),
+        (
+            [Connected(camera="left", at=at(0), url="insight://h:23?dialect=native")],
+            "camera 'left' speaks insight; only cameras that speak bvs can be replayed",
+        ),
+        ([Connected(camera="left", at=at(0), url=URL)], "no answer of camera 'left' is in it"),
+    ],
+)
+def test_plan_camera_that_cannot_be_emulated_is_refused(
+    tmp_path: Path, items: list[Any], text: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=text):
+        plan_replay(write(tmp_path / "run.mcap", items))

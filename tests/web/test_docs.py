@@ -1,0 +1,114 @@
+"""``docs/control.md`` and ``docs/calibrating.md``: tables of calls, numbers, ``curl`` lines."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import shlex
+import shutil
+import subprocess
+from typing import Any
+
+import pytest
+
+from smartcam.calibration._files.directory import MAX_NAME
+from smartcam.calibration._files.store import BACKUPS
+from smartcam.calibration._printing.page_layout import RULER
+from smartcam.calibration.wizards._services import JOURNALS
+from smartcam.emulator import EmulatedCamera
+from smartcam.web import EmulatorSite
+from smartcam.web import _emulator as emulator
+from smartcam.web import _routes as routes
+from smartcam.web import _serialize as serialize
+from smartcam.web import _streams as streams
+from smartcam.web._emulator import CALLS
+from smartcam.web._wizard import CALLS as WIZARD_CALLS
+from tests import ROOT
+from tests.web.sitekit import TOKEN
+
+PAGE = (ROOT / "docs" / "control.md").read_text(encoding="utf-8")
+WIZARD_PAGE = (ROOT / "docs" / "calibrating.md").read_text(encoding="utf-8")
+CURL = [
+    line
+    for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+    for line in block.splitlines()
+    if line.startswith("curl ")
+]
+
+
+@pytest.mark.parametrize(
+    ("page", "calls"), [(PAGE, CALLS), (WIZARD_PAGE, WIZARD_CALLS)], ids=["control", "calibrating"]
+)
+def test_table_has_every_call(page: str, calls: routes.Calls[Any]) -> None:
+    table = page.partition("\n## Calls\n")[2].partition("\n`GET /api")[0]
+    rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in table.splitlines()[3:]]
+    assert [row for row in rows if row] == [
+        [call.method, f"`{call.path}`", call.about, f"`{call.sample}`" if call.sample else ""]
+        for call in calls
+    ]
+
+
+def test_bounds_are_those_of_the_code() -> None:
+    said = {
+        f"did not come within {routes.READ_TIMEOUT:g} s",
+        f"more than {routes.MAX_BODY >> 10} KiB",
+        f"{streams.MAX_STREAMS} event streams",
+        f"nothing for {streams.SLOW:g} s",
+        f"long payloads to {serialize.MAX_HEX} bytes "
+        f"and decode results up to {serialize.MAX_VALUES}",
+    }
+    assert [text for text in said if text not in PAGE] == []
+    assert emulator.MAX_ENTRIES >= 100  # the example's limit
+
+
+def curl_lacks() -> str:
+    """Return why the examples cannot run here, nothing where they can."""
+    curl = shutil.which("curl")
+    if curl is None:
+        return "no curl on the path"
+    done = subprocess.run([curl, "--help", "all"], capture_output=True, check=False)  # noqa: S603
+    return "" if b" --json " in done.stdout else "this curl is older than 7.82: it has no --json"
+
+
+@pytest.mark.skipif(bool(curl_lacks()), reason=curl_lacks())
+@pytest.mark.real_time
+async def test_curl_lines_are_answered() -> None:
+    assert len(CURL) > 20
+    lacking: list[str] = []
+    async with (
+        EmulatedCamera() as camera,
+        EmulatorSite({"camera": camera}) as site,
+        EmulatorSite({"camera": camera}, token=TOKEN) as closed,
+    ):
+        for line in CURL:
+            token = "Authorization" in line
+            words = shlex.split(line.replace("just-for-this-test-bench", TOKEN))
+            api = (closed if token else site).api
+            words = [word.replace("http://localhost:8080", api) for word in words]
+            stream = "-N" in words
+            words[1:1] = ["-sS", "--fail-with-body", "--max-time", "60"]
+            done = await asyncio.create_subprocess_exec(
+                *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+            )
+            if stream:
+                assert done.stdout is not None
+                assert await done.stdout.readline() == b"event: camera\n"
+                done.terminate()
+            out, err = await done.communicate()
+            told = stream or not done.returncode
+            if not told:
+                lacking.append(f"{line}: {out.decode()} {err.decode()}")
+            if not stream:
+                json.loads(out)
+    assert lacking == []
+
+
+def test_wizards_bounds_are_those_of_the_code() -> None:
+    said = {
+        f"Names have up to {MAX_NAME} letters",
+        f"`NAME.json.1` to `.{BACKUPS}`",
+        f"`NAME.journal.1` to `.{JOURNALS}`",
+        f"printed {RULER:g} mm ruler",
+    }
+    assert {text for text in said if text not in WIZARD_PAGE} == set()
