@@ -17,18 +17,18 @@ import numpy as np
 from scipy.special import erf
 
 from benchmarks.measure import Comparison, Goal, Plan, Series
-from smartcam.calibration.detection.corners import refine_corners
-from smartcam.calibration.detection.find import find_target
-from smartcam.calibration.detection.image import GreyImage
-from smartcam.calibration.geometry.frames import Transform
-from smartcam.calibration.lens.model import CameraModel
-from smartcam.calibration.simulation.images import render
-from smartcam.calibration.targets import Checkerboard, CircleGrid
+from smartcam.calibration._detection.corners import refine_corners
+from smartcam.calibration._detection.find import find_target
+from smartcam.calibration._detection.image import GreyImage
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._targets import Checkerboard, CircleGrid
+from smartcam.calibration.simulation._images import render
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from smartcam.calibration.geometry.rotations import Array
+    from smartcam.calibration._geometry.rotations import Array
 
     Refine = Callable[[GreyImage, Array, Array], Array]
 

@@ -21,7 +21,8 @@ from pydantic import BaseModel, TypeAdapter
 from benchmarks.constructs import parse_localizations
 from benchmarks.measure import Comparison, Curve, Goal, Plan, cpu_microseconds, take_turns
 from benchmarks.peers import wire
-from smartcam.interpreters import Context, Reader, base, resolve
+from smartcam.interpreters import Context, Reader, resolve
+from smartcam.interpreters import _base as base
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

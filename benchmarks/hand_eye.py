@@ -28,27 +28,28 @@ import numpy as np
 import yaml
 
 from benchmarks.measure import Comparison, Goal, Series
-from smartcam.calibration.detection.find import find_target
-from smartcam.calibration.geometry.frames import Transform
-from smartcam.calibration.hand_eye.calibration import (
+from smartcam.calibration._detection.find import find_target
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rigid import Rigid
+from smartcam.calibration._hand_eye.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.calibration.hand_eye.closed_forms import LINEAR, solve_linear
-from smartcam.calibration.hand_eye.equations import Rigid, Robot, RobotSigmas
-from smartcam.calibration.lens.model import CameraModel
-from smartcam.calibration.lens.poses import locate
-from smartcam.calibration.simulation.scenes import HandEyeScene, hand_eye_scene
-from smartcam.calibration.targets import Charuco, Checkerboard, CircleGrid
+from smartcam.calibration._hand_eye.closed_forms import LINEAR, solve_linear
+from smartcam.calibration._hand_eye.equations import RobotPoses, RobotSigmas
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.poses import locate
+from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
+from smartcam.calibration.simulation._scenes import HandEyeScene, hand_eye_scene
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from benchmarks.measure import Plan
-    from smartcam.calibration.hand_eye.equations import Setup
-    from smartcam.calibration.targets import Target
-    from smartcam.calibration.views import TargetView
+    from smartcam.calibration._hand_eye.equations import Setup
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration._views import TargetView
 
 __all__ = ["FOLDER", "RECORDED", "Recorded", "find", "read_poses", "read_set", "run"]
 
@@ -286,8 +287,8 @@ def _closed_forms(
     scene: HandEyeScene, poses: Sequence[Transform], views: Sequence[TargetView]
 ) -> dict[str, tuple[float, float]]:
     """Return by how much each of OpenCV's methods is off, rad and m; infinite where it fails."""
-    robot = Robot(_rigid(poses), scene.setup == "eye-in-hand")
-    seen = _rigid([locate(view, CAMERA).transform for view in views])
+    robot = RobotPoses(Rigid.stacked(one.rigid for one in poses), scene.setup == "eye-in-hand")
+    seen = Rigid.stacked(locate(view, CAMERA).transform.rigid for view in views)
     result = {}
     for name in LINEAR:
         found = solve_linear(name, robot, seen)
@@ -296,13 +297,6 @@ def _closed_forms(
             pose = Transform(scene.camera_pose.target, "camera", *found[0])
             result[name] = scene.errors(pose)
     return result
-
-
-def _rigid(transforms: Sequence[Transform]) -> Rigid:
-    return Rigid(
-        np.array([one.rotation for one in transforms]),
-        np.array([one.translation for one in transforms]),
-    )
 
 
 def _recorded(one: Recorded, folder: Path) -> Iterator[Comparison]:

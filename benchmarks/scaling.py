@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 import smartcam
 from benchmarks.measure import Comparison, Cost, Curve, Goal, Plan, Series, cpu_microseconds
 from benchmarks.peers import peer, wire
-from smartcam.protocols.base import Role, Transport
-from smartcam.protocols.bvs import BVS
-from smartcam.protocols.framed.machine import Machine, ResultBurst
+from smartcam.protocols._base import Role, Transport
+from smartcam.protocols._bvs import BVS
+from smartcam.protocols._framed.machine import Machine, ResultBurst
 from smartcam.protocols.messages import Connect, ResultContainer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from smartcam.protocols.framed.machine import Event
+    from smartcam.protocols._framed.machine import Event
 
 __all__ = ["run"]
 

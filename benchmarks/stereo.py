@@ -18,6 +18,7 @@ import math
 import os
 import sys
 import time
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,27 +27,30 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.measure import Comparison, Goal, Series
-from smartcam.calibration.detection.find import find_target
-from smartcam.calibration.geometry.frames import Transform
-from smartcam.calibration.lens.model import CameraModel
-from smartcam.calibration.simulation import scenes
-from smartcam.calibration.simulation.images import render
-from smartcam.calibration.stereo.calibration import calibrate_stereo, spacing_errors
-from smartcam.calibration.targets import Checkerboard, CircleGrid
-from smartcam.calibration.views import TargetView
+from smartcam.calibration._detection.find import find_target
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._stereo.calibration import calibrate_stereo
+from smartcam.calibration._stereo.errors import spacing_errors
+from smartcam.calibration._targets import Checkerboard, CircleGrid
+from smartcam.calibration._views import TargetView
+from smartcam.calibration.simulation import _scenes as scenes
+from smartcam.calibration.simulation._images import render
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from benchmarks.measure import Plan
-    from smartcam.calibration.geometry.rotations import Array
-    from smartcam.calibration.stereo.calibration import StereoCalibration
-    from smartcam.calibration.targets import Target
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._stereo.calibration import StereoCalibration
+    from smartcam.calibration._targets import Target
 
 __all__ = ["run"]
 
+Folder = Path | zipfile.Path
+
 DEBIAN = Path("/usr/share/doc/opencv-doc/examples/data")
-ODD = Path(__file__).parents[1] / "tests" / "data" / "opencv_pairs"
+ODD = Path(__file__).parents[1] / "tests" / "data" / "opencv_pairs" / "pairs.zip"
 LAST = 14
 """Number of the last pair; there is no tenth."""
 
@@ -95,18 +99,18 @@ def run(plan: Plan) -> Iterator[Comparison]:
     yield _bent(plan)
 
 
-def _folder() -> Path | None:
+def _folder() -> Folder | None:
     given, under = (os.environ.get(name) for name in ("SMARTCAM_PAIRS", "SMARTCAM_DATA"))
     places = [
         *(() if given is None else (Path(given),)),
         *(() if under is None else (path.parent for path in Path(under).rglob("left01.jpg"))),
         DEBIAN,
-        ODD,
+        zipfile.Path(ODD),
     ]
     return next((place for place in places if (place / "left01.jpg").exists()), None)
 
 
-def _numbers(plan: Plan, folder: Path) -> list[int]:
+def _numbers(plan: Plan, folder: Folder) -> list[int]:
     """Return the numbers of the pairs that are there and are to be taken."""
     there = [
         number
@@ -124,7 +128,7 @@ def _called(numbers: Sequence[int]) -> str:
 # ---------------------------------------------------------------------- recorded
 
 
-def _recorded(plan: Plan, folder: Path) -> Iterator[Comparison]:
+def _recorded(plan: Plan, folder: Folder) -> Iterator[Comparison]:
     numbers = _numbers(plan, folder)
     _views(folder, "left", numbers[:1])  # what is imported late is not timed
     begin = time.perf_counter()
@@ -176,11 +180,12 @@ def _recorded(plan: Plan, folder: Path) -> Iterator[Comparison]:
 
 
 @functools.cache
-def _image(folder: Path, side: str, number: int) -> Any:
-    return cv2.imread(str(folder / f"{side}{number:02d}.jpg"), cv2.IMREAD_GRAYSCALE)
+def _image(folder: Folder, side: str, number: int) -> Any:
+    data = (folder / f"{side}{number:02d}.jpg").read_bytes()
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
 
 
-def _views(folder: Path, side: str, numbers: Sequence[int]) -> list[TargetView]:
+def _views(folder: Folder, side: str, numbers: Sequence[int]) -> list[TargetView]:
     return [find_target(_image(folder, side, number), BOARD) for number in numbers]
 
 
@@ -196,7 +201,7 @@ def _corners(image: Any, window: int) -> Array:
     return numbered
 
 
-def _peer(plan: Plan, folder: Path, numbers: Sequence[int], window: int) -> float:
+def _peer(plan: Plan, folder: Folder, numbers: Sequence[int], window: int) -> float:
     """Return the held-out error of OpenCV's own calibration, mm."""
     pixels = [
         [_corners(_image(folder, side, number), window).astype(np.float32) for number in numbers]

@@ -4,7 +4,7 @@ import struct
 
 from smartcam_weights import weights
 
-from smartcam.testing.suites.interpreters import InterpreterSuite, Sample
+from smartcam.testing import ContainerSample, InterpreterSuite
 
 
 def container(order: str) -> bytes:
@@ -18,6 +18,6 @@ class TestWeights(InterpreterSuite):
     spec = weights
     name = "weights"
     samples = (
-        Sample(container("<"), {"bolt": 0.25, "nut": 0.125}, big=container(">")),
-        Sample(b"", {}, big=b"", name="no part"),
+        ContainerSample(container("<"), {"bolt": 0.25, "nut": 0.125}, big=container(">")),
+        ContainerSample(b"", {}, big=b"", name="no part"),
     )

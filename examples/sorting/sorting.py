@@ -13,10 +13,8 @@ from collections import Counter
 from typing import TYPE_CHECKING, Protocol
 
 import smartcam
-from smartcam.calibration.geometry.frames import Transform
-from smartcam.calibration.plane.calibration import PlaneCalibration, fit_plane
-from smartcam.emulator import EmulatedCamera
-from smartcam.emulator.scene import TablePose, TableScene
+from smartcam.calibration import PlaneCalibration, Transform, fit_plane
+from smartcam.emulator import EmulatedCamera, TablePose, TableScene
 from smartcam.models import Pose, Position
 
 if TYPE_CHECKING:

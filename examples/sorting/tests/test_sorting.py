@@ -3,7 +3,7 @@
 import pytest
 from sorting import APPLICATION, CONTAINERS, MARKS, PARTS, TableRobot, calibrate, lay, main, sort
 
-from smartcam.emulator.scene import TablePose
+from smartcam.emulator import TablePose
 
 pytestmark = [
     pytest.mark.asyncio,
