@@ -89,7 +89,8 @@ class Connection:
         Raises:
             LinkError: there is none, and why.
         """
-        self._waits.raise_end()
+        if self._waits.end is not None:
+            self._waits.raise_end()
         if self.link is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         return self.link

@@ -73,12 +73,12 @@ class Dispatch:
 
     def dispatch(self, chunk: Chunk) -> None:
         """Hand on every event of a chunk, in order; never waits, never raises."""
-        at, now = datetime.now(UTC), chunk.received_at
+        at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
         for event in chunk.events:
             take = self._takers.get(type(event))
             if take is not None:  # LinkFailed and LinkEnded: the receive task ends by them
                 take(event, now, at)
-            if isinstance(event, m.Message):
+            if answers and isinstance(event, m.Message):
                 self._waits.on_message(event, now)
         if self._state.active_in_doubt:
             self._requests.ask_what_is_active()

@@ -181,7 +181,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             chunk, rest = split(chunk, self._most)
             if rest.events:
                 self._chunks.appendleft(rest)
-        if chunk.frames >= LEAST_CHUNK:
+        if chunk.frames >= LEAST_CHUNK and (self._chunks or chunk.frames > LEAST_CHUNK):
+            # more than the answers of a trigger
             self._busy_since, self._busy_with = thread_time(), chunk.frames
         if self._paused and not self._chunks:
             self._resume()

@@ -76,7 +76,8 @@ class Polling:
     def begin_trigger(self) -> None:
         """A trigger is under way, and wants to know what becomes of it."""
         self._triggered = True
-        self.wanted()
+        if self._running:
+            self.wanted()
 
     def end_trigger(self) -> None:
         """No trigger is under way any more."""
@@ -119,4 +120,4 @@ class Polling:
     @property
     def _may_be_silent(self) -> bool:
         """Something is loaded or inspected, and one thing may be done after the other."""
-        return self._waits.owes(SwitchAnswer, TriggerAnswer)
+        return self._waits.owes(SwitchAnswer) or self._waits.owes(TriggerAnswer)

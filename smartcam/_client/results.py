@@ -164,7 +164,8 @@ class Results:
         self._pending = None
         self._timer.clear()
         self.correlation.leave()
-        self._release_held()
+        if self._held:
+            self._release_held()
 
     def give_up(self, error: Exception) -> None:
         """End the trigger under way with an error; its results are late from this moment on."""
@@ -414,8 +415,10 @@ class Results:
 
     def _complete(self, now: float) -> None:
         """End the trigger under way if it has all its results, and nothing speaks against it."""
-        owner = self.pending
+        owner = self._pending
         if owner is None or owner.came < owner.wanted or not owner.progress.confirmed:
+            return
+        if self.pending is None:
             return
         self._end_input_doubt(owner)
         self._counters.processing.add(now - owner.sent_at)

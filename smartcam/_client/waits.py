@@ -33,13 +33,14 @@ class Waits:
 
     Attributes:
         end: why there is no session, None while there is one.
+        answers: who waits for an answer, by its type; by id for a message that the dialect does not
+            know.
     """
 
     def __init__(self, counters: ClientCounters) -> None:
         self.end: SmartCamError | None = None
         self._counters = counters
-        # by the answer's type; by id for a message that the dialect does not know
-        self._answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
+        self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
         self._asked_at: dict[object, float] = {}
         self._fence_open = False  # the Query in front of the last trigger is not answered
         self._statuses: list[_StatusWaiter] = []
@@ -58,9 +59,9 @@ class Waits:
         if self.end is not None:
             return False
         self.end = error
-        for answer in self._answers.values():
+        for answer in self.answers.values():
             answer.set_result(error)
-        self._answers.clear()
+        self.answers.clear()
         self._asked_at.clear()
         self._fence_open = False
         for waiter in self._statuses:
@@ -88,19 +89,18 @@ class Waits:
         """Register for the next answer of this kind; errors come as a result, never raised."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[Answer] = loop.create_future()
-        self._answers[key] = future
+        self.answers[key] = future
         if key is not m.SwitchAnswer:  # it takes its time, which is no round trip
             self._asked_at[key] = loop.time()
         return future
 
     def owed_answer(self, key: type[m.Message] | int) -> asyncio.Future[Answer]:
         """Return the future of an answer that is owed (:meth:`owes`)."""
-        return self._answers.get(key) or self.next_answer(key)
+        return self.answers.get(key) or self.next_answer(key)
 
-    def owes(self, *keys: type[m.Message] | int) -> bool:
-        """Whether an answer of one of these kinds is open."""
-        answers = self._answers
-        return any(key in answers or (key is m.QueryAnswer and self._fence_open) for key in keys)
+    def owes(self, key: type[m.Message] | int) -> bool:
+        """Whether an answer of this kind is open."""
+        return key in self.answers or (key is m.QueryAnswer and self._fence_open)
 
     def expect_fence(self) -> None:
         """Note that a Query went out in front of a trigger, for whose answer nobody waits."""
@@ -113,10 +113,8 @@ class Waits:
 
     def on_message(self, message: m.Message, now: float) -> None:
         """Complete the request that a message answers, if one is open."""
-        if not self._answers:
-            return
         key = message.message_id if isinstance(message, m.UnknownMessage) else type(message)
-        future = self._answers.pop(key, None)
+        future = self.answers.pop(key, None)
         if future is not None:
             asked_at = self._asked_at.pop(key, None)
             if asked_at is not None:

@@ -165,7 +165,7 @@ async def test_answer_keeps_the_link(transport: str, monkeypatch: pytest.MonkeyP
         for count in range(1, 6):
             await time.at(count * (HALF + JUST))
             await box.wait_for(QUERY, count + 1)
-            await until(lambda: not camera._waits._answers)
+            await until(lambda: not camera._waits.answers)
         await time.at(5 * (HALF + JUST) + HALF - JUST)
         assert camera.connected
         assert queries(box) == 5
@@ -321,7 +321,7 @@ async def test_trigger_without_a_result_is_no_silence(monkeypatch: pytest.Monkey
         for count in range(1, 8):
             await time.at(count * (HALF + JUST))
             await box.wait_for(QUERY, count + 1)
-            await until(lambda: not camera._waits._answers)
+            await until(lambda: not camera._waits.answers)
         box.send(box.result_frame() + box.status_frame(READY))
         assert (await triggering).raw == b"found"
 
@@ -386,7 +386,7 @@ async def test_load_that_is_over_is_asked_after_again(monkeypatch: pytest.Monkey
         await time.at(1200.0)
         await heard(camera, box, box.status_frame(READY))
         await box.wait_for(QUERY, 2)  # which application is active now?
-        await until(lambda: not camera._waits._answers)
+        await until(lambda: not camera._waits.answers)
         await time.at(1200.0 + HALF - JUST)
         assert queries(box) == 1
         await time.at(1200.0 + HALF)

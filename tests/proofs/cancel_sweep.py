@@ -531,7 +531,7 @@ async def _check_state(bench: Bench, call: Call) -> None:
         await camera.query_status()
     bits = bench.box.spoken.status_bits
     assert camera.status == bits.read(bits.write(device.status))
-    while not camera._waits._answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
+    while not camera._waits.answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
         await asyncio.sleep(0)
 
 

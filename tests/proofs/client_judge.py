@@ -447,7 +447,7 @@ class ClientJudge:
         assert active == camera.active_application == device.active_application
         bits = self.box.spoken.status_bits
         assert camera.status == bits.read(bits.write(device.status))
-        assert not camera._waits._answers
+        assert not camera._waits.answers
         return True
 
     def _settle_calls(self) -> None:
