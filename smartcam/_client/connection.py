@@ -122,4 +122,5 @@ class Connection:
         """
         if not 0 <= timeout < math.inf:
             raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
-        return self.loop.time() + timeout
+        loop = self._loop or asyncio.get_running_loop()
+        return loop.time() + timeout

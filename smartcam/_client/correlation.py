@@ -79,14 +79,14 @@ class SentTrigger:
         ended: nobody waits for it any more.
     """
 
-    wanted: int = 1
-    number: int | None = None
-    certain: bool = False
-    progress: Progress = field(default_factory=Progress)
-    came: int = 0
-    early: int = 0
-    given_up: bool = False
-    ended: bool = False
+    wanted: int
+    number: int | None
+    certain: bool
+    progress: Progress
+    came: int = field(init=False, default=0)
+    early: int = field(init=False, default=0)
+    given_up: bool = field(init=False, default=False)
+    ended: bool = field(init=False, default=False)
 
 
 class Match(NamedTuple):

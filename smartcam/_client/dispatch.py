@@ -125,16 +125,19 @@ class Dispatch:
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         before, status = self._state.status, report.status
-        was = self._state.report(report, switching=self._waits.owes(m.SwitchAnswer))
-        bits = int(status)
-        if (bits ^ (was or 0)) & _NOTED:
-            self._note_changes(bits, was or 0)
-        self._results.on_status(was, bits, now)
+        switching = m.SwitchAnswer in self._waits.answers
+        previous = self._state.report(report, switching=switching)
+        bits, was = int(status), previous or 0
+        if (bits ^ was) & _NOTED:
+            self._note_changes(bits, was)
+        self._results.on_status(previous, bits, now)
         if status != before and self._listeners.sees_events:
             event = StatusChanged(camera=self._name, at=at, status=status, previous=before)
             self._listeners.publish(event)
-        self._listeners.offer_status(status, now)
-        self._waits.show(status)
+        if self._listeners.statuses.references:
+            self._listeners.offer_status(status, now)
+        if self._waits.statuses:
+            self._waits.show(status)
 
     def _note_changes(self, bits: int, was: int) -> None:
         risen, fallen = bits & ~was, was & ~bits

@@ -95,9 +95,8 @@ class Listeners:
 
     def offer_status(self, status: Status, now: float) -> None:
         """Hand a status to its subscribers."""
-        if self.statuses.references:
-            for stream in self.statuses:
-                stream.offer(status, now)
+        for stream in self.statuses:
+            stream.offer(status, now)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
         """Hand results that are only streamed to their subscribers; ``size`` bytes in all."""

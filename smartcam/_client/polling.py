@@ -76,8 +76,7 @@ class Polling:
     def begin_trigger(self) -> None:
         """A trigger is under way, and wants to know what becomes of it."""
         self._triggered = True
-        if self._running:
-            self.wanted()
+        self.wanted()
 
     def end_trigger(self) -> None:
         """No trigger is under way any more."""
@@ -97,7 +96,7 @@ class Polling:
     def _tick(self) -> None:
         self._timer = None
         link, heard = self._connection.link, self._state.statuses_heard
-        soon = self._triggered or self._waits.awaits_status
+        soon = self._triggered or self._waits.statuses
         if not (soon or self._listeners.watches_status) or link is None or link.lost:
             return
         loop = self._connection.loop

@@ -47,7 +47,7 @@ _CURRENT = {"triggered", "nobody"}
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
-@dataclass(slots=True, eq=False, kw_only=True)
+@dataclass(slots=True, eq=False)
 class PendingTrigger(SentTrigger):
     """The trigger under way, and who waits for it.
 
@@ -66,8 +66,8 @@ class PendingTrigger(SentTrigger):
     has_input: bool
     sent_at: float
     triggered_at: datetime
-    application: int | None = None
-    results: list[Result] = field(default_factory=list[Result])
+    application: int | None
+    results: list[Result] = field(init=False, default_factory=list[Result])
 
     def take(self, result: Result) -> None:
         """One of its results has come."""
@@ -207,15 +207,17 @@ class Results:
             bits: the new one.
             now: loop time.
         """
-        risen, fallen = bits & ~(previous or 0), (previous or 0) & ~bits
+        was = previous or 0
+        risen, fallen = bits & ~was, was & ~bits
         if risen & _FAILING or fallen & _RUNNING:
             self._fail_trigger(risen, fallen)
         if self.correlation.on_status(previous, bits):
             self._note_others()
         if self._held:
             self._release_held()
-        if self._pending is not None and self._pending.results:
-            self._complete(now)
+        pending = self._pending
+        if pending is not None and pending.results:
+            self._complete(pending, now)
 
     def _fail_trigger(self, risen: int, fallen: int) -> None:
         """End the trigger under way where the status says that its result cannot be trusted."""
@@ -369,7 +371,7 @@ class Results:
         listeners.offer_result(result, now, current=current)
         if owner is not None:
             owner.take(result)
-            self._complete(now)
+            self._complete(owner, now)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
         """Whether it is a datagram that came twice, as far as can be told: one like it is there."""
@@ -400,7 +402,8 @@ class Results:
         value, sequence, empty_slots = interpretation(
             container, self._state.endian, camera=self._name, number=number, at=at
         )
-        self._counters.skip(empty_slots)
+        if empty_slots:
+            self._counters.skip(empty_slots)
         return Result(
             self._name,
             container.application,
@@ -413,12 +416,9 @@ class Results:
             value,
         )
 
-    def _complete(self, now: float) -> None:
+    def _complete(self, owner: PendingTrigger, now: float) -> None:
         """End the trigger under way if it has all its results, and nothing speaks against it."""
-        owner = self._pending
-        if owner is None or owner.came < owner.wanted or not owner.progress.confirmed:
-            return
-        if self.pending is None:
+        if owner.came < owner.wanted or not owner.progress.confirmed or owner.outcome.done():
             return
         self._end_input_doubt(owner)
         self._counters.processing.add(now - owner.sent_at)

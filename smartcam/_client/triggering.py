@@ -180,7 +180,7 @@ class Triggers:
         if self._commands.halted or correlation.debt is not None:
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
         while True:
-            status = int(self._status.last)
+            status = int(state.status or 0)
             if status & _SPEAKS_AGAINST != _WAITING:
                 await self._wait_for_trigger(deadline, wait=request.wait)
             elif status & _OVERTRIGGERED and not cleared:
@@ -196,17 +196,17 @@ class Triggers:
         fenced = features.fences and not (certain and decided)
         loop = connection.loop
         pending = PendingTrigger(
-            outcome=loop.create_future(),
-            interpretation=interpretation,
-            has_input=request.input_data is not None,
-            sent_at=loop.time(),
-            triggered_at=datetime.now(UTC),
-            wanted=request.results,
-            number=number,
-            certain=certain,
+            request.results,
+            number,
+            certain,
+            Progress(reached=not fenced, confirmed=not features.confirms),
+            loop.create_future(),
+            interpretation,
+            request.input_data is not None,
+            loop.time(),
+            datetime.now(UTC),
             # where each application has its own interpreter none is read with another's layout
-            application=None if interpretation.by_application else state.active,
-            progress=Progress(reached=not fenced, confirmed=not features.confirms),
+            None if interpretation.by_application else state.active,
         )
         return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
 
@@ -236,7 +236,8 @@ class Triggers:
                 self._expect_acknowledgement(pending, deadline)
             elif input_data is not None:
                 self._results.input_sent()
-            self._polling.begin_trigger()
+            if features.polled:
+                self._polling.begin_trigger()
             if not link.writable:
                 with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
                     async with asyncio.timeout_at(deadline):
@@ -262,7 +263,8 @@ class Triggers:
                 outcome.exception()  # nobody will look at it
             raise
         finally:
-            self._polling.end_trigger()
+            if features.polled:
+                self._polling.end_trigger()
             self._results.end_trigger()
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
@@ -330,7 +332,7 @@ class Triggers:
                 ) from exc
 
     def _raise_fault(self) -> None:
-        if int(self._status.last) & _SYSTEM_ERROR:
+        if int(self._state.status or 0) & _SYSTEM_ERROR:
             raise CameraFaultError(f"{self._name}: the camera reports System Error")
 
     async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:

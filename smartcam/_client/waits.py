@@ -20,7 +20,7 @@ Answer = m.Message | SmartCamError
 
 
 @dataclass(slots=True)
-class _StatusWaiter:
+class StatusWaiter:
     predicate: Callable[[Status], bool]
     outcome: asyncio.Future[Status]
 
@@ -35,6 +35,7 @@ class Waits:
         end: why there is no session, None while there is one.
         answers: who waits for an answer, by its type; by id for a message that the dialect does not
             know.
+        statuses: who waits for a status.
     """
 
     def __init__(self, counters: ClientCounters) -> None:
@@ -43,7 +44,7 @@ class Waits:
         self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
         self._asked_at: dict[object, float] = {}
         self._fence_open = False  # the Query in front of the last trigger is not answered
-        self._statuses: list[_StatusWaiter] = []
+        self.statuses: list[StatusWaiter] = []
 
     def begin_session(self) -> None:
         """A session is there, nothing is asked in it yet."""
@@ -64,10 +65,10 @@ class Waits:
         self.answers.clear()
         self._asked_at.clear()
         self._fence_open = False
-        for waiter in self._statuses:
+        for waiter in self.statuses:
             if not waiter.outcome.done():
                 waiter.outcome.set_exception(error)
-        self._statuses.clear()
+        self.statuses.clear()
         return True
 
     def finish(self, error: SmartCamError) -> None:
@@ -132,23 +133,18 @@ class Waits:
             TimeoutError: at ``deadline`` (loop time).
             LinkError: the session ended.
         """
-        waiter = _StatusWaiter(predicate, asyncio.get_running_loop().create_future())
-        self._statuses.append(waiter)
+        waiter = StatusWaiter(predicate, asyncio.get_running_loop().create_future())
+        self.statuses.append(waiter)
         try:
             async with asyncio.timeout_at(deadline):
                 return await waiter.outcome
         finally:
-            if waiter in self._statuses:
-                self._statuses.remove(waiter)
-
-    @property
-    def awaits_status(self) -> bool:
-        """Whether somebody waits for a status."""
-        return bool(self._statuses)
+            if waiter in self.statuses:
+                self.statuses.remove(waiter)
 
     def show(self, status: Status) -> None:
         """Show a status to everybody who waits for one."""
-        for waiter in tuple(self._statuses) if self._statuses else ():
+        for waiter in tuple(self.statuses):
             if waiter.outcome.done():
                 continue
             try:

@@ -579,7 +579,7 @@ def _check_waiters(camera: SmartCamera) -> None:
     """Assert that nobody is left who waits, and no turn is held."""
     lock, listeners = camera._lock, camera._listeners
     assert camera._results.correlation.pending is None
-    assert not camera._waits._statuses
+    assert not camera._waits.statuses
     assert not [future for future in listeners._next_results if not future.done()]
     assert not lock._leaving
     assert not lock._lock.locked()

@@ -393,7 +393,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         assert camera is not None
         if not self._is_alone() or not self._agrees():
             return
-        assert not camera._waits._statuses
+        assert not camera._waits.statuses
         assert not camera._lock._lock.locked()
         takes_one = device.running and device.applications[device.active_application].triggered
         if takes_one and Status.SYSTEM_ERROR not in device.status:
