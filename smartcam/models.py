@@ -13,10 +13,19 @@ import math
 import sys
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, Protocol, cast
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    # with a default, so that a bare Result or SmartCamera stays what it always was
+    from typing_extensions import TypeVar
+
+    ValueT = TypeVar("ValueT", default=Any)
+else:
+    from typing import TypeVar
+
+    ValueT = TypeVar("ValueT")
 
 __all__ = [
     "ApplicationChanged",
@@ -211,8 +220,8 @@ class Calibration(Protocol):
         ...
 
 
-class Result(NamedTuple):
-    """A decoded result container with its metadata.
+class Result(NamedTuple, Generic[ValueT]):
+    """A decoded result container with its metadata; generic in its value.
 
     Attributes:
         camera: name of the camera.
@@ -234,7 +243,7 @@ class Result(NamedTuple):
     received_at: datetime
     latency: float | None
     raw: bytes
-    value: Any
+    value: ValueT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

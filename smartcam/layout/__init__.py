@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import ConfigurationError, InterpretationError
+from smartcam.layout._classes import read_class
 from smartcam.layout._codec import Payload, Record, RecordCodec, check_names, named, record_class
 from smartcam.layout._text import Field, misfit, parse_text, to_text
 
@@ -81,6 +82,25 @@ class Layout:
         # where a table is the payload and nothing else: its dtype, and what makes it
         self._views: dict[ByteOrder, np.dtype[np.void]] = {}
         self._frombuffer: Any = None
+
+    @classmethod
+    def of(cls, described: type[Any], *, lenient: bool = False) -> Layout:
+        """Return the layout that a class says.
+
+        ``Annotated[float, "real32 mm"]`` is a field, ``bool`` one without more,
+        ``Annotated[list[Part], "*"]`` a group of records that another class says, and comes last.
+        ``interpret_as=`` takes such a class itself and gives its objects; :meth:`build` takes them.
+
+        Args:
+            described: a dataclass, a pydantic model or a NamedTuple; ``list[Part]`` for records to
+                the end.
+            lenient: as of the layout.
+
+        Raises:
+            LayoutError: a field has no layout text, one that is wrong (with the place), or one that
+                does not go with its type.
+        """
+        return cls(read_class(described).text, lenient=lenient)
 
     # -- what it is --------------------------------------------------------------------------
 
