@@ -23,6 +23,8 @@ from smartcam.emulator._insight.camera import EmulatedInSight
 from tests.cli.commandline import closed_port, emulators, run
 from tests.processes import Outcome, Process
 
+pytestmark = pytest.mark.long
+
 TARGET = Checkerboard(columns=9, rows=6, square=0.025, origin_mark=True)
 CAMERA = CameraModel(
     size=(640, 480), matrix=np.array([[700.0, 0, 320], [0, 700.0, 240], [0, 0, 1]])

@@ -79,12 +79,14 @@ def test_broken_plugins_are_listed_with_their_reasons(command: str, good: str) -
     assert "hurt  (hurt: hurt_module:f) cannot be used: smartcam." in out
 
 
+@pytest.mark.long
 def test_demo_tells_its_story() -> None:
     out = run("demo").done().out
     for text in ("BUSY", "7 parts", "parallelogram", "1. ", "6. Disconnected", "received 12 = "):
         assert text in out
 
 
+@pytest.mark.long
 def test_demo_json_is_json_with_a_balanced_account() -> None:
     lines = run("demo", "--json").done().lines
     assert [line["step"] for line in lines if "step" in line] == [1, 2, 3, 4, 5, 6]

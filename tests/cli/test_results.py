@@ -105,6 +105,7 @@ def test_trigger_json_localizations_prints_one_object(urls: dict[tuple[str, str]
             check_parts(result)
 
 
+@pytest.mark.long
 def test_trigger_dialect_not_pinned_is_found_out(urls: dict[tuple[str, str], str]) -> None:
     seven = ("--application", "7", "--interpret-as", "Localizations", "--json")
     for url in urls.values():

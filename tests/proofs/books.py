@@ -92,6 +92,9 @@ RECORD = struct.Struct("<4i")
 NOBODY = -1
 """In place of the number that was set before a trigger: none was."""
 
+FULL_LOG = 1000
+"""Entries of the emulator's log that are read before it forgets any."""
+
 MEMORY = 1 << 14
 """Runs that are remembered; a container does not come later than that."""
 
@@ -171,6 +174,10 @@ class BookKeeper(EmulatedCamera):
     @property
     def sent(self) -> list[Sent]:
         """The containers that were sent; the log is read for that, and empty then."""
+        self._read_log()
+        return self._sent
+
+    def _read_log(self) -> None:
         while self.log:
             entry = self.log.popleft()
             if isinstance(entry.message, m.ResultContainer) and entry.direction == "out":
@@ -178,10 +185,11 @@ class BookKeeper(EmulatedCamera):
                 index = run_of(data)
                 run = self.runs.get(index, KeptRun(index, 0.0))
                 self._sent.append(Sent(entry.peer, run, data, entry.wire is None))
-        return self._sent
 
     def received(self, link: ClientLink, message: m.Message) -> None:
         """Note whose the run is that a trigger begins."""
+        if len(self.log) > FULL_LOG:
+            self._read_log()  # it is bounded
         idle, before = not self.device.processing, self.device.status
         if isinstance(message, m.Connect):
             self._session, self._in_session = self._session + 1, 0
