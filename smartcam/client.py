@@ -47,7 +47,7 @@ from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterable
     from types import TracebackType
-    from typing import Literal, Self, Unpack
+    from typing import Literal, NoReturn, Self, Unpack
 
     from smartcam.interpreters._base import AnySpec, TypedSpec
     from smartcam.models import Localization
@@ -284,6 +284,14 @@ class SmartCamera(Generic[ValueT]):
 
     def __await__(self) -> Generator[Any, None, Self]:
         return self.open().__await__()
+
+    def __enter__(self) -> NoReturn:
+        raise TypeError(
+            "a smartcam.SmartCamera is opened by `async with smartcam.connect(...) as camera`; "
+            "without asyncio: `with smartcam.sync.connect(...) as camera`"
+        )
+
+    def __exit__(self, *_: object) -> None: ...
 
     def __repr__(self) -> str:
         return f"<SmartCamera {self.name} {self.url}>"

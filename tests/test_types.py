@@ -56,7 +56,7 @@ def value_of(result: Result) -> Any:
 
 async def test_values_have_their_types_wherever_they_come() -> None:
     async with (
-        EmulatedCamera(active=21, running=True) as emulator,
+        EmulatedCamera(active=7, running=True) as emulator,
         smartcam.connect(emulator.url, interpret_as="localizations") as camera,
     ):
         stream = camera.results()

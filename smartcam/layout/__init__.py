@@ -84,7 +84,7 @@ class Layout:
         self._frombuffer: Any = None
 
     @classmethod
-    def of(cls, described: type[Any], *, lenient: bool = False) -> Layout:
+    def of(cls, described: Any, *, lenient: bool = False) -> Layout:
         """Return the layout that a class says.
 
         ``Annotated[float, "real32 mm"]`` is a field, ``bool`` one without more,
@@ -296,7 +296,7 @@ class Layout:
 
     def build(
         self,
-        value: Mapping[str, Any] | Sequence[Any],
+        value: object,
         byte_order: ByteOrder = "little",
         *,
         slots: int | None = None,
@@ -305,8 +305,9 @@ class Layout:
         """Return the container's bytes for ``value``: what :meth:`parse` reads back.
 
         Args:
-            value: what :meth:`parse` returns; a record may be a mapping, a :class:`Record` or a
-                sequence of its values in order. A mapping may leave out the count field.
+            value: what :meth:`parse` returns; a record may be a mapping, a :class:`Record`, a
+                sequence of its values in order, or an object of a class (:meth:`of`). A mapping may
+                leave out the count field.
                 Values of fields with a unit are SI; integers are rounded to the wire's unit.
             byte_order: order of the bytes of a number.
             slots: pad with records of zeros up to this number, as the camera does.

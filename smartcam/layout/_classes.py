@@ -224,7 +224,7 @@ def _model_maker(kind: type[BaseModel], names: list[str]) -> Make:
             raise InterpretationError(
                 f"{kind.__name__}{'.' if where else ''}{where}: {first['msg']}, "
                 f"got {first['input']!r:.80}",
-                field=where or None,
+                field=where,
                 expected=first["msg"],
                 got=first["input"],
             ) from exc

@@ -91,8 +91,8 @@ def test_class_says_a_layout_in_both_directions(kind: Any, text: str, value: Any
     interpreter = resolve(kind)
     assert interpreter.layout == layout
     for order in ("little", "big"):
-        data = layout.build(value, order)  # type: ignore[arg-type]
-        read = run(interpreter, Reader(data, Context(byte_order=order)))  # type: ignore[arg-type]
+        data = layout.build(value, order)
+        read = run(interpreter, Reader(data, Context(byte_order=order)))
         assert read == value
         assert type(read) is type(value)
 
