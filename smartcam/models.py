@@ -213,7 +213,7 @@ class Localization(NamedTuple):
     pose: Pose
 
     def _repr_html_(self) -> str:
-        return _html().localizations_html([self])
+        return str(_html().localizations_html([self]))
 
 
 class Calibration(Protocol):
@@ -273,7 +273,7 @@ class Result(NamedTuple, Generic[ValueT]):
         return f"Result({', '.join(fields)})"
 
     def _repr_html_(self) -> str:
-        return _html().result_html(self)
+        return str(_html().result_html(self))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,13 +16,26 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple, TypeAlias, cast, get_args, get_origin, get_type_hints
-
-from pydantic import BaseModel, ValidationError
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    NamedTuple,
+    TypeAlias,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from smartcam.exceptions import InterpretationError, LayoutError
 from smartcam.layout._text import Field, LayoutSpec, parse_text, to_text
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+    from typing_extensions import TypeIs
 
 Make: TypeAlias = Callable[[Any], Any]
 """Turns what a layout's ``parse`` gives into objects of the class."""
@@ -97,7 +110,7 @@ def _members(kind: type) -> list[_Member]:
     """Return the fields of a class that are given when an object is made, in order."""
     if dataclasses.is_dataclass(kind):
         names = [field.name for field in dataclasses.fields(kind) if field.init]
-    elif issubclass(kind, BaseModel):
+    elif _is_model(kind):
         names = [*kind.model_fields]
     else:
         names = [*cast("Any", kind)._fields]
@@ -128,7 +141,7 @@ def _field(kind: type, member: _Member) -> Field:
     field = spec.fields[0]
     fitting = _types(field)
     # a model converts by itself
-    if not issubclass(kind, BaseModel) and member.hint not in (*fitting, Any, object):
+    if not _is_model(kind) and member.hint not in (*fitting, Any, object):
         expected = " or ".join(one.__name__ for one in fitting)
         got = getattr(member.hint, "__name__", member.hint)
         raise _error(kind, member, f"expected the type {expected} for {text!r}, got {got}")
@@ -158,11 +171,17 @@ def _is_record(kind: Any) -> bool:
     if not isinstance(kind, type):
         return False
     is_named_tuple = issubclass(kind, tuple) and hasattr(kind, "_fields")
-    return dataclasses.is_dataclass(kind) or issubclass(kind, BaseModel) or is_named_tuple
+    return dataclasses.is_dataclass(kind) or _is_model(kind) or is_named_tuple
 
 
 def _metadata(hint: Any) -> tuple[Any, ...]:
     return tuple(hint.__metadata__) if get_origin(hint) is Annotated else ()
+
+
+def _is_model(kind: type) -> TypeIs[type[BaseModel]]:
+    """Return whether it is a pydantic model; whoever has one has imported pydantic."""
+    pydantic = sys.modules.get("pydantic")
+    return pydantic is not None and issubclass(kind, pydantic.BaseModel)
 
 
 def _without_metadata(hint: Any) -> Any:
@@ -196,7 +215,7 @@ def _make_list(make: Make) -> Make:
 
 def _maker(kind: type, names: list[str], make_list: Make | None) -> Make:
     """Return what makes an object of ``kind`` from a record; ``make_list``: its last field."""
-    build = _model_maker(kind, names) if issubclass(kind, BaseModel) else _plain_maker(kind, names)
+    build = _model_maker(kind, names) if _is_model(kind) else _plain_maker(kind, names)
     if make_list is None:
         return build
     return lambda record: build((*record[:-1], make_list(record[-1])))
@@ -212,6 +231,8 @@ def _plain_maker(kind: type, names: list[str]) -> Make:
 
 
 def _model_maker(kind: type[BaseModel], names: list[str]) -> Make:
+    from pydantic import ValidationError
+
     fields = kind.model_fields
     keys = [fields[name].alias or name for name in names]
 
@@ -236,6 +257,7 @@ def values_of(value: object) -> dict[str, Any] | None:
     """Return the fields of an object of such a class by name, None where it is of none."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-    if isinstance(value, BaseModel):
-        return {name: getattr(value, name) for name in type(value).model_fields}
+    kind = type(value)
+    if _is_model(kind):
+        return {name: getattr(value, name) for name in kind.model_fields}
     return None
