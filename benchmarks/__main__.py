@@ -14,6 +14,7 @@ from benchmarks.report import as_json, markdown, notes, table
 
 BENCHMARKS = {
     "trigger": "await trigger() against a bare Protocol and pymodbus",
+    "sync": "camera.trigger() without asyncio, above await of it",
     "stream": "results as fast as the link gives them, one by one and in batches",
     "decode": "from a container's bytes to a table, localizations, texts",
     "large": "containers of 1 kB to 1 MB",

@@ -142,7 +142,7 @@ LIMITS = (
     "recording._records.MIN_RECORDS",
     "recording._records.MIN_UNPACKED",
     "recording._records.UNPACKED_PER_BYTE",
-    "testing._threads.CALL_TIMEOUT",
+    "_loop_thread.CALL_TIMEOUT",
     "calibration._plane.fitting.MOST_STEPS",
     "calibration._files.directory.MAX_NAME",
     "calibration._files.store.LOCK_TIMEOUT",

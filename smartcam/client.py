@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from smartcam._client.camera_state import CameraState
 from smartcam._client.command_lock import CommandLock
@@ -37,7 +37,7 @@ from smartcam.exceptions import (
     SmartCamError,
     TriggerTimeoutError,
 )
-from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status
+from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status, ValueT
 from smartcam.observers import Observer, Observers
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Transport
@@ -47,12 +47,17 @@ from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterable
     from types import TracebackType
-    from typing import Literal, Self, Unpack
+    from typing import Literal, NoReturn, Self, Unpack
+
+    from smartcam.interpreters._base import AnySpec, TypedSpec
+    from smartcam.models import Localization
+    from smartcam.settings import OtherOptions
 
 
 __all__ = ["SmartCamera", "connect"]
 
 QueueT = TypeVar("QueueT", bound=Queue[Any])
+T = TypeVar("T")
 
 DEFAULT_MAX_QUEUE = 1024
 """Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
@@ -72,13 +77,67 @@ DEFAULT_RECONNECT_TIMEOUT = 60.0
 published for the sibling)."""
 
 
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: None = None,
+    **options: Unpack[OtherOptions],
+) -> SmartCamera[bytes]: ...
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: Literal["localizations"],
+    **options: Unpack[OtherOptions],
+) -> SmartCamera[list[Localization]]: ...
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: AnySpec,
+    **options: Unpack[OtherOptions],
+) -> SmartCamera[Any]: ...
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: TypedSpec[T],
+    **options: Unpack[OtherOptions],
+) -> SmartCamera[T]: ...
+
+
+@overload
 def connect(
     url: str,
     *,
     model: str | None = None,
     observers: Iterable[Observer] = (),
     **options: Unpack[CameraOptions],
-) -> SmartCamera:
+) -> SmartCamera[Any]: ...
+
+
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    **options: Unpack[CameraOptions],
+) -> SmartCamera[Any]:
     """Return a camera to be opened with ``async with`` (or ``await``).
 
     Args:
@@ -109,7 +168,7 @@ def connect(
     return SmartCamera(CameraSettings.make(url, model, options), observers=observers)
 
 
-class SmartCamera:
+class SmartCamera(Generic[ValueT]):
     """A smart camera; made by :func:`connect`.
 
     It outlives its links: one that is lost is made again as ``reconnect`` says. Until then every
@@ -226,6 +285,14 @@ class SmartCamera:
     def __await__(self) -> Generator[Any, None, Self]:
         return self.open().__await__()
 
+    def __enter__(self) -> NoReturn:
+        raise TypeError(
+            "a smartcam.SmartCamera is opened by `async with smartcam.connect(...) as camera`; "
+            "without asyncio: `with smartcam.sync.connect(...) as camera`"
+        )
+
+    def __exit__(self, *_: object) -> None: ...
+
     def __repr__(self) -> str:
         return f"<SmartCamera {self.name} {self.url}>"
 
@@ -296,7 +363,7 @@ class SmartCamera:
         max_queue: int = DEFAULT_MAX_QUEUE,
         max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> Subscription[Result]: ...
+    ) -> Subscription[Result[ValueT]]: ...
 
     @overload
     def results(
@@ -307,7 +374,7 @@ class SmartCamera:
         max_queue: int = DEFAULT_MAX_QUEUE,
         max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> BatchSubscription[Result]: ...
+    ) -> BatchSubscription[Result[ValueT]]: ...
 
     def results(
         self,
@@ -317,7 +384,7 @@ class SmartCamera:
         max_queue: int = DEFAULT_MAX_QUEUE,
         max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> Subscription[Result] | BatchSubscription[Result]:
+    ) -> Subscription[Result[ValueT]] | BatchSubscription[Result[ValueT]]:
         """Subscribe to everything the camera sends, triggered or not; subscribed when called.
 
         The stream goes on over a reconnect; what the camera sent in between nobody got.
@@ -335,7 +402,7 @@ class SmartCamera:
                 may be larger). One that is larger alone is kept while no other is.
             overflow: what happens beyond either.
         """
-        kind = BatchSubscription[Result] if batch else Subscription[Result]
+        kind = BatchSubscription[Result[ValueT]] if batch else Subscription[Result[ValueT]]
         stream = kind(
             "results",
             max_queue=max_queue,
@@ -406,7 +473,7 @@ class SmartCamera:
 
     def next_result(
         self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
-    ) -> Coroutine[Any, Any, Result]:
+    ) -> Coroutine[Any, Any, Result[ValueT]]:
         """Wait for the next result, whoever triggers it; registered when called, not when awaited.
 
         One that is known to be of a trigger that was given up is not taken for it.
@@ -433,24 +500,96 @@ class SmartCamera:
         self,
         application: int | None = None,
         *,
-        interpret_as: object = None,
+        interpret_as: None = None,
         input: bytes | None = None,
         timeout: float = DEFAULT_TRIGGER_TIMEOUT,
         when_busy: Literal["wait", "refuse"] = "wait",
         results_per_trigger: None = None,
-    ) -> Result: ...
+    ) -> Result[ValueT]: ...
 
     @overload
     async def trigger(
         self,
         application: int | None = None,
         *,
-        interpret_as: object = None,
+        interpret_as: None = None,
         input: bytes | None = None,
         timeout: float = DEFAULT_TRIGGER_TIMEOUT,
         when_busy: Literal["wait", "refuse"] = "wait",
         results_per_trigger: int,
-    ) -> list[Result]: ...
+    ) -> list[Result[ValueT]]: ...
+
+    @overload
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: Literal["localizations"],
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: None = None,
+    ) -> Result[list[Localization]]: ...
+
+    @overload
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: Literal["localizations"],
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: int,
+    ) -> list[Result[list[Localization]]]: ...
+
+    @overload
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: AnySpec,
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: None = None,
+    ) -> Result[Any]: ...
+
+    @overload
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: AnySpec,
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: int,
+    ) -> list[Result[Any]]: ...
+
+    @overload
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: TypedSpec[T],
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: None = None,
+    ) -> Result[T]: ...
+
+    @overload
+    async def trigger(
+        self,
+        application: int | None = None,
+        *,
+        interpret_as: TypedSpec[T],
+        input: bytes | None = None,
+        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        results_per_trigger: int,
+    ) -> list[Result[T]]: ...
 
     async def trigger(
         self,
@@ -461,7 +600,7 @@ class SmartCamera:
         timeout: float = DEFAULT_TRIGGER_TIMEOUT,
         when_busy: Literal["wait", "refuse"] = "wait",
         results_per_trigger: int | None = None,
-    ) -> Result | list[Result]:
+    ) -> Result[Any] | list[Result[Any]]:
         """Trigger one inspection and return its result.
 
         Waits until the camera waits for a trigger, then sends. One trigger at a time: a second

@@ -9,14 +9,24 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import importlib
 import math
 import sys
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, Protocol, cast
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    # with a default, so that a bare Result or SmartCamera stays what it always was
+    from typing_extensions import TypeVar
+
+    ValueT = TypeVar("ValueT", default=Any)
+else:
+    from typing import TypeVar
+
+    ValueT = TypeVar("ValueT")
 
 __all__ = [
     "ApplicationChanged",
@@ -119,6 +129,22 @@ def as_status(word: int) -> Status:
     return Status(word) if known is None else cast("Status", known)
 
 
+SHORT_BYTES = 16
+"""Bytes of a container that a result's repr shows."""
+
+LONGEST_REPR = 300
+"""Characters of a value that a result's repr shows."""
+
+
+def _cut(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= LONGEST_REPR else f"{text[:LONGEST_REPR]}..."
+
+
+def _html() -> Any:
+    return importlib.import_module("smartcam._html")  # for notebooks only
+
+
 class Position(NamedTuple):
     """A point, metres."""
 
@@ -186,6 +212,9 @@ class Localization(NamedTuple):
     photo_index: int
     pose: Pose
 
+    def _repr_html_(self) -> str:
+        return str(_html().localizations_html([self]))
+
 
 class Calibration(Protocol):
     """What brings localizations into a robot's frame.
@@ -211,8 +240,8 @@ class Calibration(Protocol):
         ...
 
 
-class Result(NamedTuple):
-    """A decoded result container with its metadata.
+class Result(NamedTuple, Generic[ValueT]):
+    """A decoded result container with its metadata; generic in its value.
 
     Attributes:
         camera: name of the camera.
@@ -234,7 +263,17 @@ class Result(NamedTuple):
     received_at: datetime
     latency: float | None
     raw: bytes
-    value: Any
+    value: ValueT
+
+    def __repr__(self) -> str:
+        """Return the fields that say something, long ones cut."""
+        raw = self.raw if len(self.raw) <= SHORT_BYTES else self.raw[:SHORT_BYTES] + b"..."
+        shown = self._asdict() | {"raw": raw}
+        fields = (f"{name}={_cut(value)}" for name, value in shown.items() if value is not None)
+        return f"Result({', '.join(fields)})"
+
+    def _repr_html_(self) -> str:
+        return str(_html().result_html(self))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -210,12 +210,11 @@ def _protocols() -> Iterator[Protocol]:
             yield protocol
 
 
-class CameraOptions(TypedDict, total=False):
-    """The options that ``connect()`` takes; :class:`CameraSettings` has defaults and meanings."""
+class OtherOptions(TypedDict, total=False):
+    """The options that ``connect()`` takes, but for what says how to read results."""
 
     name: str
     application: int | None
-    interpret_as: Spec | Mapping[int, Spec]
     calibration: Calibration | Mapping[int, Calibration | None] | None
     y_down: bool
     lenient: bool
@@ -228,6 +227,12 @@ class CameraOptions(TypedDict, total=False):
     reconnect: Backoff | None
     restore: bool
     max_length: int
+
+
+class CameraOptions(OtherOptions, total=False):
+    """The options that ``connect()`` takes; :class:`CameraSettings` has defaults and meanings."""
+
+    interpret_as: Spec | Mapping[int, Spec]
 
 
 class CameraSettings(BaseModel):

@@ -16,7 +16,7 @@ from smartcam.models import SubscriberStatistics
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator, Sequence
     from types import TracebackType
-    from typing import Self
+    from typing import NoReturn, Self
 
 __all__ = ["BatchSubscription", "Subscription"]
 
@@ -136,6 +136,11 @@ class Queue(Generic[T]):
                 raise StopAsyncIteration
             self._ready.clear()
             await self._ready.wait()
+
+    def __iter__(self) -> NoReturn:
+        raise TypeError(
+            f"{self._name}() is read by `async for`; without asyncio: smartcam.sync.connect(...)"
+        )
 
     async def __aenter__(self) -> Self:
         return self

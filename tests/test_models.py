@@ -295,6 +295,32 @@ def test_jsonable_result_has_the_documented_names() -> None:
     }
 
 
+def test_result_is_shown_short() -> None:
+    small = Result("cell 1", 7, None, 4, None, AT, None, b"\x01\x02", 5)
+    assert repr(small) == (
+        f"Result(camera='cell 1', application=7, number=4, received_at={AT!r}, "
+        "raw=b'\\x01\\x02', value=5)"
+    )
+    large = Result("cell 1", 7, 1, 4, AT, AT, 0.02, bytes(60_000), ["part"] * 1000)
+    assert len(repr(large)) < 700
+    assert "sequence=1" in repr(large)
+
+
+def test_result_in_a_notebook_is_a_table_of_parts() -> None:
+    parts = [Localization(f"<{number}>", 0.9, 0, POSE) for number in range(102)]
+    html = Result("cell & 1", 7, None, 4, AT, AT, 0.02, b"\x01\x02", parts)._repr_html_()
+    assert "<td>cell &amp; 1</td>" in html
+    assert "<td>20 ms</td>" in html
+    assert "<td>102 localizations</td>" in html
+    assert html.count("<td>&lt;") == 100
+    assert html.endswith("<p>and 2 more</p>")
+    x = f"<td>{1e3 * POSE.position.x:.3f}</td>"
+    assert x in parts[0]._repr_html_()
+    plain = Result("cell 1", 7, None, 4, None, AT, None, b"", {"a": "<b>"})._repr_html_()
+    assert "<td>{&#x27;a&#x27;: &#x27;&lt;b&gt;&#x27;}</td>" in plain
+    assert "latency" not in plain
+
+
 @pytest.mark.parametrize(
     ("event", "own"),
     [

@@ -231,6 +231,9 @@ class EmulatedCamera(Server):
         quirks = self.spoken.quirks
         return Address("bvs", self._scheme, self.host, self.port, self.dialect, quirks).url
 
+    def __repr__(self) -> str:
+        return f"<EmulatedCamera {self.name} {self.url}>"
+
     @property
     def scene(self) -> TableScene:
         """The table it looks at, with the ground truth."""

@@ -14,10 +14,10 @@ import re
 import struct
 from abc import ABC, abstractmethod
 from asyncio import CancelledError
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias, TypeVar
 
 from smartcam.exceptions import (
     ConfigurationError,
@@ -27,11 +27,14 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.layout import Layout
+from smartcam.layout._classes import describes_layout, read_class
 from smartcam.layout._text import TYPES
 from smartcam.registry import INTERPRETERS
 
 if TYPE_CHECKING:
     from smartcam.models import ByteOrder
+
+T = TypeVar("T")
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -294,8 +297,14 @@ class PlainInterpreter(Interpreter):
 Function: TypeAlias = Callable[[Reader], object]
 """The shortest interpreter: a function of a reader; ``reader.layout`` is the user's layout."""
 
-Spec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | Function | None
+Spec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | type[Any] | Function | None
 """What ``interpret_as`` takes for one application."""
+
+AnySpec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | Mapping[int, Any] | None
+"""Of what ``interpret_as`` takes, that whose values a type checker cannot know."""
+
+TypedSpec: TypeAlias = Callable[[Reader], T] | type[T]
+"""Of what ``interpret_as`` takes, that which says what its values are."""
 
 
 class _FunctionInterpreter(Interpreter):
@@ -311,6 +320,24 @@ class _FunctionInterpreter(Interpreter):
 
     def __repr__(self) -> str:
         return f"<interpreter {getattr(self._function, '__name__', self._function)}>"
+
+
+class _ClassInterpreter(PlainInterpreter):
+    """Gives objects of a class that says a layout."""
+
+    layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
+
+    def __init__(self, described: Any, *, lenient: bool) -> None:
+        text, self._make = read_class(described)
+        super().__init__(Layout(text, lenient=lenient))
+        self._described = described
+
+    def read(self, data: bytes, context: Context) -> Any:
+        """Return an object, or the list of them."""
+        return self._make(self.layout.parse(data, context.byte_order))
+
+    def __repr__(self) -> str:
+        return f"<interpreter {getattr(self._described, '__name__', self._described)}>"
 
 
 def run(interpreter: Interpreter, reader: Reader) -> object:
@@ -375,7 +402,8 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
     Args:
         spec: None (``raw``), a name (``"localizations"``), a layout text, a name with a layout
             (``"table: x: real32 mm"``), a :class:`~smartcam.Layout`, an interpreter, its class,
-            or a function of a :class:`Reader`.
+            a function of a :class:`Reader`, or a class that says a layout
+            (:meth:`smartcam.Layout.of`).
         lenient: take any byte but zero for a true bool.
 
     Raises:
@@ -390,6 +418,8 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
     elif isinstance(spec, Layout):
         name = "record"
         layout = Layout(spec.text, lenient=True) if lenient and not spec.lenient else spec
+    elif describes_layout(spec):
+        return _ClassInterpreter(spec, lenient=lenient)
     else:
         return _make(getattr(spec, "__name__", repr(spec)), spec, None, lenient=lenient)
     return _make(name, INTERPRETERS.load(name), layout, lenient=lenient)
@@ -462,7 +492,8 @@ def _make(name: str, loaded: object, layout: Layout | None, *, lenient: bool) ->
     if not isinstance(loaded, type) and callable(loaded):
         return _FunctionInterpreter(loaded, layout)
     raise PluginError(
-        f"interpreter {name}: expected a function of a Reader or a subclass of Interpreter, "
+        f"interpreter {name}: expected a function of a Reader, a subclass of Interpreter, "
+        "or a dataclass, model or NamedTuple whose fields are annotated with their layout, "
         f"got {loaded!r:.200}",
         name=name,
     )

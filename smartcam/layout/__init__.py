@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import ConfigurationError, InterpretationError
+from smartcam.layout._classes import read_class
 from smartcam.layout._codec import Payload, Record, RecordCodec, check_names, named, record_class
 from smartcam.layout._text import Field, misfit, parse_text, to_text
 
@@ -81,6 +82,25 @@ class Layout:
         # where a table is the payload and nothing else: its dtype, and what makes it
         self._views: dict[ByteOrder, np.dtype[np.void]] = {}
         self._frombuffer: Any = None
+
+    @classmethod
+    def of(cls, described: Any, *, lenient: bool = False) -> Layout:
+        """Return the layout that a class says.
+
+        ``Annotated[float, "real32 mm"]`` is a field, ``bool`` one without more,
+        ``Annotated[list[Part], "*"]`` a group of records that another class says, and comes last.
+        ``interpret_as=`` takes such a class itself and gives its objects; :meth:`build` takes them.
+
+        Args:
+            described: a dataclass, a pydantic model or a NamedTuple; ``list[Part]`` for records to
+                the end.
+            lenient: as of the layout.
+
+        Raises:
+            LayoutError: a field has no layout text, one that is wrong (with the place), or one that
+                does not go with its type.
+        """
+        return cls(read_class(described).text, lenient=lenient)
 
     # -- what it is --------------------------------------------------------------------------
 
@@ -276,7 +296,7 @@ class Layout:
 
     def build(
         self,
-        value: Mapping[str, Any] | Sequence[Any],
+        value: object,
         byte_order: ByteOrder = "little",
         *,
         slots: int | None = None,
@@ -285,8 +305,9 @@ class Layout:
         """Return the container's bytes for ``value``: what :meth:`parse` reads back.
 
         Args:
-            value: what :meth:`parse` returns; a record may be a mapping, a :class:`Record` or a
-                sequence of its values in order. A mapping may leave out the count field.
+            value: what :meth:`parse` returns; a record may be a mapping, a :class:`Record`, a
+                sequence of its values in order, or an object of a class (:meth:`of`). A mapping may
+                leave out the count field.
                 Values of fields with a unit are SI; integers are rounded to the wire's unit.
             byte_order: order of the bytes of a number.
             slots: pad with records of zeros up to this number, as the camera does.

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
 from smartcam.exceptions import ConfigurationError, hex_excerpt
+from smartcam.layout._classes import values_of
 from smartcam.layout._text import UNITS, misfit
 
 if TYPE_CHECKING:
@@ -247,6 +248,9 @@ def named(value: object, names: Sequence[str], what: str) -> dict[str, Any]:
         return dict(given)
     if isinstance(value, Record):
         return dict(given._asdict())
+    fields = values_of(value)
+    if fields is not None:
+        return fields
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
         raise ConfigurationError(
             f"layout: {what}expected a mapping or a sequence of values, got {_shown(value)}"

@@ -10,17 +10,16 @@ language. All methods are synchronous and may be called in any thread::
 from __future__ import annotations
 
 import asyncio
-import threading
-from collections.abc import Callable, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
+from smartcam._loop_thread import CALL_TIMEOUT, LoopThread
 from smartcam.emulator import EmulatedCamera, EmulatedFleet, ManualClock
-from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
+from smartcam.exceptions import ConfigurationError
 from smartcam.testing._logs import CameraLog
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
     from types import TracebackType
     from typing import Self
 
@@ -29,92 +28,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.protocols.messages import Message
 
-CALL_TIMEOUT = 10.0
-"""Seconds that a call into the thread may take. It is answered in well under a millisecond; longer
-means that something in there, such as a generator of an application, does not return."""
-
 T = TypeVar("T")
-P = ParamSpec("P")
-
-
-class LoopThread:
-    """An event loop in a thread."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._end: asyncio.Event | None = None
-        self._thread: threading.Thread | None = None
-
-    def start(self) -> None:
-        """Start it; does nothing if it runs."""
-        if self._thread is not None:
-            return
-        ready: threading.Event = threading.Event()
-
-        async def live() -> None:
-            self._loop = asyncio.get_running_loop()
-            end = self._end = asyncio.Event()
-            ready.set()
-            await end.wait()
-
-        # a daemon, so that a test that is killed does not wait for it
-        self._thread = threading.Thread(
-            target=asyncio.run, args=(live(),), name=self._name, daemon=True
-        )
-        self._thread.start()
-        if not ready.wait(CALL_TIMEOUT):
-            raise ResponseTimeoutError(
-                f"the thread {self._name} did not start", message_id=None, waited=CALL_TIMEOUT
-            )
-
-    def stop(self) -> None:
-        """End it. Harmless when done twice."""
-        thread, self._thread = self._thread, None
-        if thread is not None and self._loop is not None and self._end is not None:
-            self._loop.call_soon_threadsafe(self._end.set)
-            thread.join(CALL_TIMEOUT)
-            self._loop = None
-
-    def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in the thread and return what it returns.
-
-        Raises:
-            ConfigurationError: the thread does not run.
-            ResponseTimeoutError: it took longer than :data:`CALL_TIMEOUT`.
-            Exception: whatever the function raises.
-        """
-
-        async def call() -> T:
-            return function(*args, **kwargs)
-
-        return self.wait(call())
-
-    def wait(self, work: Coroutine[Any, Any, T], timeout: float = CALL_TIMEOUT) -> T:
-        """Run a coroutine in the thread to its end; errors as in :meth:`run`."""
-        future = self.submit(work)
-        try:
-            return future.result(timeout)
-        except TimeoutError as exc:
-            if future.done():  # it was the coroutine's own
-                raise
-            future.cancel()
-            raise ResponseTimeoutError(
-                f"the thread {self._name} did not answer within {timeout:g} s",
-                message_id=None,
-                waited=timeout,
-            ) from exc
-
-    def submit(self, work: Coroutine[Any, Any, T]) -> Future[T]:
-        """Run a coroutine in the thread.
-
-        Raises:
-            ConfigurationError: the thread does not run.
-        """
-        if self._loop is None:
-            work.close()
-            raise ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
-        return asyncio.run_coroutine_threadsafe(work, self._loop)
 
 
 @dataclass(eq=False)

@@ -480,7 +480,7 @@ async def test_first_failure_is_loud_and_the_rest_quiet(caplog: pytest.LogCaptur
 
 def test_reconnect_that_is_no_policy_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="reconnect"):
-        smartcam.connect("bvs://127.0.0.1", reconnect=True)  # type: ignore[arg-type]
+        smartcam.connect("bvs://127.0.0.1", reconnect=True)  # type: ignore[call-overload]
 
 
 # ---------------------------------------------------------------------- closing meanwhile

@@ -240,7 +240,7 @@ async def test_close_while_opening_ends_the_opener() -> None:
 
 def test_connect_with_a_wrong_option_names_it() -> None:
     with pytest.raises(ConfigurationError, match="aplication"):
-        smartcam.connect("bvs://127.0.0.1", aplication=7)  # type: ignore[call-arg]
+        smartcam.connect("bvs://127.0.0.1", aplication=7)  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize("timeout", [-1.0, float("nan"), float("inf")])

@@ -719,7 +719,7 @@ async def test_interpret_as_something_wrong_is_refused_before_a_trigger_is_sent(
 ) -> None:
     async with by_hand() as (box, camera):
         with pytest.raises(error):
-            await camera.trigger(interpret_as=spec)
+            await camera.trigger(interpret_as=spec)  # type: ignore[call-overload]
         assert TRIGGER not in box.ids
 
 

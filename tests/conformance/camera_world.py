@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from smartcam._loop_thread import LoopThread
 from smartcam.conformance.camera import Allow, CameraReport, ConformanceOptions, judge
 from smartcam.emulator import EmulatedCamera
-from smartcam.testing._threads import LoopThread
 from tests.conformance.pace import is_first, slowed
 
 APPLICATION, OTHER = 5, 6

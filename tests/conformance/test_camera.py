@@ -11,6 +11,7 @@ from typing import Any, get_args
 import pytest
 import yaml
 
+from smartcam._loop_thread import LoopThread
 from smartcam.conformance.camera import Allow, ConformanceOptions, judge
 from smartcam.conformance.camera._items import CHECKS, ITEMS, QUESTIONS
 from smartcam.conformance.camera._judging import judge_item
@@ -21,7 +22,6 @@ from smartcam.emulator import _client_link as client_link
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.testing._threads import LoopThread
 from tests.conformance import camera_sins
 from tests.conformance.camera_world import (
     APPLICATION,

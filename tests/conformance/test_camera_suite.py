@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
+from smartcam._loop_thread import LoopThread
 from smartcam.protocols import messages as m
-from smartcam.testing._threads import LoopThread
 from tests import ROOT
 from tests.conformance import camera_sins
 from tests.conformance.camera_world import emulated, loop_thread

@@ -139,7 +139,7 @@ def test_no_layout_for_one_that_needs_it_says_how(name: str) -> None:
 def test_neither_interpreter_nor_spec_is_refused() -> None:
     spec: Any
     for spec in (5, int):
-        with pytest.raises(PluginError, match="expected a function of a Reader or a subclass"):
+        with pytest.raises(PluginError, match="expected a function of a Reader, a subclass"):
             resolve(spec)
 
 

@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 
 import smartcam
+from smartcam._loop_thread import LoopThread
 from smartcam.emulator import EmulatedCamera, Scenario, faults
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 from smartcam.protocols.messages import Connect, Query
-from smartcam.testing._threads import LoopThread, ThreadedCamera, ThreadedFleet
+from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
 
 pytestmark = pytest.mark.real_time
 

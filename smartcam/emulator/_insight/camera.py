@@ -160,6 +160,9 @@ class EmulatedInSight(Server):
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"insight://{host}:{self.port}"
 
+    def __repr__(self) -> str:
+        return f"<EmulatedInSight {self.url}>"
+
     @property
     def online(self) -> bool:
         """Whether it is online."""

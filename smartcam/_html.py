@@ -1,0 +1,61 @@
+"""Values as tables, for notebooks: what ``_repr_html_`` of the public values gives."""
+
+from __future__ import annotations
+
+import math
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from smartcam.models import Localization, Result
+
+MOST_ROWS = 100
+"""Rows that are shown; the number of those left out is told."""
+
+
+def localizations_html(parts: Sequence[Localization]) -> str:
+    """Return a table of parts: millimetres and degrees."""
+    return _table(("part", "quality", "x mm", "y mm", "z mm", "angle deg"), map(_part, parts))
+
+
+def result_html(result: Result) -> str:
+    """Return a result's fields, with the parts as a table where its value is some."""
+    value: Any = result.value
+    shown = _is_parts(value)
+    fields = {
+        "camera": result.camera,
+        "application": result.application,
+        "number": result.number,
+        "received": f"{result.received_at:%Y-%m-%d %H:%M:%S} UTC",
+        "latency": "" if result.latency is None else f"{1e3 * result.latency:.0f} ms",
+        "raw": f"{len(result.raw)} bytes",
+        "value": f"{len(value)} localizations" if shown else f"{value!r:.1000}",
+    }
+    rows = [[name, str(text)] for name, text in fields.items() if text != ""]
+    return _table((), rows) + (localizations_html(value) if shown else "")
+
+
+def _is_parts(value: object) -> bool:
+    items: Any = value if isinstance(value, list) else ()
+    return bool(items) and all(hasattr(item, "feature_id") for item in items)
+
+
+def _part(part: Localization) -> list[str]:
+    x, y, z = (f"{1e3 * length:.3f}" for length in part.pose.position)
+    angle = math.degrees(part.pose.orientation.theta)
+    return [part.feature_id, f"{part.quality:.3f}", x, y, z, f"{angle:.2f}"]
+
+
+def _table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    listed = list(rows)
+    head = f"<tr>{_cells('th', names)}</tr>" if names else ""
+    body = "".join(f"<tr>{_cells('td', row)}</tr>" for row in listed[:MOST_ROWS])
+    more = len(listed) - MOST_ROWS
+    rest = f"<p>and {more} more</p>" if more > 0 else ""
+    return f"<table>{head}{body}</table>{rest}"
+
+
+def _cells(kind: str, texts: Iterable[str]) -> str:
+    return "".join(f"<{kind}>{escape(text)}</{kind}>" for text in texts)

@@ -1,0 +1,349 @@
+"""An event loop in a thread, and calls into it from other threads."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import inspect
+import os
+import sys
+import threading
+import weakref
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+
+from smartcam.exceptions import ConfigurationError, LocalProtocolError, ResponseTimeoutError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+    from concurrent.futures import Future
+
+T = TypeVar("T")
+P = ParamSpec("P")
+
+CALL_TIMEOUT = 10.0
+"""Seconds that a call into the thread may take that has no deadline of its own. It is answered in
+well under a millisecond; longer means that something in there, such as a generator of an
+application, does not return."""
+
+SLICE = 0.1
+"""Seconds that Ctrl-C may have to wait on Windows, where no lock's wait is interrupted."""
+
+
+def _start(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    """Return a task that has begun, where Python can do that; it saves a turn of the loop."""
+    loop = asyncio.get_running_loop()
+    if sys.version_info >= (3, 12):
+        return asyncio.Task(work, loop=loop, eager_start=True)
+    return loop.create_task(work)
+
+
+class _Mailbox:
+    """Functions that other threads want to have called in a loop's thread.
+
+    Linux has a counter to wake a loop with, which takes a fifth of what the loop's own pair of
+    sockets takes.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._functions: collections.deque[Callable[[], object]] = collections.deque()
+        self._closed = False
+        self._counter: int | None = None
+        if sys.platform == "linux":
+            self._counter = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+            loop.add_reader(self._counter, self._woken)
+
+    def post(self, function: Callable[[], object]) -> None:
+        """Have it called, from any thread.
+
+        Raises:
+            ConfigurationError: the loop has ended; it is not called.
+        """
+        self._functions.append(function)
+        if not self._closed:
+            self._wake()
+        elif function in self._functions:  # else it was among the last ones
+            self._functions.remove(function)
+            raise ConfigurationError("the thread of the event loop has ended")
+
+    def close(self) -> None:
+        """Call what is left, and refuse what comes; in the loop's thread."""
+        self._closed = True
+        if self._counter is not None:
+            self._loop.remove_reader(self._counter)
+        self._call_all()
+
+    def __del__(self) -> None:
+        if self._counter is not None:  # nobody writes to it any more
+            os.close(self._counter)
+
+    def _wake(self) -> None:
+        if sys.platform == "linux" and self._counter is not None:
+            os.eventfd_write(self._counter, 1)
+        else:
+            self._loop.call_soon_threadsafe(self._call_all)
+
+    def _woken(self) -> None:
+        if sys.platform == "linux" and self._counter is not None:
+            os.eventfd_read(self._counter)
+        self._call_all()
+
+    def _call_all(self) -> None:
+        while self._functions:
+            self._functions.popleft()()
+
+
+class _ThreadCall:
+    """A call into the thread: begun there, awaited in another.
+
+    A lock and one wake-up each way: half of what ``asyncio.run_coroutine_threadsafe`` takes.
+    """
+
+    __slots__ = (
+        *(
+            "_cancelled",
+            "_done",
+            "_error",
+            "_finished",
+            "_function",
+            "_mailbox",
+            "_result",
+            "_task",
+        ),
+    )
+
+    def __init__(self, mailbox: _Mailbox, function: Callable[[], object]) -> None:
+        self._mailbox = mailbox
+        self._function = function
+        self._task: asyncio.Task[Any] | None = None
+        self._result: Any = None
+        self._error: BaseException | None = None
+        self._cancelled = self._finished = False
+        self._done = threading.Lock()
+        self._done.acquire()
+        mailbox.post(self._begin)
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until it is done; return whether it is. Ctrl-C ends it, and is raised.
+
+        Args:
+            timeout: seconds; None where what is called has deadlines of its own.
+        """
+        try:
+            if timeout is not None:
+                return self._done.acquire(timeout=timeout)
+            if sys.platform == "win32":
+                while not self._done.acquire(timeout=SLICE):
+                    pass
+            else:
+                self._done.acquire()
+        except BaseException:  # KeyboardInterrupt, in the main thread
+            self.cancel()
+            if not self._finished:  # what is cancelled ends at once
+                self._done.acquire(timeout=CALL_TIMEOUT)
+            raise
+        return True
+
+    def cancel(self) -> None:
+        """Have it end, from any thread."""
+        with contextlib.suppress(ConfigurationError):  # then it is over
+            self._mailbox.post(self._cancel)
+
+    def result(self) -> Any:
+        """Return what came of it, once it is done, or raise."""
+        if self._error is not None:
+            try:
+                raise self._error
+            finally:
+                self._error = None  # no circle through the traceback
+        return self._result
+
+    # ------------------------------------------------------------------ in the thread
+
+    def _begin(self) -> None:
+        if self._cancelled:
+            self._fail(asyncio.CancelledError())
+            return
+        try:
+            got = self._function()
+        except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
+            self._fail(exc)
+            return
+        if inspect.iscoroutine(got):
+            self._task = _start(self._finish_by(got))
+        else:
+            self._succeed(got)
+
+    async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
+        """Run a coroutine; who waits goes on without another turn of the loop."""
+        try:
+            got = await work
+        except asyncio.CancelledError:
+            self._fail(LocalProtocolError("cancelled: the thread of the event loop has ended"))
+            raise
+        except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
+            self._fail(exc)
+        else:
+            self._succeed(got)
+
+    def _succeed(self, result: object) -> None:
+        self._result = result
+        self._finish()
+
+    def _fail(self, error: BaseException) -> None:
+        self._error = error
+        self._finish()
+
+    def _finish(self) -> None:
+        self._finished = True
+        self._done.release()
+
+    def _cancel(self) -> None:
+        self._cancelled = True
+        if self._task is not None:
+            self._task.cancel()
+
+
+class LoopThread:
+    """An event loop in a thread.
+
+    Args:
+        name: the thread's name, for errors, too.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._mailbox: _Mailbox | None = None
+        self._end: asyncio.Event | None = None
+        self._thread: threading.Thread | None = None
+        self._forked = False
+        _threads.add(self)
+
+    def start(self) -> None:
+        """Start it; does nothing if it runs."""
+        if self._thread is not None:
+            return
+        ready: threading.Event = threading.Event()
+
+        async def live() -> None:
+            self._loop = asyncio.get_running_loop()
+            mailbox = self._mailbox = _Mailbox(self._loop)
+            end = self._end = asyncio.Event()
+            ready.set()
+            await end.wait()
+            mailbox.close()
+
+        # a daemon, so that a program that is killed does not wait for it
+        self._thread = threading.Thread(
+            target=asyncio.run, args=(live(),), name=self._name, daemon=True
+        )
+        self._thread.start()
+        if not ready.wait(CALL_TIMEOUT):
+            raise ResponseTimeoutError(
+                f"the thread {self._name} did not start", message_id=None, waited=CALL_TIMEOUT
+            )
+
+    def stop(self) -> None:
+        """End it. Harmless when done twice."""
+        thread, self._thread = self._thread, None
+        if thread is not None and self._mailbox is not None and self._end is not None:
+            self._mailbox.post(self._end.set)
+            thread.join(CALL_TIMEOUT)
+            self._loop = self._mailbox = None
+
+    @property
+    def running(self) -> bool:
+        """Whether it runs, in this process."""
+        return self._loop is not None and not self._forked
+
+    @property
+    def inside(self) -> bool:
+        """Whether this is asked in it."""
+        return self._thread is not None and threading.get_ident() == self._thread.ident
+
+    def forked(self) -> None:
+        """Note that this process is a fork of the one that has the thread."""
+        self._forked = True
+
+    def call(
+        self, function: Callable[[], Coroutine[Any, Any, T]], timeout: float | None = None
+    ) -> T:
+        """Call a function in the thread, and run the coroutine that it returns to its end.
+
+        Args:
+            function: it.
+            timeout: seconds; None where it has deadlines of its own.
+
+        Raises:
+            ConfigurationError: the thread does not run.
+            LocalProtocolError: it is called in the thread itself, or in a fork of the process.
+            ResponseTimeoutError: it took longer than ``timeout``; it was cancelled.
+            KeyboardInterrupt: Ctrl-C; it was cancelled.
+            Exception: whatever it raises.
+        """
+        return cast("T", self._call(function, timeout))
+
+    def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function in the thread and return what it returns; errors as of :meth:`call`."""
+        return cast("T", self._call(lambda: function(*args, **kwargs), CALL_TIMEOUT))
+
+    def _call(self, function: Callable[[], object], timeout: float | None) -> Any:
+        call = _ThreadCall(self._checked(), function)
+        if not call.wait(timeout):
+            call.cancel()
+            raise ResponseTimeoutError(
+                f"the thread {self._name} did not answer within {timeout:g} s",
+                message_id=None,
+                waited=timeout or 0.0,
+            )
+        return call.result()
+
+    def wait(self, work: Coroutine[Any, Any, T], timeout: float = CALL_TIMEOUT) -> T:
+        """Run a coroutine in the thread to its end; errors as of :meth:`call`."""
+        try:
+            return self.call(lambda: work, timeout)
+        finally:
+            work.close()  # where it was not begun
+
+    def submit(self, work: Coroutine[Any, Any, T]) -> Future[T]:
+        """Run a coroutine in the thread, and do not wait; errors as of :meth:`call`."""
+        if self._loop is None:
+            work.close()
+            raise ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def post(self, function: Callable[[], object]) -> None:
+        """Have a function called in the thread, and do not wait; nothing where it does not run."""
+        if self._mailbox is not None and not self._forked:
+            with contextlib.suppress(ConfigurationError):
+                self._mailbox.post(function)
+
+    def _checked(self) -> _Mailbox:
+        """Return the mailbox, or say why nothing can be called."""
+        if self._forked:
+            raise LocalProtocolError(
+                f"{self._name}: this process is a fork of the one that it was made in, and a fork "
+                "has no threads; make it in this process"
+            )
+        if self._mailbox is None:
+            raise ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
+        if self.inside:
+            raise LocalProtocolError(
+                f"{self._name}: called in its own thread (by a predicate, an observer or an "
+                "interpreter), which would wait for itself"
+            )
+        return self._mailbox
+
+
+_threads: weakref.WeakSet[LoopThread] = weakref.WeakSet()
+
+
+def _note_fork() -> None:
+    for thread in tuple(_threads):
+        thread.forked()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)

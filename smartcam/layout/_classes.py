@@ -1,0 +1,263 @@
+"""Classes that are layouts: a field's annotation says how it stands on the wire.
+
+::
+
+    @dataclass
+    class Measured:
+        passed: bool                                  # bools need nothing
+        x: Annotated[float, "real32 mm"]
+        parts: Annotated[list[Part], "*"]             # a group: records of another class
+
+The texts are put together and read like any layout text, so that there is one place that knows
+what a layout may be.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import sys
+from collections.abc import Callable
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    NamedTuple,
+    TypeAlias,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from smartcam.exceptions import InterpretationError, LayoutError
+from smartcam.layout._text import Field, LayoutSpec, parse_text, to_text
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+    from typing_extensions import TypeIs
+
+Make: TypeAlias = Callable[[Any], Any]
+"""Turns what a layout's ``parse`` gives into objects of the class."""
+
+
+class ClassLayout(NamedTuple):
+    """What a class says of a container.
+
+    Attributes:
+        text: the layout text.
+        make: turns what that layout's ``parse`` gives into objects of the class.
+    """
+
+    text: str
+    make: Make
+
+
+class _Member(NamedTuple):
+    name: str
+    hint: Any  # without its layout text
+    text: str | None
+
+
+def describes_layout(kind: object) -> bool:
+    """Return whether ``kind`` is a class whose fields can say a layout, or a list of one."""
+    return _is_record(kind) or _list_item(kind) is not None
+
+
+@functools.lru_cache(maxsize=128)
+def read_class(kind: Any) -> ClassLayout:
+    """Return what a class, or a list of one, says of a container.
+
+    Raises:
+        LayoutError: a field has no layout text, one that is wrong, or one that does not go with
+            its type.
+    """
+    record = _list_item(kind)
+    if record is None and not _is_record(kind):
+        raise LayoutError(
+            "layout: expected a dataclass, a pydantic model or a NamedTuple, or a list of one, "
+            f"got {kind!r:.200}"
+        )
+    if record is None:
+        return _read_record(kind)
+    repeat = next((one for one in _metadata(kind) if isinstance(one, str)), "*")
+    inner = _read_record(record, nested=True)
+    return ClassLayout(_checked(record, f"({inner.text}){repeat}"), _make_list(inner.make))
+
+
+def _read_record(kind: type, *, nested: bool = False) -> ClassLayout:
+    fields: list[str] = []
+    group: ClassLayout | None = None
+    members = _members(kind)
+    for member in members:
+        record = _list_item(member.hint)
+        if record is None:
+            fields.append(str(_field(kind, member)))
+        elif nested or member is not members[-1]:
+            problem = "groups do not nest" if nested else "a list comes last"
+            raise _error(kind, member, f"expected no list here: {problem}")
+        else:
+            group = _read_record(record, nested=True)
+            fields.append(f"{member.name}: ({group.text}){member.text or '*'}")
+    if not fields:
+        raise LayoutError(f"class {kind.__name__}: expected a field with a layout text, got none")
+    names = [member.name for member in members]
+    make_list = None if group is None else _make_list(group.make)
+    return ClassLayout(_checked(kind, ", ".join(fields)), _maker(kind, names, make_list))
+
+
+def _members(kind: type) -> list[_Member]:
+    """Return the fields of a class that are given when an object is made, in order."""
+    if dataclasses.is_dataclass(kind):
+        names = [field.name for field in dataclasses.fields(kind) if field.init]
+    elif _is_model(kind):
+        names = [*kind.model_fields]
+    else:
+        names = [*cast("Any", kind)._fields]
+    try:
+        hints = get_type_hints(kind, include_extras=True)
+    except NameError as exc:
+        raise LayoutError(
+            f"class {kind.__name__}: its annotations cannot be resolved: {exc}; "
+            "define what they name at the top of the module"
+        ) from exc
+    found: list[_Member] = []
+    for name in names:
+        text = next((one for one in _metadata(hints[name]) if isinstance(one, str)), None)
+        found.append(_Member(name, _without_metadata(hints[name]), text))
+    return found
+
+
+def _field(kind: type, member: _Member) -> Field:
+    """Return the layout's field that a member of a class is."""
+    text = member.text
+    if text is None:
+        if member.hint is not bool:
+            raise _error(kind, member, 'expected a layout text, as in Annotated[float, "real32"]')
+        text = "bool"
+    spec = _parsed(kind, f"{member.name}: {text}")
+    if spec.repeat is not None or len(spec.fields) != 1:
+        raise _error(kind, member, f"expected the layout text of one field, got {text!r}")
+    field = spec.fields[0]
+    fitting = _types(field)
+    # a model converts by itself
+    if not _is_model(kind) and member.hint not in (*fitting, Any, object):
+        expected = " or ".join(one.__name__ for one in fitting)
+        got = getattr(member.hint, "__name__", member.hint)
+        raise _error(kind, member, f"expected the type {expected} for {text!r}, got {got}")
+    return field
+
+
+def _types(field: Field) -> tuple[type, ...]:
+    """Return the types that the value of a field may be annotated with."""
+    if field.type == "bool":
+        return (bool,)
+    if field.type == "string":
+        return (str,)
+    if field.wire.is_integer and field.unit is None:
+        return (int, float)
+    return (float,)
+
+
+def _list_item(hint: Any) -> type | None:
+    """Return the class of a list's items, None where it is no list of a class."""
+    hint = _without_metadata(hint)
+    item = get_args(hint)[0] if get_origin(hint) is list else None
+    return item if _is_record(item) else None
+
+
+def _is_record(kind: Any) -> bool:
+    """Return whether ``kind`` is a class whose fields can say a layout."""
+    if not isinstance(kind, type):
+        return False
+    is_named_tuple = issubclass(kind, tuple) and hasattr(kind, "_fields")
+    return dataclasses.is_dataclass(kind) or _is_model(kind) or is_named_tuple
+
+
+def _metadata(hint: Any) -> tuple[Any, ...]:
+    return tuple(hint.__metadata__) if get_origin(hint) is Annotated else ()
+
+
+def _is_model(kind: type) -> TypeIs[type[BaseModel]]:
+    """Return whether it is a pydantic model; whoever has one has imported pydantic."""
+    pydantic = sys.modules.get("pydantic")
+    return pydantic is not None and issubclass(kind, pydantic.BaseModel)
+
+
+def _without_metadata(hint: Any) -> Any:
+    return hint.__origin__ if get_origin(hint) is Annotated else hint
+
+
+def _checked(kind: type, text: str) -> str:
+    """Return the canonical form of a layout text."""
+    return to_text(_parsed(kind, text))
+
+
+def _parsed(kind: type, text: str) -> LayoutSpec:
+    try:
+        return parse_text(text)
+    except LayoutError as exc:
+        raise LayoutError(
+            f"class {kind.__name__}: {exc}", text=exc.text, position=exc.position
+        ) from exc
+
+
+def _error(kind: type, member: _Member, problem: str) -> LayoutError:
+    return LayoutError(f"class {kind.__name__}, field {member.name!r}: {problem}")
+
+
+# ---------------------------------------------------------------------- objects
+
+
+def _make_list(make: Make) -> Make:
+    return lambda records: [*map(make, records)]
+
+
+def _maker(kind: type, names: list[str], make_list: Make | None) -> Make:
+    """Return what makes an object of ``kind`` from a record; ``make_list``: its last field."""
+    build = _model_maker(kind, names) if _is_model(kind) else _plain_maker(kind, names)
+    if make_list is None:
+        return build
+    return lambda record: build((*record[:-1], make_list(record[-1])))
+
+
+def _plain_maker(kind: type, names: list[str]) -> Make:
+    keywords = dataclasses.is_dataclass(kind) and any(
+        field.kw_only for field in dataclasses.fields(kind)
+    )
+    if keywords:
+        return lambda values: kind(**dict(zip(names, values, strict=True)))
+    return lambda values: kind(*values)
+
+
+def _model_maker(kind: type[BaseModel], names: list[str]) -> Make:
+    from pydantic import ValidationError
+
+    fields = kind.model_fields
+    keys = [fields[name].alias or name for name in names]
+
+    def make(values: Any) -> BaseModel:
+        try:
+            return kind.model_validate(dict(zip(keys, values, strict=True)))
+        except ValidationError as exc:
+            first = exc.errors()[0]
+            where = ".".join(map(str, first["loc"]))
+            raise InterpretationError(
+                f"{kind.__name__}{'.' if where else ''}{where}: {first['msg']}, "
+                f"got {first['input']!r:.80}",
+                field=where,
+                expected=first["msg"],
+                got=first["input"],
+            ) from exc
+
+    return make
+
+
+def values_of(value: object) -> dict[str, Any] | None:
+    """Return the fields of an object of such a class by name, None where it is of none."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+    kind = type(value)
+    if _is_model(kind):
+        return {name: getattr(value, name) for name in kind.model_fields}
+    return None
