@@ -498,32 +498,38 @@ class EmulatedCamera(Server):
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
         """A machine saw a frame, or bytes that make none."""
-        self._trace(link.peer, sender, what, link.hearing)
+        self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
+        if _log.isEnabledFor(logging.DEBUG):
+            self._show_last()
         if sender is m.Sender.CLIENT and isinstance(what, Frame):
             self._traffic.count(what)
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
         """What faults made of a message has passed, or is lost."""
         faults = ", ".join(message.faults) or None
-        self._trace(link.peer, sender, message.what, faults, message.wire)
+        self._note(link.peer, sender, message.what, faults, message.wire)
 
     def _told_second_client(self, frame: Frame) -> None:
-        self._trace(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
+        self._note(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
 
-    def _trace(
+    def _note(
         self,
         peer: str,
         sender: m.Sender,
-        what: Frame | bytes | RemoteProtocolError,
+        what: Frame | bytes,
         fault: str | None,
-        wire: bytes | None = None,
+        wire: bytes | None,
     ) -> None:
         self._traffic.add(self.clock.now, peer, sender, what, fault, wire)
         if _log.isEnabledFor(logging.DEBUG):
-            entry = self.log[-1]
-            mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
-            faulty = f" ({entry.fault}; on the wire: {entry.wire})" if entry.fault else ""
-            _log.debug("%s %s: %s%s", mark, peer, entry.error or entry.message or what, faulty)
+            self._show_last()
+
+    def _show_last(self) -> None:
+        entry = self.log[-1]
+        mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
+        faulty = f" ({entry.fault}; on the wire: {entry.wire})" if entry.fault else ""
+        said = entry.error or entry.message or f"message {entry.message_id}: {entry.hex}"
+        _log.debug("%s %s: %s%s", mark, entry.peer, said, faulty)
 
     def _connect(self, link: ClientLink) -> None:
         """Give the session to ``link``: the newcomer wins, unless a quirk says otherwise."""

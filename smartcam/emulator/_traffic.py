@@ -155,12 +155,13 @@ class Log(Sequence[LogEntry]):
         """Put an entry, or what one is made of, behind the others."""
         if isinstance(entry, LogEntry):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
-            weight = sum(len(text) for text in texts if text)
+            weight = _ENTRY + _PER_BYTE * size + sum(len(text) for text in texts if text)
         else:  # as it will be when it is read
             _, _, _, what, fault, wire = entry
             size = len(what.payload if isinstance(what, Frame) else what)
-            weight = len(fault or "") + max(0, 3 * len(wire or b"") - 1)
-        weight += _ENTRY + _PER_BYTE * size
+            weight = _ENTRY + _PER_BYTE * size
+            if fault is not None or wire is not None:
+                weight += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
         weights = self._weights
         self._unread.append(entry)
         weights.append(weight)
