@@ -142,8 +142,8 @@ def connect(
 
     Args:
         url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
-            pins the dialect; or a bare host together with ``model``.
-        model: camera model, such as ``"BVS002C"``.
+            pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
+        model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
         observers: see frames, events, results and errors:
             :class:`~smartcam.Observer`.
         **options: ``name``, ``application``, ``interpret_as``, ``calibration``, ``y_down``,

@@ -155,8 +155,11 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
     known = EMULATOR | {"application", "interpret_as", "connect", "cameras"}
     unknown = sorted(said.keys() - known)
     if unknown:
+        from smartcam._suggestions import did_you_mean
+
         pytest.fail(
-            f"the marker smartcam has no option {unknown[0]!r}; it has {', '.join(sorted(known))}",
+            f"the marker smartcam has no option {unknown[0]!r}; it has {', '.join(sorted(known))}"
+            f"{did_you_mean(unknown[0], known)}",
             pytrace=False,
         )
     if isinstance(said.get("scenario"), (str, Path)):

@@ -12,12 +12,15 @@ from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError
 
+from smartcam._suggestions import did_you_mean
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
+
+    from pydantic_core import ErrorDetails
 
     from smartcam.interpreters._base import Spec
     from smartcam.models import Calibration
@@ -75,7 +78,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     """Read a camera URL such as ``bvs://192.168.0.10?dialect=handbook``.
 
     Args:
-        url: a URL, or a bare ``HOST[:PORT]`` together with ``model``.
+        url: a URL, or a bare ``HOST[:PORT]``: BVS over TCP, unless ``model`` says otherwise.
         model: camera model; picks the protocol of a bare host.
 
     Raises:
@@ -120,7 +123,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     if dialect is not None and dialect not in protocol.dialects:
         raise ConfigurationError(
             f"camera address {shown!r}: {protocol.name} has no dialect {dialect!r}; "
-            f"it has {', '.join(protocol.dialects)}"
+            f"it has {', '.join(protocol.dialects)}{did_you_mean(dialect, protocol.dialects)}"
         )
     address = Address(
         protocol.name,
@@ -152,7 +155,7 @@ def _query(shown: str, query: str, protocol: Protocol) -> dict[str, str]:
         if key not in known:
             raise ConfigurationError(
                 f"camera address {shown!r}: unknown {key!r}; known are "
-                f"{', '.join(map(repr, known))}"
+                f"{', '.join(map(repr, known))}{did_you_mean(key, known)}"
             )
         if key in said:
             raise ConfigurationError(f"camera address {shown!r} names two {key}")
@@ -181,21 +184,22 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         for protocol in _protocols():
             if scheme in protocol.schemes:
                 return protocol, url
-        known = ", ".join(f"{s}://" for p in _protocols() for s in p.schemes)
+        schemes = [one for protocol in _protocols() for one in protocol.schemes]
+        known = ", ".join(f"{one}://" for one in schemes)
         raise ConfigurationError(
             f"camera address {_masked(url)!r}: unknown scheme {scheme!r}; known are {known}"
+            f"{did_you_mean(scheme, schemes)}"
         )
     if model is None:
-        raise ConfigurationError(
-            f"camera address {_masked(url)!r} is a bare host: give a URL such as "
-            f"bvs://{_masked(url) or 'HOST'}, "
-            'or a model, such as model="BVS002C"'
-        )
+        return cast("Protocol", PROTOCOLS.load("bvs")), f"bvs://{url}"
     for protocol in _protocols():
         if model.upper() in protocol.models:
             return protocol, f"{next(iter(protocol.schemes))}://{url}"
-    known = ", ".join(name for p in _protocols() for name in p.models)
-    raise ConfigurationError(f"unknown camera model {model!r}; known are {known}")
+    models = [name for protocol in _protocols() for name in protocol.models]
+    raise ConfigurationError(
+        f"unknown camera model {model!r}; known are {', '.join(models)}"
+        f"{did_you_mean(model, models)}"
+    )
 
 
 def _protocols() -> Iterator[Protocol]:
@@ -290,7 +294,8 @@ class CameraSettings(BaseModel):
         try:
             settings = cls(address=address, **cast("dict[str, Any]", options))
         except ValidationError as exc:
-            raise ConfigurationError(f"connect: {validation_text(exc)}") from exc
+            known = [*CameraOptions.__annotations__, *OtherOptions.__annotations__]
+            raise ConfigurationError(f"connect: {validation_text(exc, known)}") from exc
         except TypeError as exc:
             raise ConfigurationError(f"connect: {exc}") from exc
         if settings.name:
@@ -307,16 +312,26 @@ def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
     try:
         return kind.model_validate(dict(given) if isinstance(given, Mapping) else given)
     except ValidationError as exc:
-        raise ConfigurationError(f"{what}: {validation_text(exc)}") from exc
+        text = validation_text(exc, kind.model_fields)
+        raise ConfigurationError(f"{what}: {text}") from exc
 
 
-def validation_text(error: ValidationError) -> str:
-    """Return pydantic's findings as one line: where, what was expected, what came."""
+def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:
+    """Return pydantic's findings as one line: where, what was expected, what came.
+
+    ``known``: names that may stand at the top, one of which may have been meant.
+    """
     return "; ".join(
         f"{'.'.join(str(part) for part in item['loc']) or 'value'}: {item['msg']}"
-        f" (got {_shown(item['input'])})"
+        f"{_meant(item, known)} (got {_shown(item['input'])})"
         for item in error.errors()
     )
+
+
+def _meant(item: ErrorDetails, known: Iterable[str]) -> str:
+    if item["type"] != "extra_forbidden" or len(item["loc"]) != 1:
+        return ""
+    return did_you_mean(str(item["loc"][0]), known)
 
 
 def _shown(value: object) -> str:

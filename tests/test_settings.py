@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from pydantic import BaseModel, ValidationError
 
+import smartcam
 from smartcam.exceptions import ConfigurationError, PluginError
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, CameraOptions, CameraSettings, parse_address, validation_text
@@ -149,8 +150,10 @@ def test_parse_address_bare_host_with_model_is_its_protocols(
 @pytest.mark.parametrize(
     ("url", "text"),
     [
-        ("", "'' is a bare host: give a URL such as bvs://HOST, or a model"),
-        ("camera", "is a bare host: give a URL such as bvs://camera, or a model"),
+        ("", "'' has no host"),
+        ("bvs://h?dialekt=handbook", "unknown 'dialekt'; known are 'dialect', 'quirks'; did you"),
+        ("bsv://h", "did you mean 'bvs'?"),
+        ("bvs://h?dialect=hand", "thesis, b16, bid; did you mean 'handbook'?"),
         ("bvs://h?dialect=handbook&dialect=thesis", "names two dialect"),
         ("http://h", "unknown scheme 'http'; known are bvs://, bvs+udp://"),
         ("://h", "unknown scheme ''; known are"),
@@ -288,7 +291,7 @@ def test_parse_address_parameters_are_kept_and_the_url_has_no_password(
         ("acme://me:se[cret@h", "'acme://me:***@h'"),
         ("bvs://me:secret@h", "'bvs://me:***@h' has a user, which means nothing"),
         ("other://me:secret@h", "'other://me:***@h': unknown scheme 'other'"),
-        ("me:secret@h", "is a bare host"),
+        ("me:secret@h", "'me:***@h' has a user, which means nothing"),
         ("acme://h?user=me&password=secret", "unknown 'user'"),
     ],
 )
@@ -416,3 +419,17 @@ def test_number_with_more_digits_than_can_be_written_is_refused(option: str) -> 
 
 def test_options_are_those_of_the_settings() -> None:
     assert {*CameraOptions.__annotations__} == {*CameraSettings.model_fields} - {"address"}
+
+
+@pytest.mark.parametrize(
+    ("option", "meant"),
+    [("aplication", "application"), ("interpret", "interpret_as"), ("y_Down", "y_down")],
+)
+def test_option_that_is_misspelt_says_which_is_meant(option: str, meant: str) -> None:
+    options: dict[str, Any] = {option: 7}
+    with pytest.raises(ConfigurationError, match=f"{option}: .*; did you mean '{meant}'"):
+        smartcam.connect("camera", **options)
+
+
+def test_bare_host_speaks_bvs_over_tcp() -> None:
+    assert smartcam.connect("camera").url == "bvs://camera:36701"

@@ -6,7 +6,7 @@ from contextlib import aclosing
 
 import click
 
-from smartcam._cli.options import CAMERA, CONNECTS, Options, camera_url, option, runs
+from smartcam._cli.options import CAMERA, CONNECTS, Options, option, runs
 from smartcam._cli.probe import frame_text
 from smartcam._cli.texts import table_text
 from smartcam.doctor import Finding, examine
@@ -41,7 +41,7 @@ async def doctor(url: str, trigger: bool, options: Options) -> None:
     findings: list[Finding] = []
     with options.tracing() as trace:
         examination = examine(
-            camera_url(url),
+            url,
             application=options.application,
             interpret_as=options.interpret_as,
             y_down=options.y_down,

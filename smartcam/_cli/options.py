@@ -157,11 +157,6 @@ def application(text: str) -> int | str:
     return number
 
 
-def camera_url(text: str) -> str:
-    """Return a camera's URL; a bare host is one that speaks BVS over TCP."""
-    return text if "://" in text else f"bvs://{text}"
-
-
 @dataclass(slots=True)
 class Options:
     """The shared options as a command uses them."""
@@ -221,7 +216,7 @@ class Options:
                 "connect_timeout": self.step(10.0),
                 "switch_timeout": self.step(10.0),
             }
-            yield connect(camera_url(url), **{**options, **other})
+            yield connect(url, **{**options, **other})
 
     @contextmanager
     def tracing(self) -> Iterator[Callable[[TraceEntry], None] | None]:

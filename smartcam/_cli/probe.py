@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import CAMERA, CONNECTS, Options, camera_url, runs
+from smartcam._cli.options import CAMERA, CONNECTS, Options, runs
 from smartcam.doctor._probing import trials
 from smartcam.exceptions import ConnectFailedError
 from smartcam.settings import parse_address
@@ -32,7 +32,7 @@ async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
 
     Raises ConnectFailedError: none answered; names each try.
     """
-    address = parse_address(camera_url(host_or_url))
+    address = parse_address(host_or_url)
     answers: list[CameraAnswer] = []
     failed: list[str] = []
     with options.tracing() as trace:

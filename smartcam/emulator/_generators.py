@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
+from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def find_generator(name: str) -> Generator:
     except KeyError as exc:
         raise ConfigurationError(
             f"generator {name!r} is unknown; known are {', '.join(generator_names())}"
+            f"{did_you_mean(name, generator_names())}"
         ) from exc
 
 

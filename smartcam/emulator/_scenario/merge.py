@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from smartcam._suggestions import did_you_mean
 from smartcam.emulator._application import Application, make_application
 from smartcam.emulator._bvs.quirks import Quirks
 from smartcam.emulator._scenario.file import load_scenario
@@ -40,6 +41,7 @@ def make_plan(
         if what in changes and changes[what] not in names:
             raise ConfigurationError(
                 f"emulator: {what} {changes[what]!r} is unknown; known are {', '.join(names)}"
+                f"{did_you_mean(str(changes[what]), names)}"
             )
     if scenario is None:
         base = Scenario()
