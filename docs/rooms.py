@@ -29,16 +29,16 @@ class Room(NamedTuple):
 
 
 VALUES = ("models", "exceptions", "settings", "registry", "streams", "observers", "backoff")
-HELPERS = ("_accepting", "_lazy", "_locks", "_server")
+HELPERS = ("_accepting", "_html", "_lazy", "_locks", "_loop_thread", "_server", "_suggestions")
 ROOMS = (
-    Room("_cli", "the two commands", 1, 0),
+    Room("_cli", "the two commands", 1, 0, ("_cli", "__main__")),
     Room("testing", "for others' tests", 3, 0, ("testing", "pytest_plugin")),
     Room("web", "pages in a browser", 0, 2),
     Room("recording", "files of what came", 2, 1, ("recording", "_dissector")),
     Room("conformance", "judges", 3, 1),
     Room("calibration", "camera to robot", 0, 5),
     Room("doctor", "what is wrong", 1, 2),
-    Room("client", "what a program uses", 1, 3),
+    Room("client", "what a program uses", 1, 3, ("client", "sync")),
     Room("emulator", "cameras without one", 3, 3),
     Room("_client", "how a client works", 1.5, 4),
     Room("interpreters", "payload to value", 1, 5),
@@ -69,8 +69,12 @@ def imports() -> set[tuple[str, str]]:
 
 def _room(module: str) -> str:
     """Return the title of the box for a module, or for a name that smartcam itself exports."""
-    titles = [room.title for room in ROOMS if room.holds(module)]
-    return titles[0] if titles else "client" if module in {"SmartCamera", "connect"} else "values"
+    for room in ROOMS:
+        if room.holds(module):
+            return room.title
+    if any((ROOT / "smartcam").glob(f"{module}*")):
+        raise LookupError(f"smartcam/{module} is in no room of the drawing")
+    return "client" if module in {"SmartCamera", "connect"} else "values"
 
 
 def _imported(tree: ast.AST) -> set[str]:

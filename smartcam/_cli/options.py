@@ -80,6 +80,7 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "Log what happens and show tracebacks, on stderr.",
     },
     "--output": {"type": click.Path(dir_okay=False), "help": "The file to write."},
+    "--force": {"is_flag": True, "help": "Take the place of a file that is there."},
 }
 """Options that several commands have."""
 

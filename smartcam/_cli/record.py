@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from smartcam.client import SmartCamera
     from smartcam.recording import Recording
 
-_force = click.option("--force", is_flag=True, help="Take the place of a file that is there.")
 _camera = click.option(
     "--camera", metavar="NAME", help="Which camera of the recording; default all of them."
 )
@@ -45,7 +44,7 @@ _camera = click.option(
 )
 @click.argument("url")
 @option("--output", required=True)
-@_force
+@option("--force")
 @click.option(
     "--every", type=SECONDS, metavar="SECONDS", help="Send a trigger every so many seconds."
 )
@@ -214,7 +213,7 @@ def _over() -> None:
 )
 @click.argument("recording", metavar="RUN.mcap", type=click.Path())
 @option("--output", required=True)
-@_force
+@option("--force")
 @_camera
 @runs(*OUTPUT)
 async def pcap(

@@ -14,6 +14,7 @@ from smartcam._cli.calibrate import calibrate
 from smartcam._cli.decode import decode, from_hex
 from smartcam._cli.dissector import dissector
 from smartcam._cli.doctor import doctor
+from smartcam._cli.image import image
 from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, application, runs
 from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
@@ -234,7 +235,7 @@ async def demo_command(pick: bool, picture: str, seed: int, options: Options) ->
     await (demo_pick.pick(options, picture, seed) if pick else demo.demo(options))
 
 
-for _one in (probe, doctor, decode, calibrate, sheet, record, replay, pcap, dissector):
+for _one in (probe, doctor, image, decode, calibrate, sheet, record, replay, pcap, dissector):
     command.add_command(_one)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.commandline import closed_port, run, run_emulator
+from tests.cli.commandline import closed_port, emulators, run, run_emulator
 from tests.processes import Process
 
 CAN = "switch, load_file, start_stop, result_codes, get_status, read_image"
@@ -98,6 +98,24 @@ def test_start_and_stop_go_online_and_offline(url: str) -> None:
     assert "application 1, running" in run("start", url).done().out
     assert "status: RUNNING + WAITING_FOR_TRIGGER" in run("status", url).done().out
     assert "application 1, stopped" in run("stop", url).done().out
+
+
+def test_image_is_written_as_the_camera_sends_it(online: str, tmp_path: Path) -> None:
+    run("trigger", f"{online}?cells=A1").done()
+    file = tmp_path / "seen.bmp"
+    (line,) = run("image", online, "-o", str(file), "--json").done().lines
+    data = file.read_bytes()
+    assert data.startswith(b"BM")
+    assert (line["file"], line["size"]) == (str(file), len(data))
+    run("image", online, "-o", str(file)).failed(2, "is there already; --force takes its place")
+    assert f"{len(data):,} bytes" in run("image", online, "-o", str(file), "--force").done().out
+    run("image", online, "-o", str(tmp_path / "none" / "seen.bmp")).failed(2, "none")
+
+
+def test_image_of_a_camera_that_has_none_says_so(tmp_path: Path) -> None:
+    with emulators(tmp_path, ()) as (bvs,):
+        run("image", bvs, "-o", str(tmp_path / "seen.bmp")).failed(5, "has no ReadImage")
+    assert not (tmp_path / "seen.bmp").exists()
 
 
 def test_trigger_prints_cells_as_the_layout_says(online: str) -> None:

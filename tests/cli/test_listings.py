@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,13 @@ def test_protocols_lists_dialects_and_transports() -> None:
     out = run("protocols").done().out
     for text in ("bvs (built-in)", "bvs://", "bvs+udp://", "36701", "BVS002C", "thesis"):
         assert text in out
+
+
+def test_module_is_the_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "smartcam", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == run("--version").done().out
 
 
 def test_protocols_json_has_one_object_for_each() -> None:

@@ -1,0 +1,45 @@
+"""``smartcam image``: a camera's last picture to a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from smartcam._cli.options import CAMERA, CONNECTS, Options, option, runs
+from smartcam.exceptions import ConfigurationError
+
+
+@click.command(
+    help="Write a camera's last picture to a file, as the camera sends it (In-Sight: a bitmap), "
+    f"where it can be asked for one. {CONNECTS}"
+)
+@click.argument("url")
+@option("--output", required=True)
+@option("--force")
+@runs(*CAMERA)
+async def image(url: str, output: str, force: bool, options: Options) -> None:
+    """Write a camera's last picture to a file."""
+    _check_free(output, force)
+    with options.camera(url) as unopened:
+        async with unopened as camera:
+            data = await camera.read_image(timeout=options.step(10.0))
+            name = camera.name
+    _write(output, data)
+    value = {"camera": name, "file": output, "size": len(data)}
+    options.show(value, f"{output}: {len(data):,} bytes")
+
+
+def _check_free(file: str, force: bool) -> None:
+    path = Path(file)
+    if path.exists() and not force:
+        raise ConfigurationError(f"{file}: the file is there already; --force takes its place")
+    if not path.parent.is_dir():
+        raise ConfigurationError(f"{file}: there is no folder {path.parent}")
+
+
+def _write(file: str, data: bytes) -> None:
+    try:
+        Path(file).write_bytes(data)
+    except OSError as exc:
+        raise ConfigurationError(f"{file}: cannot be written: {exc.strerror}") from exc
