@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._insight.camera import EmulatedInSight
     from smartcam.emulator._insight.commands import InSightQuirks
     from smartcam.emulator._insight.job import Job
+    from smartcam.emulator._line_camera import LineCamera, LineClient
     from smartcam.emulator._scenario.file import load_scenario, load_scenarios, scenario_schema
     from smartcam.emulator._scenario.scenario import Scenario
     from smartcam.emulator._scenario.states import DeviceState
@@ -43,6 +44,8 @@ __all__ = [
     "FiredFault",
     "InSightQuirks",
     "Job",
+    "LineCamera",
+    "LineClient",
     "LogEntry",
     "ManualClock",
     "Quirks",
@@ -71,6 +74,7 @@ if not TYPE_CHECKING:
             "_fleet": "EmulatedFleet",
             "_generators": "Run register_generator",
             "_insight.camera": "EmulatedInSight",
+            "_line_camera": "LineCamera LineClient",
             "_insight.commands": "InSightQuirks",
             "_insight.job": "Job",
             "_scenario.file": "load_scenario load_scenarios scenario_schema",

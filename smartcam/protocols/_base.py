@@ -270,6 +270,8 @@ class Protocol:
             the host there.
         detection: what a client tries that was told no dialect, the most probable first, each on a
             fresh link: dialects that begin a session alike. Default: each dialect by itself.
+        emulator: ``module:attribute`` of the class of its emulated cameras, a
+            :class:`~smartcam.emulator.LineCamera` for one; "" where it brings none.
     """
 
     name: str
@@ -282,6 +284,7 @@ class Protocol:
     detection: Mapping[Transport, tuple[tuple[Dialect, ...], ...]] = field(
         default_factory=dict[Transport, "tuple[tuple[Dialect, ...], ...]"]
     )
+    emulator: str = ""
 
     def tries(
         self,

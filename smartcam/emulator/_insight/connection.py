@@ -47,7 +47,7 @@ class TelnetConnection(asyncio.Protocol):
         self.peer: str = "?"  # address and port of the client
         self.number: int = -1  # of the session, from 0
         self._emulator = emulator
-        self._reader = words.LineReader(nul_ends=True)
+        self._reader = words.command_reader()
         self._state = _LoginState.USER
         self._user = ""
         self._busy = False  # a command is under way
