@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from importlib.metadata import Distribution, EntryPoint
 
-__all__ = ["INTERPRETERS", "PROTOCOLS"]
+__all__ = ["GENERATORS", "INTERPRETERS", "PROTOCOLS"]
 
 _log = logging.getLogger(__name__)
 
@@ -184,5 +184,15 @@ PROTOCOLS = Registry(
     {
         "bvs": "smartcam.protocols._bvs:BVS",
         "insight": "smartcam.protocols._insight.dialect:INSIGHT",
+    },
+)
+
+GENERATORS = Registry(
+    "smartcam.generators",
+    {
+        "input": "smartcam.emulator._generators:_input",
+        "sequence": "smartcam.emulator._generators:_sequence",
+        "tangram": "smartcam.emulator._generators:_tangram",
+        "tangram_pixels": "smartcam.emulator._generators:_tangram_pixels",
     },
 )

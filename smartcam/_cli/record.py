@@ -197,9 +197,7 @@ async def replay(
                 on_over=_over,
             )
             await stack.enter_async_context(emulator)
-            ids = emulator.device.applications
-            value = camera_value(emulator, emulator.transport, emulator.dialect, ids)
-            options.show({**value, "camera": emulator.name}, emulator.url)
+            options.show({**camera_value(emulator), "camera": emulator.name}, emulator.url)
         await asyncio.Event().wait()
 
 

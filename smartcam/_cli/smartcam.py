@@ -20,7 +20,6 @@ from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
 from smartcam._cli.sheet import sheet
 from smartcam._cli.texts import application_text, not_running, result_text, table_text
-from smartcam._client.handshake import load_protocol
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     NotRunningError,
@@ -31,6 +30,7 @@ from smartcam.exceptions import (
 )
 from smartcam.interpreters import resolve
 from smartcam.models import Status
+from smartcam.protocols._base import load_protocol
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ import re
 import socket
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client.handshake import load_protocol
 from smartcam.doctor._context import Diagnosis
 from smartcam.doctor._findings import Exit
 from smartcam.doctor._probing import trials
@@ -19,7 +18,7 @@ from smartcam.exceptions import (
     ProtocolError,
     ResponseTimeoutError,
 )
-from smartcam.protocols._base import Transport
+from smartcam.protocols._base import Transport, load_protocol
 
 if TYPE_CHECKING:
     from smartcam.client import SmartCamera

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator._scene import TablePose, TableScene
     from smartcam.emulator._traffic import LogEntry, Visit
+    from smartcam.emulator._wire_camera import WireCamera
     from smartcam.emulator.faults import FiredFault
 
 __all__ = [
@@ -54,6 +55,7 @@ __all__ = [
     "TablePose",
     "TableScene",
     "Visit",
+    "WireCamera",
     "faults",
     "load_scenario",
     "load_scenarios",
@@ -83,6 +85,7 @@ if not TYPE_CHECKING:
             "_scenario.timeline": "Cue",
             "_scene": "TablePose TableScene",
             "_traffic": "LogEntry Visit",
+            "_wire_camera": "WireCamera",
             "faults": "FiredFault",
         },
     )

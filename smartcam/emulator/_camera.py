@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from smartcam.emulator._bvs.behaviour import behaviour_of
 from smartcam.emulator._bvs.device import Device
 from smartcam.emulator._client_link import MAX_INPUT, SecondClientSession
 from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._scenario.merge import make_plan
+from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._scene import TableScene
 from smartcam.emulator._wire_camera import WireCamera
-from smartcam.exceptions import FrameError
+from smartcam.emulator.faults._matching import misfit
+from smartcam.exceptions import ConfigurationError, FrameError
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import POLICIES, Policy, Role, Transport
 from smartcam.protocols._bvs import BVS
@@ -34,11 +36,13 @@ if TYPE_CHECKING:
     from smartcam.emulator._bvs.quirks import Quirks
     from smartcam.emulator._client_link import ClientLink, Trace
     from smartcam.emulator._clock import Clock
-    from smartcam.emulator._scenario.scenario import Scenario
+    from smartcam.emulator._scenario.scenario import Mistake, Scenario
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.protocols._framed.dialect import FramedDialect
     from smartcam.protocols._framed.framing import Frame
+
+_SHOWN = 20  # ids that an error names
 
 _log = logging.getLogger("smartcam.emulator")
 
@@ -98,6 +102,11 @@ class EmulatedCamera(WireCamera):
     Raises:
         ConfigurationError: something given is wrong.
     """
+
+    takes: ClassVar[frozenset[str]] = frozenset(
+        {"scenario", "dialect", "transport", "seed", "web", "replay"}
+    )
+    states: ClassVar[frozenset[DeviceState]] = frozenset(DeviceState)
 
     def __init__(
         self,
@@ -159,6 +168,66 @@ class EmulatedCamera(WireCamera):
         self._active: ClientLink | SecondClientSession | None = None
         self._moved_at = 0.0
         self.queue.add(faults)
+
+    @classmethod
+    def from_scenario(
+        cls,
+        plan: Scenario,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+        seed: int | None = None,
+    ) -> EmulatedCamera:
+        """Return a camera of a scenario; what is given beside it goes before it."""
+        own = plan.quirks.model_dump(exclude_unset=True)
+        return cls(
+            scenario=plan,
+            host=host,
+            port=port,
+            transport=transport,
+            dialect=dialect,
+            quirks={**own, **quirks} if quirks else None,
+            clock=clock,
+            seed=seed,
+        )
+
+    @classmethod
+    def mistake(cls, plan: Scenario) -> Mistake | None:
+        """Return the place in it of what the camera cannot do, and why; None where all is well."""
+        dialect = BVS.dialects[plan.dialect]
+        known = [application.id for application in plan.all_applications]
+        for number, application in enumerate(plan.applications):
+            ids = dialect.application_ids
+            if application.id not in ids:
+                text = (
+                    f"application id {application.id} does not fit dialect {dialect.name}: "
+                    f"{ids.start} to {ids.stop - 1}"
+                )
+                return ("applications", number, "id"), text
+        if plan.active is not None and plan.active not in known:
+            there = ", ".join(str(number) for number in known[:_SHOWN])
+            more = ", ..." if len(known) > _SHOWN else ""
+            asked = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
+            return ("active",), f"no application has {asked}; there are {there}{more}"
+        try:
+            spoken = dialect.with_quirks(plan.quirks.of_the_wire)
+        except ConfigurationError as exc:
+            return ("quirks",), str(exc)
+        for number, cue in enumerate(plan.timeline):
+            for place, fault in enumerate(cue.do):
+                found = misfit(fault, spoken, known)
+                if found is not None:
+                    return ("timeline", number, "do", place, found[0]), found[1]
+        return None
+
+    @classmethod
+    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
+        """Return the options with which an application is active, and runs, from the beginning."""
+        return {"active": active, "running": running}
 
     # ------------------------------------------------------------------ what it is
 

@@ -79,11 +79,15 @@ class CameraMachine(Protocol):
 class LinkOwner(Protocol):
     """What links want from the emulator behind them."""
 
-    codec: Codec  # the words on the wire
     clock: Clock
     queue: FaultQueue  # the faults that wait
     max_links: int  # clients that are looked at
     write_limit: int  # bytes kept for a client that does not read
+
+    @property
+    def codec(self) -> Codec:
+        """The words on the wire."""
+        ...
 
     def step(self) -> AbstractContextManager[object]:
         """Bring the device's time up; afterwards deliver what it said."""
@@ -184,8 +188,8 @@ class ClientLink(ABC):
         """Write bytes that belong together; False if it was not possible."""
 
     @abstractmethod
-    def part(self, how: Literal["close", "reset"]) -> None:
-        """End the link as a fault has it."""
+    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+        """End the link behind what was written, or by a reset."""
 
     def hold(self, on: bool) -> None:  # noqa: B027  only where the network keeps what is not read
         """Read nothing more for a time, or go on."""

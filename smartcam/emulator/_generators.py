@@ -1,17 +1,19 @@
 """Where an application's values may come from beside constants: functions with a name.
 
 A generator takes a :class:`Run` and returns what ``Layout.build`` takes: a mapping for a record, a
-list of mappings for ``( ... )*``. :func:`register_generator` adds one that scenario files can name;
-in Python the function itself can be given.
+list of mappings for ``( ... )*``. :func:`register_generator` adds one that scenario files can name,
+and so does a plug-in (entry points ``smartcam.generators``); in Python the function itself can be
+given.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 from smartcam._suggestions import did_you_mean
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, PluginError
+from smartcam.registry import GENERATORS
 
 if TYPE_CHECKING:
     from smartcam.emulator._scene import Observation, TableScene
@@ -67,19 +69,25 @@ def find_generator(name: str) -> Generator:
 
     Raises:
         ConfigurationError: there is none; the text names those there are.
+        PluginError: a plug-in's failed to load, or is no function.
     """
-    try:
-        return _GENERATORS[name]
-    except KeyError as exc:
+    found = _GENERATORS.get(name)
+    if found is not None:
+        return found
+    if name not in GENERATORS:
         raise ConfigurationError(
             f"generator {name!r} is unknown; known are {', '.join(generator_names())}"
             f"{did_you_mean(name, generator_names())}"
-        ) from exc
+        )
+    loaded = GENERATORS.load(name)
+    if not callable(loaded):
+        raise PluginError(f"generator {name!r}: {loaded!r} is no function", name=name)
+    return cast("Generator", loaded)
 
 
 def generator_names() -> list[str]:
-    """Return the names of all generators, sorted."""
-    return sorted(_GENERATORS)
+    """Return the names of all generators, sorted; those of plug-ins are not loaded for it."""
+    return sorted({*_GENERATORS, *(info.name for info in GENERATORS.available())})
 
 
 def register_generator(name: str, function: Generator) -> None:
@@ -88,7 +96,9 @@ def register_generator(name: str, function: Generator) -> None:
     Raises:
         ConfigurationError: the name is taken by another function.
     """
-    if _GENERATORS.get(name, function) is not function:
+    if _GENERATORS.get(name, function) is not function or (
+        name in GENERATORS and name not in _GENERATORS
+    ):
         raise ConfigurationError(f"generator {name!r} is there already")
     _GENERATORS[name] = function
 

@@ -6,22 +6,26 @@ import heapq
 import itertools
 import logging
 import re
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._line_codec import HeardLine, LineCodec, LineServer, SaidLine
+from smartcam.emulator._makes import check_options
 from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._scenario.timeline import Cue
 from smartcam.emulator._wire_camera import WireCamera
+from smartcam.emulator.faults._matching import misfit
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols._lines import LineDialect
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from typing import Self
 
     from smartcam.emulator._client_link import ClientLink, Trace
     from smartcam.emulator._clock import Clock
+    from smartcam.emulator._scenario.scenario import Mistake, Scenario
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.protocols import messages as m
     from smartcam.protocols._base import Protocol, Transport
@@ -33,6 +37,13 @@ MAX_WAITING = 1 << 16
 
 MAX_AGENDA = 10_000
 """What may be put off to a later time at once."""
+
+
+_FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", "cameras"})
+"""Fields of a scenario that say something of such a camera."""
+
+_STATE = frozenset({"active", "running"})
+"""And those of cameras that know programs."""
 
 
 class LineClient:
@@ -77,6 +88,11 @@ class LineClient:
     def close(self, reason: str) -> None:
         """End the connection at once."""
         self._link.close(reason)
+
+    def end(self, reason: str) -> None:
+        """End the connection in order, behind what was said; nothing more is heard."""
+        self._link.flush()
+        self._link.part("close", reason)
 
     def begin(self, message: HeardLine) -> None:
         """A line is under way."""
@@ -158,7 +174,75 @@ class LineCamera(WireCamera):
             timeline=cues,
             applications=self.application_ids,
         )
+        wrong = self.mistake_in(cues)
+        if wrong is not None:
+            place, text = wrong
+            raise ConfigurationError(f"{self.name}: {'.'.join(map(str, place))}: {text}")
         self.queue.add(faults)
+
+    @classmethod
+    def from_scenario(
+        cls,
+        plan: Scenario,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+        seed: int | None = None,
+    ) -> Self:
+        """Return a camera of a scenario; what is given beside it goes before it.
+
+        Raises:
+            ConfigurationError: something given is wrong, or nothing that such a camera takes.
+        """
+        options = dict(plan.options)
+        if plan.active is not None or plan.running:
+            options = {**cls.state_options(plan.active, running=plan.running), **options}
+        if quirks:
+            options["quirks"] = {**options.get("quirks", {}), **quirks}
+        given = {"transport": transport, "dialect": dialect}
+        options |= {
+            name: value for name, value in given.items() if value not in {None, getattr(plan, name)}
+        }
+        check_options(cls, options)
+        return cls(
+            host=host,
+            port=plan.port if port is None else port,
+            name=plan.name,
+            clock=clock,
+            seed=plan.seed if seed is None else seed,
+            timeline=plan.timeline,
+            **options,
+        )
+
+    @classmethod
+    def mistake(cls, plan: Scenario) -> Mistake | None:
+        """Return the place in a scenario of what such a camera cannot do, and why; or None."""
+        fields = _FIELDS | (_STATE if cls.state_options(None, running=True) else frozenset())
+        for name in sorted(plan.changed() - fields):
+            if name != "dialect" or plan.dialect not in cls.protocol.dialects:
+                takes = ", ".join(sorted(fields))
+                return (name,), f"a camera of {cls.protocol.name} takes none; it takes {takes}"
+        try:
+            camera = cls.from_scenario(plan.model_copy(update={"timeline": ()}))
+        except ConfigurationError as exc:
+            return ("options",), str(exc)
+        return camera.mistake_in(plan.timeline)
+
+    def mistake_in(self, cues: Sequence[Cue]) -> Mistake | None:
+        """Return the place in a timeline of what it cannot do, and why; or None."""
+        for number, cue in enumerate(cues):
+            if cue.entering is not None and cue.entering not in self.states:
+                able = ", ".join(sorted(state.value for state in self.states))
+                return ("timeline", number, "entering"), f"it tells only of {able}"
+            for place, fault in enumerate(cue.do):
+                wrong = misfit(fault, self.codec, self.application_ids, self.fault_kinds)
+                if wrong is not None:
+                    return ("timeline", number, "do", place, wrong[0]), wrong[1]
+        return None
 
     def make_codec(self) -> LineCodec:
         """Return the lines it speaks: those of its protocol's first dialect.
@@ -225,11 +309,6 @@ class LineCamera(WireCamera):
     def sessions(self) -> list[str]:
         """Address and port of the clients that it serves, the oldest first."""
         return [client.peer for link, client in self._clients.items() if self.serves(link)]
-
-    @property
-    def has_session(self) -> bool:
-        """Whether it serves a client."""
-        return bool(self.sessions)
 
     # ------------------------------------------------------------------ links
 

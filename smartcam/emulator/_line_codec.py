@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import FrameError, UnsupportedError
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
 from smartcam.protocols._framed.framing import Frame
 from smartcam.protocols._framed.machine import State
 
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from smartcam.emulator._client_link import Trace
+    from smartcam.protocols._base import Transport
     from smartcam.protocols._lines import LineRow
 
 MAX_LOGGED = 4096
@@ -138,12 +138,12 @@ class LineCodec:
     def decode(self, sender: m.Sender, frame: Frame) -> m.Message:
         """Return what a line means; UnknownMessage where no row says it."""
         kind = self.message_type(sender, frame.message_id)
-        text = self.text(frame.payload)
         if sender is m.Sender.CLIENT and kind is not m.UnknownMessage:
-            return self._request(kind, frame.message_id, text)
+            return self._request(kind, frame.message_id, self.text(frame.payload))
         if kind is not m.UnknownMessage:
+            said = frame.payload.removesuffix(self.line_end).decode(self.encoding, "replace")
             try:
-                return self._rows[frame.message_id - 1].read(text)
+                return self._rows[frame.message_id - 1].read(said)
             except (ValueError, LookupError):
                 pass
         return m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)

@@ -116,7 +116,7 @@ class _TcpLink(ClientLink, asyncio.Protocol):
             self._owner.lost(self)
         self._transport.abort()
 
-    def part(self, how: Literal["close", "reset"]) -> None:
+    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         if how == "reset":
             with contextlib.suppress(OSError):  # the client may be gone already
                 sock = self._transport.get_extra_info("socket")
@@ -124,7 +124,7 @@ class _TcpLink(ClientLink, asyncio.Protocol):
             self.close("a fault resets it")
             return
         self._leave()
-        _log.info("= %s: connection closed: a fault ends it", self.peer)
+        _log.info("= %s: connection closed: %s", self.peer, why)
         self._owner.lost(self)
         # a socket that is closed with unread bytes sends a reset, so it stays until the client
         # has closed its side, too
@@ -257,8 +257,8 @@ class _UdpLink(ClientLink):
     def write(self, data: bytes) -> bool:
         return not data or self._listener.send(data, self._address)
 
-    def part(self, how: Literal["close", "reset"]) -> None:
-        self.close(f"a fault ends it ({how})")
+    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+        self.close(f"{why} ({how})")
 
     def stop_listening(self) -> None:
         pass  # the faulty link takes nothing any more

@@ -71,6 +71,12 @@ class LogEntry(NamedTuple):
     fault: str | None = None
     wire: str | None = None
 
+    @property
+    def text(self) -> str:
+        """What was heard as a line without its end, or said as it was; of cameras that speak so."""
+        text = bytes.fromhex(self.hex).decode("latin-1")
+        return text.rstrip("\r\n\0") if self.direction == "in" else text
+
 
 class Visit(NamedTuple):
     """A TCP connection that has ended.

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._client_link import CameraMachine, ClientLink, Trace
     from smartcam.emulator._clock import TimerHandle
     from smartcam.emulator._links import Listener
+    from smartcam.emulator._scenario.scenario import Mistake, Scenario
     from smartcam.emulator._scenario.states import DeviceState
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator._traffic import Log
@@ -111,7 +112,9 @@ class WireCamera(Server):
     """Bytes kept for a client that does not read, or held back by faults; more end its
     connection."""
     takes: ClassVar[frozenset[str]] = frozenset()
-    """What of :data:`~smartcam.emulator._makes.ABILITIES` it takes."""
+    """What it takes of ``scenario``, ``dialect``, ``transport``, ``seed``, ``web``, ``replay``."""
+    device: Any
+    """What is behind the wire."""
     states: ClassVar[frozenset[DeviceState]] = frozenset()
     """What it can enter, for a timeline."""
 
@@ -157,6 +160,39 @@ class WireCamera(Server):
         self._down = False
         self._timer = OneTimer(self.clock, self._wake)
 
+    @classmethod
+    @abstractmethod
+    def from_scenario(
+        cls,
+        plan: Scenario,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+        seed: int | None = None,
+    ) -> WireCamera:
+        """Return a camera of a scenario; what is given beside it goes before it.
+
+        Raises:
+            ConfigurationError: something given is wrong, or nothing that such a camera takes.
+        """
+
+    @classmethod
+    @abstractmethod
+    def mistake(cls, plan: Scenario) -> Mistake | None:
+        """Return the place in a scenario of what such a camera cannot do, and why; or None."""
+
+    @classmethod
+    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
+        """Return the options with which a program is active, and runs, from the beginning.
+
+        Nothing, where such a camera knows no programs.
+        """
+        return {}
+
     # ------------------------------------------------------------------ what it is
 
     @property
@@ -168,6 +204,16 @@ class WireCamera(Server):
     @abstractmethod
     def application_ids(self) -> list[int]:
         """Ids of the programs on it."""
+
+    @property
+    @abstractmethod
+    def sessions(self) -> list[str]:
+        """Address and port of the clients that have a session."""
+
+    @property
+    def has_session(self) -> bool:
+        """Whether a client has a session."""
+        return bool(self.sessions)
 
     @property
     def port(self) -> int:

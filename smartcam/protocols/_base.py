@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, FrameError, MessageError, UnsupportedError
 from smartcam.protocols.messages import Message, Request, Sender, StatusReport, wire_fields
+from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -312,3 +313,16 @@ class Protocol:
         if not parameters:
             return list(groups)
         return [tuple(d.with_parameters(parameters) for d in group) for group in groups]
+
+
+def load_protocol(name: str) -> Protocol:
+    """Return the protocol of this name.
+
+    Raises:
+        PluginError: unknown, or it failed to load.
+        ConfigurationError: the entry point gives something else.
+    """
+    protocol = PROTOCOLS.load(name)
+    if not isinstance(protocol, Protocol):
+        raise ConfigurationError(f"entry point {name!r} gives {protocol!r}, not a Protocol")
+    return protocol

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from smartcam._client import handshake
-from smartcam._client.handshake import Session, Try, establish, load_protocol
+from smartcam._client.handshake import Session, Try, establish
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -23,6 +23,7 @@ from smartcam.exceptions import (
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
+from smartcam.protocols._base import load_protocol
 from smartcam.protocols._bvs import BVS, HANDBOOK, THESIS
 from smartcam.protocols._framed.machine import Event, State
 from smartcam.registry import PROTOCOLS

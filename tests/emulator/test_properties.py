@@ -218,9 +218,7 @@ class Owner:
         return nullcontext()
 
     def make_machine(self, transport: CarriedBy, trace: Trace) -> Machine:
-        return Machine(
-            HANDBOOK, Role.CAMERA, transport, max_length=MAX_INPUT, trace=trace
-        )
+        return Machine(HANDBOOK, Role.CAMERA, transport, max_length=MAX_INPUT, trace=trace)
 
     def arrived(self, link: ClientLink) -> None:
         pass

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
-from smartcam.emulator import _links as links
 from smartcam.emulator._client_link import MAX_INPUT
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire

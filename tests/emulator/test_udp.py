@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
-from smartcam.emulator import _links as links
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import UdpClient
