@@ -49,8 +49,8 @@ CAMERAS = 2
 
 MARKER = (
     "smartcam(protocol='bvs', application=None, interpret_as=None, connect={}, cameras=2, "
-    "scenario=None, dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and emulated_fleet "
-    "are made. application=ID has that application running; connect={...} are further options of "
+    "scenario=None, dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and "
+    "emulated_fleet are made. application=ID has that application running; connect={...} are further options of "
     "smartcam.connect(); the rest are options of smartcam.emulator.EmulatedCamera, or of the class "
     "that the protocol brings. A scenario is looked for beside the test, then below the root."
 )

@@ -64,6 +64,9 @@ def wrap_number(field: Field, number: int) -> int:
     return (number - low) % (high - low + 1) + low
 
 
+_FOUND: dict[str, Generator] = {}  # those that were used: a run asks for its generator each time
+
+
 def find_generator(name: str) -> Generator:
     """Return the generator of that name.
 
@@ -71,7 +74,7 @@ def find_generator(name: str) -> Generator:
         ConfigurationError: there is none; the text names those there are.
         PluginError: a plug-in's failed to load, or is no function.
     """
-    found = _GENERATORS.get(name)
+    found = _FOUND.get(name)
     if found is not None:
         return found
     if name not in GENERATORS:
@@ -82,25 +85,22 @@ def find_generator(name: str) -> Generator:
     loaded = GENERATORS.load(name)
     if not callable(loaded):
         raise PluginError(f"generator {name!r}: {loaded!r} is no function", name=name)
-    return cast("Generator", loaded)
+    found = _FOUND[name] = cast("Generator", loaded)
+    return found
 
 
 def generator_names() -> list[str]:
     """Return the names of all generators, sorted; those of plug-ins are not loaded for it."""
-    return sorted({*_GENERATORS, *(info.name for info in GENERATORS.available())})
+    return [info.name for info in GENERATORS.available()]
 
 
 def register_generator(name: str, function: Generator) -> None:
     """Let applications name ``function`` as their generator.
 
     Raises:
-        ConfigurationError: the name is taken by another function.
+        PluginError: the name is taken by another function.
     """
-    if _GENERATORS.get(name, function) is not function or (
-        name in GENERATORS and name not in _GENERATORS
-    ):
-        raise ConfigurationError(f"generator {name!r} is there already")
-    _GENERATORS[name] = function
+    GENERATORS.register(name, function)
 
 
 def _tangram(run: Run) -> Values:
@@ -165,11 +165,3 @@ def _input(run: Run) -> Values:
     values = zeros(run.layout.fields)
     values.update((key, value) for key, value in (run.input or {}).items() if key in values)
     return values if run.layout.repeat is None else [values]
-
-
-_GENERATORS: dict[str, Generator] = {
-    "tangram": _tangram,
-    "tangram_pixels": _tangram_pixels,
-    "sequence": _sequence,
-    "input": _input,
-}

@@ -177,11 +177,20 @@ class LineDialect(Dialect):
         raise LocalProtocolError(f"dialect {self.name}: there are no other requests")
 
 
+class _Asked(NamedTuple):
+    """A request, and how it is said."""
+
+    row: LineRow
+    line: str
+
+
 class LineMachine:
     """One connection's lines, in the client's role; what a link needs.
 
-    See :class:`~smartcam.protocols.LinkMachine`. A line is the answer to the oldest request without
-    one, unless a row says that the camera says such a line unasked.
+    See :class:`~smartcam.protocols.LinkMachine`. A request is said when the one before it is
+    answered: nothing in a line says what it answers, so one that is lost must not make the answers
+    of later ones its own. A line is the answer to it, unless a row says that the camera says such a
+    line unasked.
 
     Args:
         dialect: what is spoken.
@@ -210,13 +219,14 @@ class LineMachine:
         self.dialect: LineDialect = dialect
         self.kin: Sequence[Dialect] = (dialect,)
         self.transport: Transport = transport
-        self.replies: bool = False
+        self.replies: bool = True
         self.counters: Counters = Counters()
         self.state: State = State.IDLE
         self._trace = trace
         self._reader = dialect.reader()
         self._store = memoryview(bytearray(READ_SIZE))
-        self._asked: collections.deque[LineRow] = collections.deque()  # at most one of a kind
+        # under way is the first one; at most one of a kind
+        self._asked: collections.deque[_Asked] = collections.deque()
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
@@ -277,7 +287,7 @@ class LineMachine:
                 continue
         if not self._asked:
             raise FrameError(f"{line[:64]!r} came, nothing was asked")
-        row = self._asked.popleft()
+        row = self._asked.popleft().row
         try:
             message = row.read(line)
         except (ValueError, LookupError) as exc:
@@ -286,6 +296,8 @@ class LineMachine:
             ) from exc
         if row.request is m.Connect and self.state is State.CONNECTING:
             self.state = State.CONNECTED
+        if self._asked and self.state is State.CONNECTED:
+            self._write(self._asked[0].line)
         return message
 
     def _end(self, state: State) -> None:
@@ -297,7 +309,7 @@ class LineMachine:
     # ------------------------------------------------------------------ messages out
 
     def send(self, message: m.Message, *, answered: bool | None = None) -> None:
-        """Say a request; write :meth:`data_to_send` next.
+        """Put a request in line; write :meth:`data_to_send` next.
 
         A Get status whose answer is owed is not repeated: it is new enough. Disconnect has no
         words, the connection's end is that.
@@ -318,14 +330,18 @@ class LineMachine:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        if row in self._asked:
+        if any(row is one.row for one in self._asked):
             if kind is m.GetStatus:
                 return
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
         line = self.dialect.line(message)
         if kind is m.Connect:
             self.state = State.CONNECTING
-        self._asked.append(row)
+        self._asked.append(_Asked(row, line))
+        if len(self._asked) == 1:
+            self._write(line)
+
+    def _write(self, line: str) -> None:
         data = line.encode(self.dialect.encoding, "replace") + self.dialect.line_end
         self._outbox.append(data)
         self.counters.frames_sent += 1
