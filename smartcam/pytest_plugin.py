@@ -48,11 +48,12 @@ CAMERAS = 2
 """Cameras of a fleet where nothing else is said."""
 
 MARKER = (
-    "smartcam(protocol='bvs', application=None, interpret_as=None, connect={}, cameras=2, "
+    "smartcam(application=None, interpret_as=None, connect={}, cameras=2, protocol='bvs', "
     "scenario=None, dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and "
-    "emulated_fleet are made. application=ID has that application running; connect={...} are further options of "
-    "smartcam.connect(); the rest are options of smartcam.emulator.EmulatedCamera, or of the class "
-    "that the protocol brings. A scenario is looked for beside the test, then below the root."
+    "emulated_fleet are made. application=ID has that application running; connect={...} are "
+    "further options of smartcam.connect(); the rest are options of "
+    "smartcam.emulator.EmulatedCamera, or of the class that the protocol brings. A scenario is looked for "
+    "beside the test, then below the root."
 )
 
 _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()

@@ -85,6 +85,10 @@ class LineClient:
             with self._camera.step():
                 self._link.feed(b"")
 
+    def hide_next(self) -> None:
+        """Keep the next line out of the log: it is a password."""
+        self._server.secret = True
+
     def close(self, reason: str) -> None:
         """End the connection at once."""
         self._link.close(reason)
@@ -137,7 +141,7 @@ class LineCamera(WireCamera):
         ConfigurationError: something given is wrong.
     """
 
-    protocol: ClassVar[Protocol]
+    protocol: Protocol
     device: Any = None
     takes: ClassVar[frozenset[str]] = frozenset({"scenario", "seed", "web", "replay"})
     states: ClassVar[frozenset[DeviceState]] = frozenset(

@@ -81,7 +81,7 @@ class EmulatedInSight(LineCamera):
         ConfigurationError: something given is wrong.
     """
 
-    protocol: ClassVar[Protocol] = INSIGHT
+    protocol: Protocol = INSIGHT
     device: InSightDevice
     states: ClassVar[frozenset[DeviceState]] = LineCamera.states | {
         DeviceState.RUNNING,

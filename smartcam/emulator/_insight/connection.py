@@ -101,7 +101,7 @@ class TelnetClient(LineClient):
         elif self._state is _LoginState.USER:
             self._user = line
             self._state = _LoginState.PASSWORD
-            self._server.secret = True
+            self.hide_next()
             self.respond(words.PASSWORD_PROMPT)
         elif self._emulator.admits(self._user, line):
             self._state = _LoginState.COMMANDS
