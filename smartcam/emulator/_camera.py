@@ -22,6 +22,7 @@ from smartcam.emulator._scene import TableScene
 from smartcam.emulator._wire_camera import WireCamera
 from smartcam.emulator.faults._matching import misfit
 from smartcam.exceptions import ConfigurationError, FrameError
+from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import POLICIES, Policy, Role, Transport
 from smartcam.protocols._bvs import BVS
@@ -30,6 +31,7 @@ from smartcam.settings import Address
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+    from datetime import datetime
     from pathlib import Path
 
     from smartcam.emulator._application import Application
@@ -41,6 +43,12 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.protocols._framed.dialect import FramedDialect
     from smartcam.protocols._framed.framing import Frame
+
+CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
+"""What an operator can set and clear, by name."""
+
+SHOWN = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
+"""What the page shows of an application."""
 
 _SHOWN = 20  # ids that an error names
 
@@ -250,6 +258,36 @@ class EmulatedCamera(WireCamera):
     def scene(self) -> TableScene:
         """The table it looks at, with the ground truth."""
         return self.device.scene
+
+    @property
+    def clock_time(self) -> datetime:
+        """What its own clock shows."""
+        return self.device.clock_time
+
+    def application_of(self, message: m.ResultContainer) -> Application | None:
+        """Return the application that describes a result; None where none does."""
+        return self.device.applications.get(message.application)
+
+    def shown(self) -> dict[str, Any]:
+        """Return what its page shows of its state."""
+        device = self.device
+        return {
+            **super().shown(),
+            "mode": device.mode,
+            "status": device.status,
+            "active_application": device.active_application,
+            "conditions": {name: bit in device.status for name, bit in CONDITIONS.items()},
+            "running": device.running,
+            "processing": device.processing,
+            "endian": device.endian,
+            "next_number": device.next_number,
+            "queued_inputs": device.queued_inputs,
+            "applications": [
+                {key: getattr(one, key) for key in SHOWN} for one in device.applications.values()
+            ],
+            "quirks": self.quirks,
+            "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),
+        }
 
     @property
     def quirks(self) -> Quirks:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import FrameError, UnsupportedError
 from smartcam.protocols import messages as m
+from smartcam.protocols._framed.dialect import MessageRow
 from smartcam.protocols._framed.framing import Frame
 from smartcam.protocols._framed.machine import State
 
@@ -59,8 +60,6 @@ class LineCodec:
         encoding: of characters.
     """
 
-    table = ()
-
     def __init__(
         self,
         label: str,
@@ -76,6 +75,12 @@ class LineCodec:
         self.ends: re.Pattern[bytes] = ends
         self.max_line: int = max_line
         self.encoding: str = encoding
+        self.table: tuple[MessageRow, ...] = tuple(
+            MessageRow(number, kind, row.line, "")
+            for number, row in enumerate(rows, start=1)
+            for kind in (row.request, row.answer)
+            if kind is not None
+        )
         self._rows = rows
         self._patterns = [
             (number, re.compile(_pattern(row.line), re.DOTALL))

@@ -21,6 +21,7 @@ from smartcam.emulator.faults._base import DeviceFault
 from smartcam.emulator.faults._device_effects import Stage, act, kinds_of
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
+from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Transport
 from smartcam.protocols._framed.framing import Frame
@@ -29,13 +30,16 @@ if TYPE_CHECKING:
     from collections import deque
     from collections.abc import Callable, Container, Iterable, Mapping, Sequence
     from contextlib import AbstractContextManager
+    from datetime import datetime
 
+    from smartcam.emulator._application import Application
     from smartcam.emulator._client_link import CameraMachine, ClientLink, Trace
     from smartcam.emulator._clock import TimerHandle
     from smartcam.emulator._links import Listener
     from smartcam.emulator._scenario.scenario import Mistake, Scenario
     from smartcam.emulator._scenario.states import DeviceState
     from smartcam.emulator._scenario.timeline import Cue
+    from smartcam.emulator._scene import TableScene
     from smartcam.emulator._traffic import Log
     from smartcam.emulator.faults import Fault, FiredFault
     from smartcam.emulator.faults._base import BaseFault
@@ -214,6 +218,38 @@ class WireCamera(Server):
     def has_session(self) -> bool:
         """Whether a client has a session."""
         return bool(self.sessions)
+
+    @property
+    def scene(self) -> TableScene | None:
+        """The table it looks at; None for a camera without."""
+        return None
+
+    @property
+    def clock_time(self) -> datetime | None:
+        """What its own clock shows; None for a camera without."""
+        return None
+
+    def application_of(self, message: m.ResultContainer) -> Application | None:
+        """Return the application that describes a result; None where none does."""
+        return None
+
+    def shown(self) -> dict[str, Any]:
+        """Return what its page shows of its state; a camera adds and replaces what it has."""
+        return {
+            "mode": "running" if self._started else "stopped",
+            "status": Status(0),
+            "active_application": None,
+            "conditions": {},
+            "running": self._started,
+            "processing": False,
+            "endian": 0,
+            "next_number": None,
+            "queued_inputs": 0,
+            "applications": [],
+            "cells": {},
+            "quirks": {},
+            "quirks_chosen": {},
+        }
 
     @property
     def port(self) -> int:

@@ -10,7 +10,7 @@ from smartcam.web._streams import PERIOD, News
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from smartcam.emulator import EmulatedCamera
+    from smartcam.emulator import WireCamera
 
 MAX_LOG_NEWS = 200
 """Log entries in one event; at ten events a second it keeps up with 2000 messages a second."""
@@ -28,7 +28,7 @@ class Watcher:
     ``since`` is the serial of the first log entry that is wanted; None: what comes from now on.
     """
 
-    def __init__(self, name: str, emulator: EmulatedCamera, since: int | None = None) -> None:
+    def __init__(self, name: str, emulator: WireCamera, since: int | None = None) -> None:
         self._name = name
         self._emulator = emulator
         self._serial = serialize.log_count(emulator) if since is None else since
@@ -41,8 +41,9 @@ class Watcher:
         emulator = self._emulator
         log = self._log()
         yield from self._changed("camera", serialize.camera_state(self._name, emulator))
-        scene = {**serialize.scene_state(emulator.scene), "reported": self._reported}
-        yield from self._changed("scene", scene)
+        if emulator.scene is not None:
+            scene = {**serialize.scene_state(emulator.scene), "reported": self._reported}
+            yield from self._changed("scene", scene)
         if self._changed_faults():
             yield News("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
         if log is not None:

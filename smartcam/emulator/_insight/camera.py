@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+from smartcam.emulator._camera import SHOWN
 from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._insight.commands import InSightCommands, InSightQuirks
 from smartcam.emulator._insight.connection import MAX_SESSIONS, ROWS, WRITE_LIMIT, TelnetClient
@@ -23,8 +24,10 @@ from smartcam.emulator._line_codec import LineCodec
 from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._tally import Tally
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
+from smartcam.models import Status
 from smartcam.protocols._insight import words
 from smartcam.protocols._insight.dialect import INSIGHT
+from smartcam.protocols._insight.machine import ONLINE
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
@@ -150,6 +153,34 @@ class EmulatedInSight(LineCamera):
     def application_ids(self) -> list[int]:
         """Ids of the jobs on it that have one."""
         return [job.id for job in self.device.jobs.values() if job.id is not None]
+
+    def shown(self) -> dict[str, Any]:
+        """Return what its page shows of its state."""
+        device, job = self.device, self.device.job
+        jobs = [one for one in device.jobs.values() if one.id is not None]
+        return {
+            **super().shown(),
+            "mode": device.mode,
+            "status": ONLINE if device.online else Status(0),
+            "active_application": None if job is None else job.id,
+            "running": device.online,
+            "processing": device.busy,
+            "next_number": device.runs + 1,
+            "applications": [
+                {
+                    **dict.fromkeys(SHOWN),
+                    "id": one.id,
+                    "name": one.file,
+                    "rate": one.rate,
+                    "load_time": one.load_time,
+                    "processing_time": one.processing_time,
+                }
+                for one in jobs
+            ],
+            "cells": dict(device.cells),
+            "quirks": self.quirks,
+            "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),
+        }
 
     @property
     def online(self) -> bool:

@@ -10,7 +10,7 @@ import heapq
 import itertools
 import logging
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._insight.image import check_image, grey_pattern
@@ -95,6 +95,13 @@ class InSightDevice:
     def online(self) -> bool:
         """Whether it is online: wanted by clients, and not held offline (manual, published)."""
         return self._wanted_online and self._allowed_online
+
+    @property
+    def mode(self) -> Literal["running", "stopped", "switching"]:
+        """How it stands, in the words of other cameras: online, offline, or a job is loaded."""
+        if self._loading:
+            return "switching"
+        return "running" if self.online else "stopped"
 
     @property
     def busy(self) -> bool:
