@@ -169,10 +169,12 @@ async def test_connect_with_a_wrong_password_is_tried_once_and_shows_none(
         camera = smartcam.connect(url, observers=[Trace()])
         error = await gone(camera.open())
         assert isinstance(error, ConnectFailedError)
-        assert str(error).endswith(
-            "no session with insight://admin@" + emulator.url.partition("//")[2] + ": attempt 1: "
-            "native over TCP: waiting for the answer to Connect: the camera refused the session: "
-            "code -6 (the user or the password is wrong)"
+        address = emulator.url.partition("//")[2]
+        refusal = "the camera refused the session: code -6 (the user or the password is wrong)"
+        begin = f"{address}: no session with insight://admin@{address}: {address} (TCP) refuses: "
+        assert str(error).startswith(f"{begin}{refusal}. ")
+        assert error.attempts == (
+            f"attempt 1: native over TCP: waiting for the answer to Connect: {refusal}",
         )
         assert said(emulator) == ["admin", "***"]
     shown = repr([camera, camera.settings, traced]) + str(error) + caplog.text
