@@ -263,6 +263,8 @@ async def attempt(
         progress.received = link.machine.counters.bytes_received
     if collector.version > 1:
         logger.warning("%s ! protocol version %d is newer than 1", name, collector.version)
+    if dialect.remark:
+        logger.warning("%s ! %s", name, dialect.remark)
     pinned = address._replace(dialect=dialect.name, quirks=dialect.quirks)
     return Session(link, pinned, dialect, collector.version, collector.early)
 
@@ -273,6 +275,11 @@ def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
     return protocol.tries(
         protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
     )
+
+
+def remarks(address: Address) -> set[str]:
+    """Return what a user should know who asks for results at an address."""
+    return {dialect.remark for dialects in tries_for(address) for dialect in dialects} - {""}
 
 
 def names_of(dialects: Sequence[Dialect]) -> str:

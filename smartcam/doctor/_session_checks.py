@@ -8,7 +8,7 @@ import socket
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.attempts import reason_for, words
-from smartcam._client.handshake import load_protocol
+from smartcam._client.handshake import load_protocol, remarks
 from smartcam.doctor._findings import Exit
 from smartcam.doctor._probing import trials
 from smartcam.doctor._timing import figures
@@ -124,6 +124,8 @@ def _say_session(
         protocol_version=camera.protocol_version,
         connect_time=measured._asdict(),
     )
+    for remark in remarks(exam.address):
+        exam.say("warning", remark)
 
 
 # ---------------------------------------------------------------------- no session

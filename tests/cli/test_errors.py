@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -32,6 +33,7 @@ from tests.cli.commandline import (
     emulators,
     run,
     run_as_far_as,
+    run_emulator,
 )
 from tests.processes import PATIENCE, Process, script
 
@@ -65,6 +67,28 @@ def test_command_nothing_listens_exits_3() -> None:
             outcome = run(command, f"bvs://{address}", *more, "--timeout", "0.3")
             outcome.failed(3, address, "onnection refused")
             assert command == "probe" or outcome.out == ""
+
+
+def test_error_is_json_where_json_is_asked_for() -> None:
+    with closed_port() as address:
+        outcome = run("status", f"bvs://{address}", "--json", "--timeout", "0.3")
+    told = json.loads(outcome.err)
+    assert (outcome.code, outcome.out) == (3, "")
+    assert (told["error"], told["exit_code"]) == ("ConnectFailedError", 3)
+    assert f"no session with bvs://{address}: nothing listens at" in told["text"]
+    assert f"{told['host']}:{told['port']}" == address
+    assert told["attempts"][0].startswith("attempt 1: ")
+
+
+def test_wrong_use_is_json_where_json_is_asked_for() -> None:
+    for program in (run, run_emulator):
+        for arguments in (("--json", "--bogus"), ("--bogus", "--json")):
+            command = ("status", "bvs://h") if program is run else ()
+            outcome = program(*command, *arguments)
+            told = json.loads(outcome.err)
+            assert (outcome.code, told["error"], told["exit_code"]) == (2, "NoSuchOption", 2)
+    told = json.loads(run("watch", "bvs://h", "--count", "-1", "--json").err)
+    assert (told["error"], told["exit_code"]) == ("BadParameter", 2)
 
 
 def test_status_silent_peer_exits_3() -> None:
