@@ -59,7 +59,7 @@ TOPICS: Mapping[str, Sequence[str]] = {
 """What ``--help`` lists where."""
 
 
-class Commands(JsonErrors, click.Group):
+class CommandsByTopic(JsonErrors, click.Group):
     """The commands, listed by topic with whole summaries."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -70,7 +70,7 @@ class Commands(JsonErrors, click.Group):
                 formatter.write_dl(rows)
 
 
-@click.group(cls=Commands, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=CommandsByTopic, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(smartcam.__version__)
 def command() -> None:
     """Talk to industrial smart cameras.
