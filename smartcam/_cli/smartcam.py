@@ -70,7 +70,9 @@ class CommandsByTopic(JsonErrors, click.Group):
                 formatter.write_dl(rows)
 
 
-@click.group(cls=CommandsByTopic, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=CommandsByTopic, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.version_option(smartcam.__version__)
 def command() -> None:
     """Talk to industrial smart cameras.
