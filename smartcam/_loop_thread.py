@@ -167,11 +167,11 @@ class _ThreadCall:
             return
         try:
             got = self._function()
+            if inspect.iscoroutine(got):
+                self._task = _start(self._finish_by(got))
+                return
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
-            return
-        if inspect.iscoroutine(got):
-            self._task = _start(self._finish_by(got))
         else:
             self._succeed(got)
 

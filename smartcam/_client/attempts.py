@@ -80,7 +80,8 @@ class Try:
             what = f"{self.received} bytes, then silence" if self.received else "silence"
             self.outcome = f"{what} for {waited:.1f} s"
         elif isinstance(system, OSError) and system.errno is not None and system.errno > 0:
-            self.outcome = os.strerror(system.errno)  # plainer than "Connect call failed"
+            words = os.strerror(system.errno)  # plainer than "Connect call failed"
+            self.outcome = str(system) if words.startswith("Unknown error") else words  # Winsock's
         elif isinstance(error, socket.gaierror) and error.strerror:
             self.outcome = error.strerror
         else:
