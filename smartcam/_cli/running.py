@@ -20,6 +20,7 @@ from smartcam.exceptions import (
     CameraFaultError,
     CommandRejectedError,
     ConfigurationError,
+    ConnectionLostError,
     InterpretationError,
     LayoutError,
     LinkError,
@@ -48,6 +49,13 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 """First match decides. 0 done; 1 a fault of ours; 2 wrong usage; 3 no session or a broken one; 4 a
 wait in a session ran out; 5 the camera refused or is not running; 6 a result is not interpretable;
 7 ``calibrate --check``: stale; 130 and 143: cut off by Ctrl-C or SIGTERM."""
+
+
+TAKEN = (
+    "Has another client taken it? Most cameras serve one, and the newcomer wins. smartcam doctor "
+    "tells more."
+)
+"""Cure of a connection that the camera ended."""
 
 
 def exit_code(error: BaseException) -> int:
@@ -153,7 +161,11 @@ def _one_line(error: Exception) -> str:
     lines = str(error).splitlines()
     if isinstance(error, LayoutError):
         del lines[1:]  # the text with a mark below it; the first line tells the position
-    return " ".join(line.strip() for line in lines)
+    text = " ".join(line.strip() for line in lines)
+    hung_up = isinstance(error, ConnectionLostError) and isinstance(
+        error.__cause__, ConnectionError
+    )
+    return f"{text}. {TAKEN}" if hung_up else text
 
 
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:
