@@ -675,6 +675,19 @@ async def test_reconnect_that_is_refused_is_not_tried_for_ever() -> None:
         assert said(emulator).count("***") == 2
 
 
+async def test_camera_that_inspects_for_long_is_not_taken_for_a_silent_one() -> None:
+    async with insight(request_timeout=SHORT) as (emulator, camera):
+        await camera.switch_application("20slow")
+        statuses = camera.statuses()  # so that it is asked all the time
+        waiting = asyncio.create_task(camera.trigger(timeout=60.0))
+        await until(lambda: said(emulator).count("SW8") == 1)
+        await asyncio.sleep(20 * SHORT)
+        pass_time(emulator, SECOND)
+        assert (await waiting).application == 20
+        assert camera.connected
+        statuses.close()
+
+
 async def test_silent_camera_is_given_up() -> None:
     async with insight(liveness_timeout=2 * SHORT) as (emulator, camera):
         events = camera.events()
