@@ -302,6 +302,8 @@ def test_suite_that_does_not_use_it_imports_nothing_heavy(tmp_path: Path) -> Non
         "    heavy = {'asyncio', 'numpy', 'pydantic', 'construct', 'yaml', 'aiohttp',\n"
         "        'smartcam.emulator', 'smartcam.client', 'smartcam.testing._threads'}\n"
         "    assert 'smartcam.pytest_plugin' in sys.modules\n"
+        # pdb, which pytest imports, has it from then on
+        "    heavy -= {'asyncio'} if sys.version_info >= (3, 14) else set()\n"
         "    assert heavy.isdisjoint(sys.modules)\n",
         encoding="utf-8",
     )
