@@ -230,6 +230,7 @@ async def interpreters(options: Options) -> None:
 
 def _interpreter(info: PluginInfo) -> tuple[object, str]:
     """Describe an interpreter, as JSON and as text."""
+    about = ""
     try:
         about = _first_line(INTERPRETERS.load(info.name))
         resolve(info.name)
