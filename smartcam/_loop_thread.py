@@ -9,6 +9,7 @@ import inspect
 import os
 import sys
 import threading
+import time
 import weakref
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
@@ -27,7 +28,8 @@ well under a millisecond; longer means that something in there, such as a genera
 application, does not return."""
 
 SLICE = 0.1
-"""Seconds that Ctrl-C may have to wait on Windows, where no lock's wait is interrupted."""
+"""Seconds that Ctrl-C may have to wait where a lock's wait is not interrupted: on Windows, and
+elsewhere if it comes between the lock's look for signals and its wait."""
 
 
 def _start(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
@@ -131,13 +133,10 @@ class _ThreadCall:
             timeout: seconds; None where what is called has deadlines of its own.
         """
         try:
-            if timeout is not None:
-                return self._done.acquire(timeout=timeout)
-            if sys.platform == "win32":
-                while not self._done.acquire(timeout=SLICE):
-                    pass
-            else:
-                self._done.acquire()
+            deadline = None if timeout is None else time.monotonic() + timeout
+            while not self._done.acquire(timeout=SLICE):
+                if deadline is not None and time.monotonic() >= deadline:
+                    return False
         except BaseException:  # KeyboardInterrupt, in the main thread
             self.cancel()
             if not self._finished:  # what is cancelled ends at once
@@ -167,11 +166,11 @@ class _ThreadCall:
             return
         try:
             got = self._function()
+            if inspect.iscoroutine(got):
+                self._task = _start(self._finish_by(got))
+                return
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
-            return
-        if inspect.iscoroutine(got):
-            self._task = _start(self._finish_by(got))
         else:
             self._succeed(got)
 

@@ -17,10 +17,11 @@ here before a fixture is used.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import pytest
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from smartcam.client import SmartCamera
     from smartcam.emulator import Scenario
     from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
+
+T = TypeVar("T")
 
 __all__ = ["camera", "emulated_camera", "emulated_fleet"]
 
@@ -52,8 +55,8 @@ MARKER = (
     "scenario=None, dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and "
     "emulated_fleet are made. application=ID has that application running; connect={...} are "
     "further options of smartcam.connect(); the rest are options of "
-    "smartcam.emulator.EmulatedCamera, or of the class that the protocol brings. A scenario is looked for "
-    "beside the test, then below the root."
+    "smartcam.emulator.EmulatedCamera, or of the class that the protocol brings. A scenario is "
+    "looked for beside the test, then below the root."
 )
 
 _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
@@ -98,8 +101,8 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
     application = said.get("application")
     if application is not None:
         options = {**emulated_class(protocol).state_options(application, running=True), **options}
-    with ThreadedCamera(**options) as emulator:
-        yield emulator
+    with contextlib.ExitStack() as stack:
+        yield _made(lambda: stack.enter_context(ThreadedCamera(**options)))
 
 
 @pytest.fixture
@@ -116,8 +119,8 @@ def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
             _scenario(said.get("protocol", PROTOCOL), application, number)
             for number in range(1, 1 + said.get("cameras", CAMERAS))
         ]
-    with ThreadedFleet(scenarios, **options) as fleet:
-        yield fleet
+    with contextlib.ExitStack() as stack:
+        yield _made(lambda: stack.enter_context(ThreadedFleet(scenarios, **options)))
 
 
 def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
@@ -151,11 +154,21 @@ def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> S
         "application": said.get("application"),
         **said.get("connect", {}),
     }
-    client = connect(
-        emulated_camera.url, **{key: one for key, one in options.items() if one is not None}
-    )
+    given = {key: one for key, one in options.items() if one is not None}
+    client = _made(lambda: connect(emulated_camera.url, **given))
     request.node.stash[_CLIENT] = client
     return client
+
+
+def _made(make: Callable[[], T]) -> T:
+    """Return what is made; a marker that says what cannot be fails the test by its text."""
+    from smartcam.exceptions import SmartCamError
+
+    try:
+        return make()
+    except (SmartCamError, TypeError, OSError) as exc:
+        wrong = f"the marker smartcam: {exc}"
+    pytest.fail(wrong, pytrace=False)  # out here, or pytest shows where it came from
 
 
 def _said(request: pytest.FixtureRequest) -> dict[str, Any]:

@@ -63,7 +63,10 @@ class Outcome(NamedTuple):
 
     def failed(self, code: int, *texts: str) -> Self:
         """See that it ended with ``code`` and one line that holds ``texts``."""
-        assert self.err.startswith(("smartcam: error: ", "smartcam-emulator: error: "))
+        if self.err.startswith("{"):  # told as JSON
+            assert json.loads(self.err)["exit_code"] == code
+        else:
+            assert self.err.startswith(("smartcam: error: ", "smartcam-emulator: error: "))
         assert self.err.count("\n") == 1
         assert self.err.endswith("\n")
         assert "Traceback" not in self.err

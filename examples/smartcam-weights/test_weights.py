@@ -1,4 +1,4 @@
-"""Tests of the interpreter ``weights``; they need ``smartcam[test]``."""
+"""Tests of the interpreter ``weights``; they need ``smartcam[suites]``."""
 
 import struct
 

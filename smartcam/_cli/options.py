@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from smartcam._cli.running import run
+from smartcam._client.handshake import remarks
 from smartcam.client import SmartCamera, connect
 from smartcam.doctor._context import FrameObserver
 from smartcam.exceptions import ConfigurationError
@@ -74,7 +75,10 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "type": click.Path(dir_okay=False),
         "help": "Write every frame, decoded and hex, as JSON lines.",
     },
-    "--json": {"is_flag": True, "help": "One JSON object a line on stdout."},
+    "--json": {
+        "is_flag": True,
+        "help": "One JSON object a line on stdout; an error is one on stderr.",
+    },
     "--debug": {
         "is_flag": True,
         "help": "Log what happens and show tracebacks, on stderr.",
@@ -124,6 +128,7 @@ def runs(
                 main(*args, options=options, **given),
                 program=program,
                 debug=options.debug,
+                as_json=options.as_json,
                 interrupted=0 if has_page else interrupted,
                 terminated=terminated,
             )
@@ -246,6 +251,11 @@ class Options:
                 failed.append(exc)
         if failed:
             raise ConfigurationError(f"--trace {self.trace}: {failed[0].strerror}") from failed[0]
+
+    def remark(self, camera: SmartCamera) -> None:
+        """Say on stderr what who asks this camera for results should know."""
+        for text in remarks(camera.settings.address):
+            click.echo(f"note: {text}", err=True)
 
     def show(self, value: object, text: str | Callable[[Any], str]) -> None:
         """Print ``value`` as a line of JSON, or for people ``text`` (of it); flushed."""

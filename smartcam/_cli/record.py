@@ -64,6 +64,7 @@ async def _record(
     unopened: SmartCamera, recorder: Recorder, every: float | None, options: Options
 ) -> None:
     recorder.open()
+    options.remark(unopened)
     facts = {name: getattr(options, name) for name in ("interpret_as", "application", "y_down")}
     recorder.describe(unopened.name, **{name: fact for name, fact in facts.items() if fact})
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
+import json
 import logging
 import os
 import signal
@@ -19,6 +20,7 @@ from smartcam.exceptions import (
     CameraFaultError,
     CommandRejectedError,
     ConfigurationError,
+    ConnectionLostError,
     InterpretationError,
     LayoutError,
     LinkError,
@@ -27,9 +29,10 @@ from smartcam.exceptions import (
     TriggerError,
     UnsupportedError,
 )
+from smartcam.models import jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Coroutine, Iterator
 
 EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (ConfigurationError, 2),
@@ -48,6 +51,13 @@ wait in a session ran out; 5 the camera refused or is not running; 6 a result is
 7 ``calibrate --check``: stale; 130 and 143: cut off by Ctrl-C or SIGTERM."""
 
 
+TAKEN = (
+    "Has another client taken it? Most cameras serve one, and the newcomer wins. smartcam doctor "
+    "tells more."
+)
+"""Cure of a connection that the camera ended."""
+
+
 def exit_code(error: BaseException) -> int:
     """Return the exit code for an error."""
     return next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1)
@@ -58,6 +68,7 @@ def run(
     *,
     program: str,
     debug: bool,
+    as_json: bool = False,
     interrupted: int = 130,
     terminated: int = 143,
 ) -> NoReturn:
@@ -70,6 +81,7 @@ def run(
         main: what to run.
         program: its name, for the error line.
         debug: log to stderr and show tracebacks.
+        as_json: tell an error as a line of JSON.
         interrupted: exit code after Ctrl-C; 0 where that is the way to end.
         terminated: exit code after SIGTERM.
     """
@@ -96,9 +108,51 @@ def run(
     except Exception as exc:  # noqa: BLE001 - the last place: one line instead of a traceback
         if debug:
             traceback.print_exc()
-        sys.stderr.write(f"{program}: error: {_one_line(exc)}\n")
+        text = _one_line(exc)
+        told = error_json(exc, text, exit_code(exc)) if as_json else f"{program}: error: {text}"
+        sys.stderr.write(f"{told}\n")
         sys.exit(exit_code(exc))
     sys.exit(0)
+
+
+def error_json(error: Exception, text: str, code: int) -> str:
+    """Return an error as JSON: its class, its text, the exit code, and its public attributes."""
+    said = {name: value for name, value in vars(error).items() if not name.startswith("_")}
+    if isinstance(error, click.ClickException):
+        said = {}  # click's own, with its context
+    value = {"error": type(error).__name__, "text": text, "exit_code": code, **said}
+    return json.dumps(jsonable(value))
+
+
+class JsonErrors(click.Command):
+    """A command that tells a wrong use as JSON where ``--json`` is given."""
+
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: click.Context | None = None,
+        **extra: Any,
+    ) -> click.Context:
+        """Parse."""
+        with _told_as_json("--json" in args):
+            return super().make_context(info_name, args, parent, **extra)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run."""
+        with _told_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
+            return super().invoke(ctx)
+
+
+@contextlib.contextmanager
+def _told_as_json(wanted: bool) -> Iterator[None]:
+    try:
+        yield
+    except click.ClickException as exc:
+        if not wanted:
+            raise
+        sys.stderr.write(error_json(exc, exc.format_message(), exc.exit_code) + "\n")
+        raise click.exceptions.Exit(exc.exit_code) from exc
 
 
 def _one_line(error: Exception) -> str:
@@ -107,7 +161,11 @@ def _one_line(error: Exception) -> str:
     lines = str(error).splitlines()
     if isinstance(error, LayoutError):
         del lines[1:]  # the text with a mark below it; the first line tells the position
-    return " ".join(line.strip() for line in lines)
+    text = " ".join(line.strip() for line in lines)
+    hung_up = isinstance(error, ConnectionLostError) and isinstance(
+        error.__cause__, ConnectionError
+    )
+    return f"{text}. {TAKEN}" if hung_up else text
 
 
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
+import re
 import shlex
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,7 @@ from smartcam._cli.image import image
 from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, application, runs
 from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
+from smartcam._cli.running import JsonErrors
 from smartcam._cli.sheet import sheet
 from smartcam._cli.texts import application_text, not_running, result_text, table_text
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
@@ -34,7 +37,7 @@ from smartcam.protocols._base import load_protocol
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from smartcam.registry import PluginInfo
 
@@ -46,7 +49,30 @@ EPILOG = (
 )
 
 
-@click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+TOPICS: Mapping[str, Sequence[str]] = {
+    "A camera": ("trigger", "watch", "image", "status", "start", "stop", "switch"),
+    "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
+    "A robot": ("calibrate", "sheet"),
+    "Recordings": ("record", "replay", "pcap", "dissector"),
+    "Without a camera": ("demo",),
+}
+"""What ``--help`` lists where."""
+
+
+class CommandsByTopic(JsonErrors, click.Group):
+    """The commands, listed by topic with whole summaries."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list."""
+        for topic, names in TOPICS.items():
+            with formatter.section(topic):
+                rows = [(name, self.commands[name].get_short_help_str(limit=400)) for name in names]
+                formatter.write_dl(rows)
+
+
+@click.group(
+    cls=CommandsByTopic, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.version_option(smartcam.__version__)
 def command() -> None:
     """Talk to industrial smart cameras.
@@ -76,6 +102,7 @@ async def trigger(url: str, input_hex: str | None, options: Options) -> None:
     timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
     loop = asyncio.get_running_loop()
     with options.camera(url) as unopened:
+        options.remark(unopened)
         async with unopened as camera:
             end = loop.time() + options.seconds if options.seconds else None
             count = options.count or (None if end else 1)
@@ -198,15 +225,27 @@ def _broken(info: PluginInfo, exc: Exception) -> tuple[object, str]:
 async def interpreters(options: Options) -> None:
     """List the interpreters that --interpret-as knows."""
     for info in INTERPRETERS.available():
-        value: object = info
-        text = f"{info.name}  ({info.origin}: {info.target})"
-        try:
-            resolve(info.name)
-        except PluginError as exc:
-            value, text = _broken(info, exc)
-        except SmartCamError:
-            pass  # it has need of a layout
-        options.show(value, text)
+        options.show(*_interpreter(info))
+
+
+def _interpreter(info: PluginInfo) -> tuple[object, str]:
+    """Describe an interpreter, as JSON and as text."""
+    about = ""
+    try:
+        about = _first_line(INTERPRETERS.load(info.name))
+        resolve(info.name)
+    except PluginError as exc:
+        return _broken(info, exc)
+    except SmartCamError:
+        pass  # it has need of a layout
+    where = "" if info.origin == "built-in" else f" ({info.origin}: {info.target})"
+    return {**info._asdict(), "about": about}, f"{info.name:14} {about}{where}"
+
+
+def _first_line(loaded: object) -> str:
+    """Return the first line of what a plug-in says of itself, without its markup."""
+    lines = (inspect.getdoc(loaded) or "").splitlines()
+    return re.sub(r":[a-z]+:`~?(?:[\w.]*\.)?(\w+)`|`+", r"\1", lines[0]) if lines else ""
 
 
 @command.command(name="demo")

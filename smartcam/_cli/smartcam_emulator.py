@@ -13,6 +13,7 @@ from click.core import ParameterSource
 import smartcam
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._cli.page import PageOptions, page_options
+from smartcam._cli.running import JsonErrors
 from smartcam._cli.texts import camera_value
 from smartcam.emulator import Scenario, load_scenarios, scenario_schema
 from smartcam.emulator._generators import find_generator
@@ -39,7 +40,7 @@ _SAID = {
 """What not every emulated camera takes, as it is said."""
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=JsonErrors, context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("scenario", required=False, metavar="[SCENARIO.yaml]")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(

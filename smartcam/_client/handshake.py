@@ -11,13 +11,11 @@ session alike share an attempt: the answer to Connect, and what follows, tells t
 from __future__ import annotations
 
 import asyncio
-import itertools
 import logging
-import operator
-import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
+from smartcam._client.attempts import CONNECTING, OPENING, SessionRefusedError, Try, explain
 from smartcam._client.link import Chunk, Link, open_link
 from smartcam.exceptions import (
     CommandRejectedError,
@@ -65,10 +63,6 @@ MAX_EARLY = 1 << 20
 a few round trips, and the fastest camera sends a fraction of it meanwhile."""
 
 
-OPENING = "opening the link"
-CONNECTING = "waiting for the answer to Connect"
-
-
 class Session(NamedTuple):
     """A link with a session on it.
 
@@ -86,51 +80,6 @@ class Session(NamedTuple):
     dialect: Dialect
     version: int
     early: list[Chunk]
-
-
-@dataclass(slots=True)
-class Try:
-    """One attempt: what was tried and how far it came.
-
-    Attributes:
-        dialect: that was spoken; those that begin a session alike until it is known which.
-        transport: ``tcp`` or ``udp``.
-        step: what was waited for at last.
-        outcome: what came of it.
-        received: bytes that came.
-        hung_up: the other side ended the link without a byte.
-        on_step: called with each new step.
-    """
-
-    dialect: str
-    transport: str
-    step: str = OPENING
-    outcome: str = ""
-    received: int = 0
-    hung_up: bool = False
-    on_step: Callable[[str], None] | None = None
-
-    def reach(self, step: str) -> None:
-        """Note that this is what is waited for now."""
-        self.step = step
-        if self.on_step is not None:
-            self.on_step(step)
-
-    def end(self, error: Exception, waited: float) -> None:
-        """Note what it ended with; ``UnicodeError`` stands for what is no host name."""
-        timeout = isinstance(error, TimeoutError)
-        self.hung_up = self.step == CONNECTING and not timeout and not self.received
-        if isinstance(error, TimeoutError) and not isinstance(error, SmartCamError):
-            what = f"{self.received} bytes, then silence" if self.received else "silence"
-            self.outcome = f"{what} for {waited:.1f} s"
-        elif isinstance(error, OSError) and error.errno is not None and error.errno > 0:
-            self.outcome = os.strerror(error.errno)  # asyncio's own text is "Connect call failed"
-        else:
-            self.outcome = str(error)
-
-    def __str__(self) -> str:
-        """One line for an error text."""
-        return f"{self.dialect} over {self.transport.upper()}: {self.step}: {self.outcome}"
 
 
 @dataclass(slots=True)
@@ -167,7 +116,7 @@ class _Collector:
                         said += code_text(dialect, code, Connect)
                         if dialect.has_login:
                             raise CommandRejectedError(said, code=code)
-                        raise RemoteProtocolError(said)
+                        raise SessionRefusedError(said)
                     if version < 1:
                         raise RemoteProtocolError(f"the camera speaks protocol version {version}")
                     self.version = version
@@ -299,6 +248,8 @@ async def attempt(
         progress.received = link.machine.counters.bytes_received
     if collector.version > 1:
         logger.warning("%s ! protocol version %d is newer than 1", name, collector.version)
+    if dialect.remark:
+        logger.warning("%s ! %s", name, dialect.remark)
     pinned = address._replace(dialect=dialect.name, quirks=dialect.quirks)
     return Session(link, pinned, dialect, collector.version, collector.early)
 
@@ -309,6 +260,11 @@ def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
     return protocol.tries(
         protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
     )
+
+
+def remarks(address: Address) -> set[str]:
+    """Return what a user should know who asks for results at an address."""
+    return {dialect.remark for dialects in tries_for(address) for dialect in dialects} - {""}
 
 
 def names_of(dialects: Sequence[Dialect]) -> str:
@@ -322,7 +278,7 @@ async def establish(
     """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.
 
     Raises:
-        ConnectFailedError: names each attempt and what came.
+        ConnectFailedError: why, and what to do about it; ``attempts`` tells what came each time.
 
     Cancellation: the link that was being made is dropped.
     """
@@ -335,13 +291,18 @@ async def establish(
     tries: list[Try] = []
     cause: BaseException | None = None
     disconnect_first = True
+    round_tries: list[Try] = []
     for left in range(settings.connect_attempts, 0, -1):
+        if isinstance(cause, CommandRejectedError):
+            break  # it said no, and would again
+        round_tries = []
         end = loop.time() + (deadline - loop.time()) / left
         hurried = len(groups) > 1 and left == settings.connect_attempts > 1
         for position, dialects in enumerate(groups):
             begin, untried = loop.time(), len(groups) - position
             progress = Try(names_of(dialects), transport.value)
             tries.append(progress)
+            round_tries.append(progress)
             try:
                 async with asyncio.timeout_at(end) as limit:
                     progress.on_step = _sharer(limit, end, untried, hurried=hurried)
@@ -363,16 +324,14 @@ async def establish(
                 # perhaps at the Disconnect: then the next link does without, and so by turns
                 disconnect_first = not disconnect_first
             logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
-            if isinstance(cause, CommandRejectedError):
-                groups = []  # it said no, and would again
-                break
-            if progress.step == OPENING:
-                break  # no link, so another dialect would fare no better in this round
+            if progress.step == OPENING or isinstance(cause, CommandRejectedError):
+                break  # another dialect would fare no better in this round
             if progress.step != CONNECTING:
                 groups = [dialects]  # it answered the Connect: that is its dialect
                 break
+    why = explain(round_tries, address, protocol)
     raise ConnectFailedError(
-        f"{settings.name}: no session with {address.url}: {_folded(tries)}",
+        f"{settings.name}: no session with {address.url}: {why}",
         host=address.host,
         port=address.port,
         attempts=tuple(f"attempt {number}: {one}" for number, one in enumerate(tries, 1)),
@@ -397,14 +356,3 @@ def _sharer(
         limit.reschedule(when)
 
     return on_step
-
-
-def _folded(tries: list[Try]) -> str:
-    """Return the outcomes of all attempts in words, equal ones in a row as one."""
-    parts: list[str] = []
-    numbered = enumerate(map(str, tries), 1)
-    for text, group in itertools.groupby(numbered, key=operator.itemgetter(1)):
-        first, *more = [number for number, _ in group]
-        which = f"attempts {first} to {more[-1]}" if more else f"attempt {first}"
-        parts.append(f"{which}: {text}")
-    return "; ".join(parts)

@@ -242,7 +242,7 @@ class Triggers:
                 with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
                     async with asyncio.timeout_at(deadline):
                         await link.drain()
-            return await outcome
+            return await outcome  # TimeoutError: the timer of Results, at the deadline
         except TimeoutError as exc:
             self._correlation.give_up(pending)
             # it may have been stopped: then Waiting did not drop for this trigger

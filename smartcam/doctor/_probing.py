@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._client.handshake import Try, attempt, names_of
-from smartcam.exceptions import ConnectionLostError, SmartCamError
+from smartcam._client.attempts import Try
+from smartcam._client.handshake import attempt, names_of
+from smartcam.exceptions import SmartCamError
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
 from smartcam.protocols._base import Transport, load_protocol
@@ -51,41 +51,28 @@ class CameraAnswer(NamedTuple):
     protocol_version: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
-    """One try and what came of it.
+@dataclass(slots=True, kw_only=True)
+class Trial(Try):
+    """One try and what came of it; ``outcome`` is ``session`` where a camera answered.
 
     Attributes:
         address: where, with the scheme of the transport.
-        transport: ``tcp`` or ``udp``.
-        dialect: that was spoken; where several begin a session alike, all until it is known.
-        step: what was waited for at last.
-        outcome: what came of it, ``session`` where a camera answered.
-        opened: whether there was a link at all.
-        hung_up: the other side ended the link without a byte.
-        received: bytes that came.
         frames: what went over the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: entries beyond those.
-        error: why there is no session, None where there is one.
         answer: what the camera said, None where none answered.
     """
 
     address: Address
-    transport: str
-    dialect: str
-    step: str
-    outcome: str
-    opened: bool
-    hung_up: bool
-    received: int
-    frames: tuple[TraceEntry, ...]
-    omitted: int
-    error: Exception | None
-    answer: CameraAnswer | None
+    frames: list[TraceEntry] = field(default_factory=list[TraceEntry])
+    omitted: int = 0
+    answer: CameraAnswer | None = None
 
-    def __str__(self) -> str:
-        """One line for an error text."""
-        return f"{self.dialect} over {self.transport.upper()}: {self.step}: {self.outcome}"
+    def keep(self, entry: TraceEntry) -> None:
+        """Keep an entry, as long as this is not over."""
+        if self.answer is None and len(self.frames) < MAX_FRAMES:
+            self.frames.append(entry)
+        elif self.answer is None:
+            self.omitted += 1
 
 
 class Way(NamedTuple):
@@ -145,26 +132,6 @@ async def trials(
             return
 
 
-@dataclass(slots=True)
-class _Notes:
-    """Keeps what goes over the wire, and hands it on."""
-
-    trace: Callable[[TraceEntry], None] | None
-    frames: list[TraceEntry] = field(default_factory=list[TraceEntry])
-    omitted: int = 0
-    ended: bool = False  # the session was made; what follows is its end
-
-    def take(self, entry: TraceEntry) -> None:
-        if self.trace is not None:
-            self.trace(entry)
-        if self.ended:
-            return
-        if len(self.frames) < MAX_FRAMES:
-            self.frames.append(entry)
-        else:
-            self.omitted += 1
-
-
 async def _try(
     way: Way,
     share: float,
@@ -173,47 +140,32 @@ async def _try(
     disconnect_first: bool,
 ) -> Trial:
     address, transport, dialects = way
-    progress = Try(names_of(dialects), transport.value)
-    opening = progress.step
-    notes = _Notes(trace)
-    answer, error = None, None
+    trial = Trial(names_of(dialects), transport.value, address=address)
+
+    def take(entry: TraceEntry) -> None:
+        trial.keep(entry)
+        if trace is not None:
+            trace(entry)
+
     try:
         async with asyncio.timeout(share):
             session = await attempt(
                 address,
                 dialects,
                 transport,
-                progress=progress,
+                progress=trial,
                 name=f"{address.host}:{address.port}",
                 max_length=DEFAULT_MAX_LENGTH,
-                trace=notes.take,
+                trace=take,
                 disconnect_first=disconnect_first,
             )
     except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
-        progress.end(exc, share)
-        error = exc
-        cause = exc.__cause__
-        if isinstance(exc, ConnectionLostError) and isinstance(cause, OSError) and cause.errno:
-            progress.outcome = os.strerror(cause.errno)  # the system's own words are plainer
+        trial.end(exc, share)
     else:
-        progress.outcome = "session"
-        answer = _answer(session)
-        notes.ended = True
+        trial.outcome = "session"
+        trial.answer = _answer(session)
         await session.link.close(CLOSE_TIMEOUT)
-    return Trial(
-        address=address,
-        transport=progress.transport,
-        dialect=progress.dialect,
-        step=progress.step,
-        outcome=progress.outcome,
-        opened=progress.step != opening,
-        hung_up=progress.hung_up,
-        received=progress.received,
-        frames=tuple(notes.frames),
-        omitted=notes.omitted,
-        error=error,
-        answer=answer,
-    )
+    return trial
 
 
 def _answer(session: Session) -> CameraAnswer:

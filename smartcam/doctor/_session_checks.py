@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
-import re
 import socket
 from typing import TYPE_CHECKING, Any
 
-from smartcam.doctor._context import Diagnosis
+from smartcam._client.attempts import reason_for, words
+from smartcam._client.handshake import remarks
 from smartcam.doctor._findings import Exit
 from smartcam.doctor._probing import trials
 from smartcam.doctor._timing import figures
@@ -21,6 +20,7 @@ from smartcam.exceptions import (
 from smartcam.protocols._base import Transport, load_protocol
 
 if TYPE_CHECKING:
+    from smartcam._client.attempts import Reason, Try
     from smartcam.client import SmartCamera
     from smartcam.doctor._context import Examination
     from smartcam.doctor._probing import CameraAnswer, Trial
@@ -124,88 +124,11 @@ def _say_session(
         protocol_version=camera.protocol_version,
         connect_time=measured._asdict(),
     )
+    for remark in remarks(exam.address):
+        exam.say("warning", remark)
 
 
 # ---------------------------------------------------------------------- no session
-
-
-def _is_errno(trial: Trial, *numbers: int) -> bool:
-    """Whether one of these errors of the system is behind it; a name has several addresses."""
-    error = trial.error
-    if error is not None and isinstance(error.__cause__, OSError):
-        error = error.__cause__
-    if not isinstance(error, OSError):
-        return False
-    found = {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
-    return not found.isdisjoint(numbers)
-
-
-_ERRNO = re.compile(r"\[Errno (\d+)\]")
-
-
-_UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
-
-_CURE_SILENT = (
-    "Is the camera's interface set to {other} instead of {this}? Does it speak another dialect? "
-    "Does another client hold it? Is {port} the port of its process interface (36701 by "
-    "default)?"
-)
-
-_REASONS: tuple[Diagnosis[Trial], ...] = (
-    Diagnosis(
-        lambda trial: _is_errno(trial, errno.ECONNREFUSED),
-        "nothing listens at {where}: {said}",
-        "Look at the port (36701 by default), and whether the camera's process interface is "
-        "switched on. A camera that has just been switched on needs about half a minute.",
-    ),
-    Diagnosis(
-        lambda trial: _is_errno(trial, *_UNREACHABLE),
-        "there is no way to {where}: {said}",
-        "Look at the address, at this machine's network and mask, the cable and the camera's "
-        "power: both must be in one network, or have a route.",
-    ),
-    Diagnosis(
-        lambda trial: not trial.opened and isinstance(trial.error, TimeoutError),
-        "nobody answers at {where}, not even with a refusal: {said}",
-        "Wrong address, no power, another network, or a firewall that drops what comes. Does the "
-        "camera answer a ping from this machine?",
-    ),
-    Diagnosis(
-        lambda trial: not trial.opened,
-        "no connection to {where}: {said}",
-        "Look at the address, this machine's network and the camera's.",
-    ),
-    Diagnosis(
-        lambda trial: trial.hung_up,
-        "{where} takes the connection and hangs up without a word: {said}",
-        "It may serve another client and refuse newcomers: end the other one. Or it is no "
-        "camera, or something else listens at this port.",
-    ),
-    Diagnosis(
-        lambda trial: isinstance(trial.error, ProtocolError),
-        "what {where} answers is no camera's language: {said}",
-        "Something else listens there, or a camera with a dialect that smartcam does not know. "
-        "smartcam probe shows every byte.",
-    ),
-    Diagnosis(
-        lambda trial: trial.received > 0,
-        "{where} answers, and no session comes of it: {step}: {said}",
-        "Something else listens there, or the camera's answers get lost. smartcam probe shows "
-        "every byte.",
-    ),
-    Diagnosis(
-        lambda trial: trial.transport == Transport.UDP.value,
-        "nothing comes back from {where}: {said}; UDP does not tell whether anybody is there",
-        "Look at address, cable and power. " + _CURE_SILENT,
-    ),
-    Diagnosis(
-        lambda trial: True,
-        "{where} takes the connection and says nothing: {step}: {said}",
-        _CURE_SILENT,
-    ),
-)
-"""The first that fits one of the tries is it: bytes that came tell more than silence. Filled in are
-``where``, ``said`` (the try's outcome), ``step``, ``this``, ``other`` and ``port``."""
 
 
 async def _diagnose(exam: Examination, failure: ConnectFailedError) -> SmartCamera | None:
@@ -243,31 +166,24 @@ async def _try_all(exam: Examination) -> list[Trial]:
 
 def _say_no_session(exam: Examination, found: list[Trial], answer: CameraAnswer | None) -> None:
     own = found[0].address
-    kind, trial = _reason(found, pinned=own.dialect is not None)
-    words = {
-        "where": f"{exam.host_and_port} ({trial.transport.upper()})",
-        "said": trial.outcome,
-        "step": trial.step,
-        "this": trial.transport.upper(),
-        "other": "UDP" if trial.transport == "tcp" else "TCP",
-        "port": str(own.port),
-    }
+    reason, trial = _reason(found, pinned=own.dialect is not None)
+    filled = words(trial, own, load_protocol(own.protocol))
     if answer is not None:
         cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
     else:
         others = [one for one in found if one is not trial]
         also = f" Also tried: {_folded(others)}." if others else ""
-        cure = kind.cure.format(**words) + also
+        cure = reason.cure.format(**filled) + also
     exam.fail(
-        kind.text.format(**words),
+        reason.text.format(**filled),
         cure,
         tries=[str(one) for one in found],
-        frames=[one.frames for one in found],
+        frames=[tuple(one.frames) for one in found],
         answers_at=answer.url if answer is not None else None,
     )
 
 
-def _reason(found: list[Trial], *, pinned: bool) -> tuple[Diagnosis[Trial], Trial]:
+def _reason(found: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
     """Return the reason why the URL gives no session, and the try that shows it."""
     first = found[0]
     own = [
@@ -275,7 +191,7 @@ def _reason(found: list[Trial], *, pinned: bool) -> tuple[Diagnosis[Trial], Tria
         for trial in found
         if trial.transport == first.transport and (trial.dialect == first.dialect or not pinned)
     ]
-    return next((kind, trial) for kind in _REASONS for trial in own if kind.fits(trial))
+    return reason_for(own)
 
 
 def _folded(found: list[Trial]) -> str:

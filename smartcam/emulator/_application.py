@@ -200,7 +200,8 @@ def make_application(given: Application | dict[str, Any]) -> Application:
     """
     if isinstance(given, Application):
         return given
-    return validated(Application, given, f"application {given.get('id', '?')}")
+    number = given.get("id", "?") if isinstance(given, dict) else repr(given)
+    return validated(Application, given, f"application {number}")
 
 
 LOCALIZATIONS = (

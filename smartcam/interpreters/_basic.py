@@ -20,7 +20,7 @@ _TEXT = struct.Struct(f"{WIDTH}s")
 
 
 class RawInterpreter(PlainInterpreter):
-    """``raw``: the container's bytes as they are, hex in JSON; takes no layout."""
+    """The container's bytes as they are, hex in JSON; takes no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
@@ -30,7 +30,7 @@ class RawInterpreter(PlainInterpreter):
 
 
 class Strings50Interpreter(PlainInterpreter):
-    """``strings50``: texts of 50 bytes each (the thesis' ``50ByteStrings``); takes no layout."""
+    """Texts of 50 bytes each (the thesis' ``50ByteStrings``); takes no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "none"
 
@@ -49,7 +49,10 @@ class Strings50Interpreter(PlainInterpreter):
 
 
 class RecordInterpreter(PlainInterpreter):
-    """``record``: what :meth:`smartcam.Layout.parse` gives; needs a layout."""
+    """One record of named fields; needs a layout.
+
+    See :meth:`smartcam.Layout.parse`.
+    """
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
     layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here
@@ -64,7 +67,10 @@ class RecordInterpreter(PlainInterpreter):
 
 
 class TableInterpreter(PlainInterpreter):
-    """``table``: what :meth:`smartcam.Layout.parse_table` gives; needs a layout."""
+    """Records as a numpy array; needs a layout.
+
+    See :meth:`smartcam.Layout.parse_table`.
+    """
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "required"
     layout: Layout  # pyright: ignore[reportIncompatibleVariableOverride]  never None here

@@ -50,7 +50,7 @@ _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[report
 
 
 class LocalizationsInterpreter(PlainInterpreter):
-    """Gives a list of :class:`~smartcam.Localization`.
+    """Parts that were found, a :class:`~smartcam.Localization` each: feature, quality, pose.
 
     Args:
         layout: ``x`` and ``y`` must be in its records. Without ``feature_id`` it is ``""``,

@@ -69,8 +69,9 @@ def _fields(layout: Layout, count: int) -> Sequence[Field]:
         records = 1 if records is None else -(-left // len(layout.fields))
     expected = len(layout.head) + records * len(layout.fields)
     if expected != count:
+        cause = "" if count else "; ?cells=B2,C2 in the URL names those that are read"
         raise InterpretationError(
-            f"{count} cells came, the layout has {expected} fields: {layout.text}",
+            f"{count} cells came, the layout has {expected} fields: {layout.text}{cause}",
             expected=expected,
             got=count,
         )

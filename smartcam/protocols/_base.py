@@ -167,6 +167,11 @@ class Dialect(ABC):
         return f"{self.name} with quirk {', '.join(self.quirks)}" if self.quirks else self.name
 
     @property
+    def remark(self) -> str:
+        """What a user should know who asks for results in this dialect, "" for nothing."""
+        return ""
+
+    @property
     @abstractmethod
     def capabilities(self) -> Capabilities:
         """What a camera can do in it."""

@@ -1,4 +1,4 @@
-"""Finding out what is new with a camera, for one event stream."""
+"""Finding out what is new with a camera, for one event stream: by asking the emulator's log."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -32,6 +33,7 @@ from tests.cli.commandline import (
     emulators,
     run,
     run_as_far_as,
+    run_emulator,
 )
 from tests.processes import PATIENCE, Process, script
 
@@ -63,8 +65,30 @@ def test_command_nothing_listens_exits_3() -> None:
     for command, more in COMMANDS:
         with each(command), closed_port() as address:
             outcome = run(command, f"bvs://{address}", *more, "--timeout", "0.3")
-            outcome.failed(3, address, "b16 or bid over TCP: opening the link: ")
+            outcome.failed(3, address, "onnection refused")
             assert command == "probe" or outcome.out == ""
+
+
+def test_error_is_json_where_json_is_asked_for() -> None:
+    with closed_port() as address:
+        outcome = run("status", f"bvs://{address}", "--json", "--timeout", "0.3")
+    told = json.loads(outcome.err)
+    assert (outcome.code, outcome.out) == (3, "")
+    assert (told["error"], told["exit_code"]) == ("ConnectFailedError", 3)
+    assert f"no session with bvs://{address}: nothing listens at" in told["text"]
+    assert f"{told['host']}:{told['port']}" == address
+    assert told["attempts"][0].startswith("attempt 1: ")
+
+
+def test_wrong_use_is_json_where_json_is_asked_for() -> None:
+    for program in (run, run_emulator):
+        for arguments in (("--json", "--bogus"), ("--bogus", "--json")):
+            command = ("status", "bvs://h") if program is run else ()
+            outcome = program(*command, *arguments)
+            told = json.loads(outcome.err)
+            assert (outcome.code, told["error"], told["exit_code"]) == (2, "NoSuchOption", 2)
+    told = json.loads(run("watch", "bvs://h", "--count", "-1", "--json").err)
+    assert (told["error"], told["exit_code"]) == ("BadParameter", 2)
 
 
 def test_status_silent_peer_exits_3() -> None:
@@ -78,8 +102,8 @@ def test_status_silent_udp_peer_exits_3() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
         silent.bind(("127.0.0.1", 0))
         url = f"bvs+udp://127.0.0.1:{silent.getsockname()[1]}"
-        outcome = run_as_far_as("thesis over UDP", "status", url)
-    outcome.failed(3, "handbook over UDP", "thesis over UDP", "silence")
+        outcome = run_as_far_as("silence", "status", url)
+    outcome.failed(3, "nothing comes back from", "set to UDP, not to TCP")
 
 
 def test_status_garbage_exits_3() -> None:
@@ -96,7 +120,7 @@ def test_status_length_bomb_at_connect_exits_3() -> None:
 
 def test_status_peer_closes_at_once_exits_3() -> None:
     with Peer({CONNECT: DIE}) as peer:
-        run_as_far_as("answer to Connect", "status", peer.url).failed(3, "answer to Connect")
+        run_as_far_as("hangs up", "status", peer.url).failed(3, "hangs up without a word")
 
 
 def test_status_no_first_status_exits_3() -> None:

@@ -117,6 +117,16 @@ def test_image_of_a_camera_that_has_none_says_so(tmp_path: Path) -> None:
     assert not (tmp_path / "seen.bmp").exists()
 
 
+def test_trigger_without_cells_says_so(online: str) -> None:
+    said = "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"
+    empty = run("trigger", online)
+    assert (empty.code, empty.err) == (0, f"note: {said}\n")
+    run("trigger", f"{online}?cells=A1").done()
+    wrong = run("trigger", online, "--interpret-as", "x: real32")
+    assert (wrong.code, wrong.err.count("?cells=B2,C2 in the URL names")) == (6, 2)
+    assert f"warning  session: {said}" in run("doctor", online).out
+
+
 def test_trigger_prints_cells_as_the_layout_says(online: str) -> None:
     cells, layout = f"{online}?cells=A1,Passed,C1", "x: real32 mm, ok: bool, code: string[8]"
     (line,) = run("trigger", cells, "--interpret-as", layout, "--json").done().lines
@@ -160,7 +170,7 @@ def test_trigger_that_cannot_be_read_exits(
 
 
 def test_trigger_with_input_is_unsupported(online: str) -> None:
-    run("trigger", online, "--input", "00").failed(5, f"no SetInput; it can: {CAN}")
+    run("trigger", f"{online}?cells=A1", "--input", "00").failed(5, f"no SetInput; it can: {CAN}")
 
 
 @pytest.mark.parametrize("job", ["7", "7Counter.job", "7Counter"])

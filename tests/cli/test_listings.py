@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -11,6 +12,8 @@ from click.testing import CliRunner
 
 import smartcam
 from smartcam._cli.dissector import dissector
+from smartcam._cli.smartcam import TOPICS
+from smartcam._cli.smartcam import command as smartcam_command
 from smartcam._dissector import lua_source
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 from tests.cli.commandline import each, run, run_emulator
@@ -50,8 +53,40 @@ def test_interpreters_lists_the_built_in_ones() -> None:
     names = {"localizations", "raw", "record", "strings50", "table"}
     lines = run("interpreters", "--json").done().lines
     assert {line["name"] for line in lines if line["origin"] == "built-in"} == names
+    assert all(line["about"] for line in lines if line["name"] in names)
     out = run("interpreters").done().out
     assert {line.split()[0] for line in out.splitlines()} >= names
+    assert "Parts that were found, a Localization each" in out
+
+
+def test_help_lists_every_command_by_topic() -> None:
+    listed = [name for names in TOPICS.values() for name in names]
+    assert sorted(listed) == sorted(smartcam_command.commands)
+    out = run("--help").done().out
+    assert [out.index(f"\n{topic}:\n") for topic in TOPICS] == sorted(
+        out.index(f"\n{topic}:\n") for topic in TOPICS
+    )
+    assert "..." not in out.partition("A camera:")[2]
+
+
+def test_completion_knows_commands_and_options() -> None:
+    for words, cword, wanted in (
+        ("smartcam do", 1, "doctor"),
+        ("smartcam watch --sec", 2, "--sec"),
+    ):
+        told = subprocess.run(
+            [sys.executable, "-m", "smartcam"],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={
+                **os.environ,
+                "_SMARTCAM_COMPLETE": "bash_complete",
+                "COMP_WORDS": words,
+                "COMP_CWORD": str(cword),
+            },
+        )
+        assert wanted in told.stdout
 
 
 @pytest.fixture

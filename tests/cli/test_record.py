@@ -143,6 +143,7 @@ def test_record_of_a_camera_that_sends_nothing_asks_for_every(tmp_path: Path) ->
     with Process("smartcam-emulator", "--protocol", "insight") as emulator:
         url = emulator.read_until(b"\n").strip()
         run("start", url).done()
+        url += "?cells=A1"
         first = run("record", url, "-o", str(tmp_path / "a.mcap"), "--seconds", "60")
         command = ["record", url, "-o", str(tmp_path / "b.mcap"), "--application", "7"]
         run(*command, "--every", "0.05", "--count", "2").done()

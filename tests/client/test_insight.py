@@ -169,10 +169,12 @@ async def test_connect_with_a_wrong_password_is_tried_once_and_shows_none(
         camera = smartcam.connect(url, observers=[Trace()])
         error = await gone(camera.open())
         assert isinstance(error, ConnectFailedError)
-        assert str(error).endswith(
-            "no session with insight://admin@" + emulator.url.partition("//")[2] + ": attempt 1: "
-            "native over TCP: waiting for the answer to Connect: the camera refused the session: "
-            "code -6 (the user or the password is wrong)"
+        address = emulator.url.partition("//")[2]
+        refusal = "the camera refused the session: code -6 (the user or the password is wrong)"
+        begin = f"{address}: no session with insight://admin@{address}: {address} (TCP) refuses: "
+        assert str(error).startswith(f"{begin}{refusal}. ")
+        assert error.attempts == (
+            f"attempt 1: native over TCP: waiting for the answer to Connect: {refusal}",
         )
         assert said(emulator) == ["admin", "***"]
     shown = repr([camera, camera.settings, traced]) + str(error) + caplog.text
@@ -671,6 +673,19 @@ async def test_reconnect_that_is_refused_is_not_tried_for_ever() -> None:
         with pytest.raises(ConnectionLostError, match="the user or the password is wrong"):
             await camera.wait_connected()
         assert said(emulator).count("***") == 2
+
+
+async def test_camera_that_inspects_for_long_is_not_taken_for_a_silent_one() -> None:
+    async with insight(request_timeout=SHORT) as (emulator, camera):
+        await camera.switch_application("20slow")
+        statuses = camera.statuses()  # so that it is asked all the time
+        waiting = asyncio.create_task(camera.trigger(timeout=60.0))
+        await until(lambda: said(emulator).count("SW8") == 1)
+        await asyncio.sleep(20 * SHORT)
+        pass_time(emulator, SECOND)
+        assert (await waiting).application == 20
+        assert camera.connected
+        statuses.close()
 
 
 async def test_silent_camera_is_given_up() -> None:

@@ -288,6 +288,8 @@ def test_request_trace_has_every_byte(
     counters = talk.machine.counters
     assert counters.bytes_received == len(LOGIN) + len(heard)
     assert counters.bytes_sent == len(b"admin\r\n\r\n") + len(written)
+    pieces = sum(sender is m.Sender.CAMERA for sender, _ in talk.traced)
+    assert 0 < counters.frames_received - pieces < 8  # those of the login
 
 
 def test_requests_are_sent_one_after_the_other() -> None:

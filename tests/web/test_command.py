@@ -62,8 +62,9 @@ def test_web_json_has_name_and_page_of_a_camera_and_the_token_is_that_of_the_env
         assert (camera["name"], fragment) == ("camera", f"token={TOKEN}")
         assert page_of(emulator) == camera["web"]
         assert get(f"{page}api/cameras/camera", TOKEN)["url"] == camera["url"]
-        with pytest.raises(urllib.error.HTTPError, match="401"):
+        with pytest.raises(urllib.error.HTTPError, match="401") as refused:
             get(f"{page}api/cameras")
+        refused.value.close()
         emulator.send_signal(signal.SIGINT)
         assert emulator.wait().code == 0
 

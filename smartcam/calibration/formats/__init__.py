@@ -1,5 +1,7 @@
 """Formats of other programs: transforms, samples of a hand-eye calibration, poses over time.
 
+Our own files are in ``calibration/_files``.
+
 ::
 
     write_transform("camera.txt", "ros2", plane_frame(calibration).transform)

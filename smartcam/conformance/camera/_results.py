@@ -106,6 +106,7 @@ def check(
 ) -> Callable[[Callable[[CameraUnderTest], Any]], Check]:
     """Make a check of the function below: its name and docstring are those of the check.
 
+    ``_items.py`` finds it where its module is one of ``_MODULES`` there, in the file's order.
     The rest is what an :class:`Item` has: ``sources`` as a text hold for every dialect, ``about``
     stands where the docstring's line has no room for it.
     """

@@ -18,9 +18,10 @@ Connect, and the messages of the session.
 
 There is no chance in any of it: the same list and the same messages give the same bytes.
 
-A fault that is new is a class here, with a ``kind``, and stands in one of the unions below. What it
-does is a row in ``_wire_effects.py`` (by what it makes of a message) or ``_device_effects.py``. The
-tests then ask for a row in ``docs/emulator.md`` and the schema (``smartcam-emulator --schema``).
+A fault that is new is a class here, with a ``kind``, in ``__all__`` and in one of the unions below.
+What it does is a row: of ``_CHANGES`` (what it makes of a message) or ``_REBUILDS`` (of all that go
+together) in ``_wire_effects.py``, or of ``_ACTIONS`` in ``_device_effects.py``. The tests then ask
+for a row in ``docs/emulator.md`` and the schema (``smartcam-emulator --schema``).
 """
 
 from __future__ import annotations

@@ -118,6 +118,13 @@ class InSightDialect(Dialect):
         )
 
     @property
+    def remark(self) -> str:
+        """That a result is empty where no cells are asked for."""
+        if self.cells:
+            return ""
+        return "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"
+
+    @property
     def capabilities(self) -> Capabilities:
         """What a camera can do in it."""
         return Capabilities(

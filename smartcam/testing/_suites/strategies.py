@@ -16,8 +16,8 @@ try:
 except ModuleNotFoundError as _exc:
     raise MissingExtraError(
         "smartcam's suites draw bytes with hypothesis, which is not installed: "
-        'pip install "smartcam[test]"',
-        extra="test",
+        'pip install "smartcam[suites]"',
+        extra="suites",
     ) from _exc
 
 st = strategies

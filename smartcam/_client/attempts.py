@@ -1,0 +1,208 @@
+"""Attempts at a session: how far each came, and what that says about the cause, with a cure."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import (
+    CommandRejectedError,
+    ConnectionLostError,
+    ProtocolError,
+    RemoteProtocolError,
+    SmartCamError,
+)
+from smartcam.protocols._base import Transport
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from smartcam.protocols._base import Protocol
+    from smartcam.settings import Address
+
+OPENING = "opening the link"
+CONNECTING = "waiting for the answer to Connect"
+
+_ERRNO = re.compile(r"\[Errno (-?\d+)\]")
+
+
+class SessionRefusedError(RemoteProtocolError):
+    """The answer to Connect says no; a camera of another dialect may mean something else."""
+
+
+@dataclass(slots=True)
+class Try:
+    """One attempt: what was tried and how far it came.
+
+    Attributes:
+        dialect: that was spoken; those that begin a session alike until it is known which.
+        transport: ``tcp`` or ``udp``.
+        step: what was waited for at last.
+        outcome: what came of it.
+        received: bytes that came.
+        hung_up: the other side ended the link without a byte.
+        error: why there is no session, None where there is one.
+        on_step: called with each new step.
+    """
+
+    dialect: str
+    transport: str
+    step: str = OPENING
+    outcome: str = ""
+    received: int = 0
+    hung_up: bool = False
+    error: Exception | None = None
+    on_step: Callable[[str], None] | None = None
+
+    @property
+    def opened(self) -> bool:
+        """Whether there was a link at all."""
+        return self.step != OPENING
+
+    def reach(self, step: str) -> None:
+        """Note that this is what is waited for now."""
+        self.step = step
+        if self.on_step is not None:
+            self.on_step(step)
+
+    def end(self, error: Exception, waited: float) -> None:
+        """Note what it ended with; ``UnicodeError`` stands for what is no host name."""
+        self.error = error
+        timeout = isinstance(error, TimeoutError)
+        self.hung_up = self.step == CONNECTING and not timeout and not self.received
+        lost = error.__cause__ if isinstance(error, ConnectionLostError) else None
+        system = lost if isinstance(lost, OSError) else error
+        if timeout and not isinstance(error, SmartCamError):
+            what = f"{self.received} bytes, then silence" if self.received else "silence"
+            self.outcome = f"{what} for {waited:.1f} s"
+        elif isinstance(system, OSError) and system.errno is not None and system.errno > 0:
+            words = os.strerror(system.errno)  # plainer than "Connect call failed"
+            self.outcome = str(system) if words.startswith("Unknown error") else words  # Winsock's
+        elif isinstance(error, socket.gaierror) and error.strerror:
+            self.outcome = error.strerror
+        else:
+            self.outcome = str(error)
+
+    def failed_with(self, *numbers: int) -> bool:
+        """Whether one of these errors of the system is behind it; a name has several addresses."""
+        error = self.error
+        if error is not None and isinstance(error.__cause__, OSError):
+            error = error.__cause__
+        if not isinstance(error, OSError):
+            return False
+        found = {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
+        return not found.isdisjoint(numbers)
+
+    def __str__(self) -> str:
+        """One line for an error text."""
+        return f"{self.dialect} over {self.transport.upper()}: {self.step}: {self.outcome}"
+
+
+class Reason(NamedTuple):
+    """Why there may be no session. Its texts are filled in by :func:`words`."""
+
+    fits: Callable[[Try], bool]  # whether it is this one, by what an attempt saw
+    text: str  # what is wrong
+    cure: str  # what to do
+
+
+_NO_WAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
+
+REASONS: tuple[Reason, ...] = (
+    Reason(
+        lambda one: isinstance(one.error, (socket.gaierror, UnicodeError)),
+        "the name {host!r} does not resolve: {said}",
+        "Look for a slip in the name, or give the camera's IP address. Names need a DNS server, or "
+        "an entry in this machine's hosts file.",
+    ),
+    Reason(
+        lambda one: isinstance(one.error, (CommandRejectedError, SessionRefusedError)),
+        "{where} refuses: {said}",
+        "Address and dialect are right. Look at the password, and for another client.",
+    ),
+    Reason(
+        lambda one: one.failed_with(errno.ECONNREFUSED),
+        "nothing listens at {where}: {said}",
+        "Look at the port ({default} by default), and whether the camera's process interface is "
+        "switched on{interface}. A camera that has just been switched on needs about half a "
+        "minute.",
+    ),
+    Reason(
+        lambda one: one.failed_with(*_NO_WAY),
+        "there is no way to {where}: {said}",
+        "Look at the address, at this machine's network and mask, the cable and the camera's "
+        "power: both must be in one network, or have a route.",
+    ),
+    Reason(
+        lambda one: not one.opened and isinstance(one.error, TimeoutError),
+        "nobody answers at {where}, not even with a refusal: {said}",
+        "Wrong address, no power, another network, or a firewall that drops what comes. Does the "
+        "camera answer a ping from this machine?",
+    ),
+    Reason(
+        lambda one: not one.opened,
+        "no connection to {where}: {said}",
+        "Look at the address, this machine's network and the camera's.",
+    ),
+    Reason(
+        lambda one: one.hung_up,
+        "{where} takes the connection and hangs up without a word: {said}",
+        "It may serve another client and refuse newcomers: end the other one. Or it is no "
+        "camera, or something else listens at this port.",
+    ),
+    Reason(
+        lambda one: isinstance(one.error, ProtocolError),
+        "what {where} answers is no camera's language: {said}",
+        "Something else listens there, or a camera with a dialect that smartcam does not know. "
+        "smartcam probe shows every byte.",
+    ),
+    Reason(
+        lambda one: one.received > 0,
+        "{where} answers, and no session comes of it: {step}: {said}",
+        "Something else listens there, or the camera's answers get lost. smartcam probe shows "
+        "every byte.",
+    ),
+    Reason(
+        lambda one: one.transport == Transport.UDP.value,
+        "nothing comes back from {where}: {said}; UDP does not tell whether anybody is there",
+        "Look at address, cable and power, whether the camera's process interface is at {port} "
+        "({default} by default){interface}, and for another client or dialect.",
+    ),
+    Reason(
+        lambda one: True,
+        "{where} takes the connection and says nothing: {step}: {said}",
+        "Look whether the camera's process interface is at {port} ({default} by default)"
+        "{interface}, and for another client or dialect.",
+    ),
+)
+"""The first that fits one of the attempts is it: bytes that came tell more than silence."""
+
+
+def reason_for(tries: Sequence[Try]) -> tuple[Reason, Try]:
+    """Return why attempts failed, and the one that shows it."""
+    return next((reason, one) for reason in REASONS for one in tries if reason.fits(one))
+
+
+def words(one: Try, address: Address, protocol: Protocol) -> dict[str, str]:
+    """Return what is filled into a reason's texts."""
+    names = [transport.value for transport in protocol.schemes.values()]
+    this, others = one.transport.upper(), [name for name in names if name != one.transport]
+    return {
+        "where": f"{address.host}:{address.port} ({this})",
+        "host": address.host,
+        "said": one.outcome,
+        "step": one.step,
+        "port": str(address.port),
+        "default": str(protocol.default_port),
+        "interface": f" and set to {this}, not to {others[0].upper()}" if others else "",
+    }
+
+
+def explain(tries: Sequence[Try], address: Address, protocol: Protocol) -> str:
+    """Return one cause and one cure for attempts that failed."""
+    reason, one = reason_for(tries)
+    return f"{reason.text}. {reason.cure}".format(**words(one, address, protocol))
