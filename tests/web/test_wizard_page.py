@@ -56,6 +56,7 @@ class View(NamedTuple):
     async def answer(self, title: str, **answers: Any) -> None:
         """Answer the step of that title."""
         await self.see("#title", title)
+        await self.see("#go:enabled")  # or it is the step before, whose answer is under way
         for name, value in answers.items():
             field = self.page.locator(f"#form [name={name}]")
             if await field.first.get_attribute("type") == "radio":
