@@ -64,12 +64,12 @@ class LineClient:
 
     def say(self, text: str) -> None:
         """Say a line that answers nothing."""
-        self.say_bytes(self._camera.codec.data(text), row=0)
+        self.say_bytes(self._camera.lines.data(text), row=0)
 
     def answer(self, text: str | None) -> None:
         """Answer the line under way, None with silence; the next one is heard then."""
         if text is not None:
-            self.say_bytes(self._camera.codec.data(text))
+            self.say_bytes(self._camera.lines.data(text))
         self.go_on()
 
     def say_bytes(self, data: bytes, *, row: int | None = None) -> None:
@@ -136,6 +136,7 @@ class LineCamera(WireCamera):
             ``switch_application(id, running=False)``. Faults, scenarios and the page find what
             there is.
         fault_kinds: the faults that it can do.
+        lines: how lines are read and written.
 
     Raises:
         ConfigurationError: something given is wrong.
@@ -147,8 +148,6 @@ class LineCamera(WireCamera):
     states: ClassVar[frozenset[DeviceState]] = frozenset(
         {DeviceState.CONNECTED, DeviceState.DISCONNECTED}
     )
-    codec: LineCodec
-
     def __init__(
         self,
         *,
@@ -165,8 +164,9 @@ class LineCamera(WireCamera):
         self._numbers = itertools.count()
         self._spoken_to: dict[ClientLink, None] = {}  # links that have something to write
         cues = [validated(Cue, one, f"cue {at}") for at, one in enumerate(timeline, start=1)]
+        self.lines: LineCodec = self.make_codec()
         super().__init__(
-            spoken=self.make_codec(),
+            spoken=self.lines,
             device=self.device,
             host=host,
             port=port,
@@ -318,7 +318,7 @@ class LineCamera(WireCamera):
 
     def make_machine(self, transport: Transport, trace: Trace) -> LineServer:
         """Return the machine of a new link."""
-        return LineServer(self.codec, transport, trace)
+        return LineServer(self.lines, transport, trace)
 
     def arrived(self, link: ClientLink) -> None:
         """A connection was made."""
@@ -339,7 +339,7 @@ class LineCamera(WireCamera):
             return
         faults = self._provoke(self.queue.device_heard, message)
         client.begin(message)
-        self.hear(client, self.codec.text(message.data))
+        self.hear(client, self.lines.text(message.data))
         self._act(faults, "after")
 
     def serves(self, link: ClientLink) -> bool:

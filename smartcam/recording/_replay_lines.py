@@ -146,7 +146,7 @@ class ReplayedLines(LineCamera):
         return self._kind.make_codec(self)
 
     def _bare(self, data: bytes) -> bytes:
-        return self.codec.text(data).encode(self.codec.encoding, "replace")
+        return self.lines.text(data).encode(self.lines.encoding, "replace")
 
     @property
     def url(self) -> str:
@@ -159,8 +159,8 @@ class ReplayedLines(LineCamera):
         return sum(one.left for line, one in self.plan.answers.items() if self._triggers(line))
 
     def _triggers(self, line: bytes) -> bool:
-        row = self.codec.row_of(line.decode(self.codec.encoding, "replace"))
-        return self.codec.message_type(m.Sender.CLIENT, row) is m.Trigger
+        row = self.lines.row_of(line.decode(self.lines.encoding, "replace"))
+        return self.lines.message_type(m.Sender.CLIENT, row) is m.Trigger
 
     def greet(self, client: LineClient) -> None:
         """Say what came before any line."""
@@ -173,7 +173,7 @@ class ReplayedLines(LineCamera):
         """Give a line what the recorded one got."""
         place = self._places[client]
         self._places[client] += 1
-        data = line.encode(self.codec.encoding, "replace")
+        data = line.encode(self.lines.encoding, "replace")
         found = self.plan.secrets.get(place) or self.plan.answers.get(data)
         if found is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")

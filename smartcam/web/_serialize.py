@@ -191,7 +191,7 @@ def _values(message: m.Message, emulator: WireCamera, *, whole: bool) -> Any:
     if not isinstance(message, m.ResultContainer):
         return None
     if message.cells is not None:
-        return {cell.name: cell.text for cell in message.cells}
+        return {cell.cell: cell.text for cell in message.cells}
     application = emulator.application_of(message)
     layout = None if application is None else application.result_layout
     if layout is None or (not whole and len(message.data) > MAX_VALUES):
