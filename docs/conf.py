@@ -221,7 +221,6 @@ LIMITS = (
     "web._serialize.MAX_VALUES",
     "web._serialize.MAX_TOLD",
     "web._serialize.MAX_LISTED",
-    "web._serialize.MAX_LOOK_BACK",
     "web._feed.MAX_LOG_NEWS",
     "web._feed.MAX_FAULTS_TOLD",
     "web._site.FAREWELL",

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 DIALECTS = tuple(BVS.dialects)
 
+SHOWN = 7
+"""The application that runs where a page shows a camera of no scenario."""
+
 _SAID = {
     "scenario": "scenario",
     "dialect": "--dialect",
@@ -111,7 +114,7 @@ async def command(
     Prints one line per camera, its URL. Without a scenario there are the built-in applications:
     1 three strings, 3 mixed fields, 7 the tangram table's localizations, 9 a free-running counter,
     21 "Hello World". An In-Sight camera has the jobs 1 (constants), 7 (a counter of triggers) and
-    9 (free-running), and is offline at first.
+    9 (free-running), and is offline at first. With --web and without a scenario 7 runs at once.
     """
     if schema:
         click.echo(json.dumps(scenario_schema(), indent=2))
@@ -119,7 +122,7 @@ async def command(
     if generators:
         _list_generators(options)
         return
-    plans = _scenarios(scenario, protocol, dialect, cameras)
+    plans = _scenarios(scenario, protocol, dialect, cameras, shown=web.wanted)
     for plan in plans:
         _refuse_what_does_not_fit(context, plan)
     chosen = dict(map(_quirk, quirks)) or None
@@ -170,14 +173,14 @@ async def _open_page(
 
 
 def _scenarios(
-    path: str | None, protocol: str | None, dialect: str | None, copies: int
+    path: str | None, protocol: str | None, dialect: str | None, copies: int, *, shown: bool
 ) -> tuple[Scenario, ...]:
     """Return a scenario for each camera.
 
     Raises ConfigurationError: the file is wrong, or copies are wanted of several cameras;
     MissingExtraError: PyYAML is not installed.
     """
-    plain = Scenario(protocol=protocol or BVS.name)
+    plain = _plain(protocol or BVS.name, shown=shown)
     loaded = (plain,) if path is None else load_scenarios(path, dialect=dialect)
     for plan in loaded:
         if protocol not in {None, plan.protocol}:
@@ -195,6 +198,13 @@ def _scenarios(
         one.model_copy(update={"name": f"camera{index + 1}", "seed": one.seed + index})
         for index in range(copies)
     )
+
+
+def _plain(protocol: str, *, shown: bool) -> Scenario:
+    """Return a camera without a scenario; one with a page has something to show."""
+    if not (shown and emulated_class(protocol).state_options(SHOWN, running=True)):
+        return Scenario(protocol=protocol)
+    return Scenario(protocol=protocol, active=SHOWN, running=True)
 
 
 def _quirk(text: str) -> tuple[str, Any]:

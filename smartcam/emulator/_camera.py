@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from smartcam.emulator._bvs.behaviour import behaviour_of
+from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK
 from smartcam.emulator._bvs.device import Device
 from smartcam.emulator._client_link import MAX_INPUT, SecondClientSession
-from smartcam.emulator._clock import nanoseconds
+from smartcam.emulator._clock import ManualClock, nanoseconds
 from smartcam.emulator._scenario.merge import make_plan
 from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._scene import TableScene
@@ -31,10 +33,10 @@ from smartcam.settings import Address
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from datetime import datetime
     from pathlib import Path
 
     from smartcam.emulator._application import Application
+    from smartcam.emulator._bvs.device import LastReport
     from smartcam.emulator._bvs.quirks import Quirks
     from smartcam.emulator._client_link import ClientLink, Trace
     from smartcam.emulator._clock import Clock
@@ -157,6 +159,7 @@ class EmulatedCamera(WireCamera):
             running=plan.running,
             quirks=plan.quirks,
             scene=TableScene(seed=plan.seed),
+            clock_time=LOST_CLOCK if isinstance(clock, ManualClock) else datetime.now(UTC),
             behaviour=behaviour_of(self.spoken, plan.quirks),
         )
         super().__init__(
@@ -263,6 +266,14 @@ class EmulatedCamera(WireCamera):
     def clock_time(self) -> datetime:
         """What its own clock shows."""
         return self.device.clock_time
+
+    @property
+    def last_report(self) -> LastReport | None:
+        """What the last run reported, whether anybody heard it or not; its time is the log's."""
+        last = self.device.last_report
+        if last is None:
+            return None
+        return last._replace(time=self._moved_at - (self.device.time - last.time))
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
         """Return the application that describes a result; None where none does."""

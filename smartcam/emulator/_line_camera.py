@@ -148,6 +148,7 @@ class LineCamera(WireCamera):
     states: ClassVar[frozenset[DeviceState]] = frozenset(
         {DeviceState.CONNECTED, DeviceState.DISCONNECTED}
     )
+
     def __init__(
         self,
         *,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from smartcam.emulator._application import Application
+    from smartcam.emulator._bvs.device import LastReport
     from smartcam.emulator._client_link import CameraMachine, ClientLink, Trace
     from smartcam.emulator._clock import TimerHandle
     from smartcam.emulator._links import Listener
@@ -229,6 +230,11 @@ class WireCamera(Server):
         """What its own clock shows; None for a camera without."""
         return None
 
+    @property
+    def last_report(self) -> LastReport | None:
+        """What the last run reported, whether anybody heard it or not; None where none is kept."""
+        return None
+
     def application_of(self, message: m.ResultContainer) -> Application | None:
         """Return the application that describes a result; None where none does."""
         return None
@@ -244,7 +250,8 @@ class WireCamera(Server):
             "processing": False,
             "endian": 0,
             "next_number": None,
-            "queued_inputs": 0,
+            "queued_inputs": None,
+            "run_ends": "ResultContainer",  # what tells a client so
             "applications": [],
             "cells": {},
             "quirks": {},

@@ -333,8 +333,7 @@ def _command(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("GET", f"{_CAMERA}/scene")
 def _scene(site: EmulatorSite, call: CallRequest) -> object:
     """The table: parts at their true poses, the field of view, and what was reported."""
-    emulator = _emulator(site, call)
-    return {**serialize.scene_state(_table(site, call)), "reported": serialize.reported(emulator)}
+    return serialize.scene_state(_emulator(site, call), _table(site, call))
 
 
 @CALLS.add(

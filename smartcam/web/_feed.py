@@ -33,7 +33,6 @@ class Watcher:
         self._emulator = emulator
         self._serial = serialize.log_count(emulator) if since is None else since
         self._known: dict[str, Any] = {}
-        self._reported = serialize.reported(emulator)
         self._looks = 0
 
     def look(self) -> Iterator[News]:
@@ -42,8 +41,7 @@ class Watcher:
         log = self._log()
         yield from self._changed("camera", serialize.camera_state(self._name, emulator))
         if emulator.scene is not None:
-            scene = {**serialize.scene_state(emulator.scene), "reported": self._reported}
-            yield from self._changed("scene", scene)
+            yield from self._changed("scene", serialize.scene_state(emulator, emulator.scene))
         if self._changed_faults():
             yield News("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
         if log is not None:
@@ -69,5 +67,4 @@ class Watcher:
         self._serial = part["next"]  # a serial of another emulator's time may have been higher
         if not entries and not part["missed"]:
             return None
-        self._reported = serialize.reported(emulator, entries) or self._reported
         return News("log", part, self._serial)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +13,13 @@ from smartcam.emulator.faults._base import DeviceFault
 from smartcam.exceptions import InterpretationError
 from smartcam.models import jsonable
 from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import BVS
 from smartcam.web._shapes import OUTLINES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from smartcam.emulator import FiredFault, LogEntry, TableScene, WireCamera
+    from smartcam.emulator import Application, FiredFault, LogEntry, TableScene, WireCamera
     from smartcam.emulator._bvs.device import Device
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.emulator.faults._wire_effects import Codec
@@ -41,8 +41,8 @@ end the list; an answer stays a few megabytes of JSON, and no more than its entr
 MAX_LISTED = 1000
 """Faults that a list shows."""
 
-MAX_LOOK_BACK = 1000
-"""Log entries among which the last result that has poses is searched."""
+LOOKING = {"tangram": False, "tangram_pixels": True}
+"""Generators that look at the table, and whether they tell pixels."""
 
 
 # ---------------------------------------------------------------------- the camera
@@ -61,9 +61,10 @@ OPERATOR = (
 
 
 def abilities(emulator: WireCamera) -> list[str]:
-    """Return what the operator of a camera can do, and ``scene`` where it looks at a table."""
+    """Return what the operator of a camera can do; ``scene`` and ``clock`` where it has them."""
     able = [one for one in OPERATOR if hasattr(emulator.device, one)]
-    return able if emulator.scene is None else [*able, "scene"]
+    has = {"scene": emulator.scene, "clock": emulator.clock_time}
+    return able + [name for name, one in has.items() if one is not None]
 
 
 def camera_row(name: str, emulator: WireCamera) -> dict[str, Any]:
@@ -161,10 +162,25 @@ def camera_entry(
         "hex": entry.hex[:shown],
         "size": _size(entry.hex),
         "error": entry.error,
+        "search": _search(entry.hex) if entry.error and entry.direction == "in" else None,
         "fault": entry.fault,
         "wire": None if wire is None else wire[:shown],
         "wire_size": None if wire is None else _size(wire),
     }
+
+
+def _search(data: str) -> str | None:
+    """Return the dialect in which a client greeted that searches for the camera's, or None."""
+    return next((name for hello, name in _greetings() if data.startswith(hello)), None)
+
+
+@functools.cache
+def _greetings() -> list[tuple[str, str]]:
+    return [
+        (dialect.encode(hello).hex(" "), dialect.name)
+        for dialect in BVS.dialects.values()
+        for hello in (m.Disconnect(), m.Connect())
+    ]
 
 
 def _size(text: str) -> int:
@@ -257,11 +273,13 @@ def kinds() -> list[dict[str, Any]]:
 # ---------------------------------------------------------------------- the scene
 
 
-def scene_state(scene: TableScene) -> dict[str, Any]:
-    """Return the table: parts at their true poses, and what the camera sees of it.
+def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
+    """Return the table: parts at their true poses, what the camera sees of it and reported last.
 
-    Lengths are metres on the table, angles radians.
+    Lengths are metres on the table, angles radians. ``lookers`` are the ids of the applications
+    that look at it.
     """
+    applications = emulator.device.applications.values()
     return {
         "table": {"width": TABLE_SIZE[0], "depth": TABLE_SIZE[1]},
         "sensor": {"width": SENSOR[0], "height": SENSOR[1]},
@@ -273,6 +291,8 @@ def scene_state(scene: TableScene) -> dict[str, Any]:
         "seed": scene.seed,
         "y_down": scene.y_down,
         "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
+        "lookers": [one.id for one in applications if _looks(one)],
+        "reported": _reported(emulator, scene),
     }
 
 
@@ -298,39 +318,24 @@ def _part(scene: TableScene, name: str, pose: TablePose) -> dict[str, Any]:
     }
 
 
-def reported(
-    emulator: WireCamera, entries: Iterable[LogEntry] | None = None
-) -> dict[str, Any] | None:
-    """Return the reported poses of the last result that has some, or None.
-
-    Those are results of the generators ``tangram`` and ``tangram_pixels``, which fill ``x``, ``y``
-    and ``theta``. Entries are searched, oldest first, by default the log's last ones.
-    """
-    if entries is None:
-        entries = emulator.log.since(log_count(emulator) - MAX_LOOK_BACK)[0]
-    for entry in reversed(list(entries)):
-        message = entry.message
-        if entry.direction == "out" and isinstance(message, m.ResultContainer):
-            parts = _poses(message, emulator)
-            if parts is not None:
-                return {"application": message.application, "time": entry.time, "parts": parts}
-    return None
-
-
-def _poses(message: m.ResultContainer, emulator: WireCamera) -> list[dict[str, Any]] | None:
-    application, device = emulator.application_of(message), emulator.device
+def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
+    """Return the poses that the last run reported, whether or not a client heard it, or None."""
+    last = emulator.last_report
+    application = None if last is None else emulator.application_of(last.result)
     layout = None if application is None else application.result_layout
-    if application is None or layout is None:
+    if last is None or application is None or layout is None or not _looks(application):
         return None
-    pixels = {"tangram": False, "tangram_pixels": True}.get(str(application.generator))
-    if pixels is None or not {"x", "y", "theta"} <= {field.name for field in layout.fields}:
-        return None
-    try:
-        records = layout.parse_records(message.data, _byte_order(device))
-    except InterpretationError:
-        return None
-    found = [_pose(record, device.scene, pixels=pixels) for record in records]
-    return [one for one in found if one is not None]
+    records = layout.parse_records(last.result.data, last.byte_order)
+    found = [_pose(one, scene, pixels=LOOKING[str(application.generator)]) for one in records]
+    parts = [one for one in found if one is not None]
+    return {"application": application.id, "time": round(last.time, 6), "parts": parts}
+
+
+def _looks(application: Application) -> bool:
+    """Return whether an application looks at the table, and tells where the parts are."""
+    layout = application.result_layout
+    fields = set[str]() if layout is None else {field.name for field in layout.fields}
+    return str(application.generator) in LOOKING and {"x", "y", "theta"} <= fields
 
 
 def _pose(record: Any, scene: TableScene, *, pixels: bool) -> dict[str, Any] | None:
@@ -338,8 +343,6 @@ def _pose(record: Any, scene: TableScene, *, pixels: bool) -> dict[str, Any] | N
     if not any(values.values()):
         return None  # a slot that is not filled
     pose = TablePose(values["x"], values["y"], values["theta"])
-    if not all(map(math.isfinite, pose)):
-        return None  # a fault may have changed the bytes
     if pixels:
         pose = scene.to_table(Observation("", *pose, 1.0))
     name = values.get("feature_id")

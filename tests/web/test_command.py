@@ -74,7 +74,7 @@ def test_web_shows_a_camera_of_another_make() -> None:
     with Process("smartcam-emulator", *options, fresh=True) as emulator:
         page, url = page_of(emulator), emulator.read_until(b"\n").strip()
         (camera,) = get(f"{page}api/cameras")["cameras"]
-        assert (camera["url"], camera["mode"]) == (url, "stopped")
+        assert (camera["url"], camera["mode"]) == (url, "running")
 
 
 def test_web_that_cannot_be_is_refused_in_one_line() -> None:

@@ -166,6 +166,7 @@ class EmulatedInSight(LineCamera):
             "running": device.online,
             "processing": device.busy,
             "next_number": device.runs + 1,
+            "run_ends": "TriggerAnswer",
             "applications": [
                 {
                     **dict.fromkeys(SHOWN),
