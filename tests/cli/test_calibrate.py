@@ -78,15 +78,22 @@ def test_calibrate_in_json_gives_a_calibration(url: str, tmp_path: Path) -> None
 
 def test_calibrate_in_the_terminal_asks_and_shows_errors(url: str, tmp_path: Path) -> None:
     typed = [str(value) for one in TOUCHES for value in one.values()]
-    about = ["marks", "m", "", "", "pin", "inch", "", "", "", "", "", "", "", "m", "", "0,2"]
-    lines = [*about, "", *["yes"] * 6, "n", *typed[:18], ":undo", *typed[15:18], "", "", ""]
+    about = ["marks", "m", "", "", "pin", "inch", "m", "", "0,2"]
+    touches = [*typed[:1], "much", "", ":repeat", *typed[1:18], ":undo", *typed[15:18]]
+    lines = [*about, "", *["yes"] * 6, "n", *touches, "", "", ""]
     done = calibrating(url, tmp_path, lines).done()
     assert "1. Camera, robot and tool  (:abort)" in done.out
-    assert "! Unit of the robot's coordinates: 'inch': expected one of mm, m" in done.out
-    assert "x, m: y, m: z, m: " in done.out
+    unit, again = done.out.split(
+        "! Unit of the robot's coordinates: 'inch': expected one of mm, m\n"
+    )
+    assert unit.count("Unit of the robot's coordinates\n") == 1
+    assert again.startswith("Unit of the robot's coordinates\n")
+    assert "x, m: y, m: ! y: 'much': expected a number\ny, m: ! y: '': expected a number\n" in again
+    assert "y, m: ! :repeat: expected one of :undo, :abort\ny, m: z, m: " in again
     assert "  - model " in done.out
     assert "from 6 points" in done.out
-    assert "\ndone\n  name: plane\n  file: plane.json\n" in done.out
+    assert "\ndone\nGood for 0." in done.out
+    assert "  file: plane.json\n" in done.out
 
 
 def test_calibrate_y_down_is_kept_and_wanted_by_the_check(url: str, tmp_path: Path) -> None:
@@ -139,7 +146,7 @@ def test_calibrate_check_in_the_terminal_shows_the_verdict(url: str, tmp_path: P
     done = calibrating(url, tmp_path, lines, "--check", "plane").done()
     assert "1. Is plane still true?  (:abort)" in done.out
     assert ". plane still holds  (:undo, :abort)" in done.out
-    assert "\ndone\n  name: plane\n  stale: no\n  touches: 1\n" in done.out
+    assert "\ndone\nStill true: 0.0 mm rms off\n  name: plane\n  stale: no\n" in done.out
 
 
 def test_calibrate_check_of_no_calibration_says_so_and_leaves_nothing(tmp_path: Path) -> None:
@@ -170,7 +177,8 @@ def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:
 def test_calibrate_killed_at_every_step_loses_no_sample(url: str, tmp_path: Path) -> None:
     touched = {f"mark_{number}": number in {1, 2, 6} for number in range(1, 8)}
     some = [TOUCHES[index] for index in (0, 1, 5)]
-    for number, line in enumerate(as_lines(ABOUT, {}, touched, *some, {}, {}), 1):
+    lines = as_lines(ABOUT, {}, touched, *some, {"next": "accept"}, {})
+    for number, line in enumerate(lines, 1):
         with process(url, tmp_path, "--json") as killed:
             killed.read_until(b"\n")
             killed.write(f"{line}\n".encode())

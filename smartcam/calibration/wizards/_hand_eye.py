@@ -28,6 +28,7 @@ from smartcam.calibration.wizards._sequence import Wizard, ask
 from smartcam.calibration.wizards._steps import Number, Option, Step, pick
 from smartcam.calibration.wizards._target_drawing import draw
 from smartcam.calibration.wizards._target_steps import ask_target
+from smartcam.calibration.wizards._verdict import VIEW_CURES, Judgement, judge, refused
 from smartcam.calibration.wizards._view_suggestions import LOOKS, outline
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Pose
@@ -99,7 +100,7 @@ def hand_eye_wizard(
         views = _Views(there, setup, take_picture, read_robot or robot, camera)
         calibration = await views.run()
         name = str(parameters.get("name", KIND))
-        return await ask_to_save(name, save_to, KIND, _outcome(calibration))
+        return await ask_to_save(name, save_to, KIND, _outcome(calibration), views.preview())
 
     return Wizard(name=KIND, version=1, script=script)
 
@@ -148,8 +149,8 @@ class _Views:
         while True:
             while more and await self._take_view():
                 pass
-            calibration, notes = await self._calculate()
-            answers = await ask(self._review(calibration, notes))
+            calibration, notes, judgement = await self._calculate()
+            answers = await ask(self._review(calibration, notes, judgement))
             if answers["next"] == "accept" and calibration is not None:
                 return calibration
             more = answers["next"] == "more"
@@ -183,7 +184,7 @@ class _Views:
             button="Take a picture" if count < LEAST_POSES else "Go on",
             inputs=inputs,
             notes=(f"{count} views so far",) if count else (),
-            preview=self._preview(),
+            preview=self.preview(),
             timeout=PICTURE_TIMEOUT,
         )
         sample = (await ask(step, self._sample)).outcome
@@ -230,11 +231,12 @@ class _Views:
         )
         return view, svg if len(svg) <= MAX_PREVIEW else ""
 
-    def _preview(self) -> dict[str, Any] | None:
+    def preview(self) -> dict[str, Any] | None:
+        """Return the picture of the last view; None where there is none."""
         svg = self._samples[-1].get("preview") if self._samples else None
         return {"svg": svg} if svg else None
 
-    async def _calculate(self) -> tuple[HandEyeCalibration | None, tuple[str, ...]]:
+    async def _calculate(self) -> tuple[HandEyeCalibration | None, tuple[str, ...], Judgement]:
         step = Step(
             id="calculate",
             title="Calculate",
@@ -245,10 +247,13 @@ class _Views:
         )
         found = (await ask(step, self._solve)).outcome
         if "code" in found:
-            return None, (f"{found['code']}: {found['text']}",)
+            worst, code = len(self._samples), Code(found["code"])
+            judgement = refused(code, found["text"], worst=worst, cures=VIEW_CURES)
+            return None, (f"{code}: {found['text']}",), judgement
         views = [one["view"] for one in self._samples]
         calibration = HandEyeCalibration.from_data({**found, "views": views})
-        return calibration, _outcome(calibration).notes
+        _, _, notes, judgement = _outcome(calibration)
+        return calibration, notes, judgement
 
     async def _solve(self, _answers: Answers) -> dict[str, Any]:
         """Return the calibration without the samples' views, or why there is none."""
@@ -261,7 +266,12 @@ class _Views:
             return {"code": str(exc.code), "text": str(exc)}
         return {**calibration.to_data(), "views": []}
 
-    def _review(self, calibration: HandEyeCalibration | None, notes: tuple[str, ...]) -> Step:
+    def _review(
+        self,
+        calibration: HandEyeCalibration | None,
+        notes: tuple[str, ...],
+        judgement: Judgement,
+    ) -> Step:
         options = {
             "accept": "accept it",
             "more": "take another view",
@@ -273,7 +283,8 @@ class _Views:
         else:
             worst = 1 + calibration.worst
         label = "View to remove; the worst one stands there"
-        return review_step(options, pick("view", label, len(self._samples), worst), notes)
+        view = pick("view", label, len(self._samples), worst)
+        return review_step(options, view, notes, judgement, self.preview())
 
 
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
@@ -305,7 +316,15 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
 def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     held_out = calibration.held_out_error
     remarks = [f"{one.code}: {one.text}" for one in calibration.warnings]
+    judgement = judge(
+        None if held_out is None else 1e3 * held_out,
+        [one for one in calibration.warnings if one.code != Code.TOO_FEW],
+        worst=1 + calibration.worst,
+        cures=VIEW_CURES,
+        more="take more views",
+    )
     figures = {
+        **judgement.figures,
         "method": calibration.method,
         "views": len(calibration.views),
         "held_out_mm": None if held_out is None else 1e3 * held_out,
@@ -327,7 +346,7 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
             f"the camera's place is known to {figures['translation_error_mm']:.2g} mm, its "
             f"orientation to {figures['rotation_error_deg']:.2g} deg"
         )
-    return Calibrated(calibration, figures, (*notes, *remarks))
+    return Calibrated(calibration, figures, (*notes, *remarks), judgement)
 
 
 def _known(factor: float, value: float) -> float | None:

@@ -23,11 +23,12 @@ from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, pick
 from smartcam.calibration.wizards._touch_previews import compared, plain
 from smartcam.calibration.wizards._touches import SIDE, SIGMA, UNIT, Touch, Touches
+from smartcam.calibration.wizards._verdict import Judgement, judge, refused
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from smartcam.calibration._files.load import AnyCalibration
@@ -52,6 +53,7 @@ class Calibrated(NamedTuple):
     calibration: AnyCalibration | HandEyeCalibration
     figures: dict[str, Any]  # what the wizard's result says of it, JSON-able
     notes: tuple[str, ...]  # what people should know of it, a line each
+    judgement: Judgement
 
 
 class PointSource(Touches, ABC):
@@ -150,6 +152,7 @@ class PointSource(Touches, ABC):
             camera_frame=self.camera_frame,
             y_down=self.y_down,
         )
+        outcome = self.outcome(plane)
         await ask(
             Step(
                 id="review",
@@ -157,7 +160,8 @@ class PointSource(Touches, ABC):
                 description="Three touches fit any plane: nothing tells how good they were. To "
                 f"know, touch {self.POINTS} instead.",
                 button="Accept",
-                notes=self.outcome(plane).notes,
+                notes=outcome.notes,
+                verdict=outcome.judgement.verdict,
                 preview=self._preview(plane),
             )
         )
@@ -169,8 +173,8 @@ class PointSource(Touches, ABC):
             while len(self.touches) < wanted:
                 await self.add()
             wanted = LEAST
-            plane, notes = self._try_fit(robust=robust)
-            choice = await ask(self._review(plane, notes, robust=robust))
+            plane, notes, judgement = self._try_fit(robust=robust)
+            choice = await ask(self._review(plane, notes, judgement, robust=robust))
             index = choice["point"] - 1
             match choice["next"]:
                 case "accept" if plane is not None:
@@ -184,15 +188,23 @@ class PointSource(Touches, ABC):
                 case _:
                     robust = choice["next"] == "robust"
 
-    def _try_fit(self, *, robust: bool) -> tuple[PlaneCalibration | None, tuple[str, ...]]:
+    def _try_fit(
+        self, *, robust: bool
+    ) -> tuple[PlaneCalibration | None, tuple[str, ...], Judgement]:
         try:
             plane = self.fit(robust=robust and len(self.touches) >= LEAST_POINTS)
         except CalibrationError as exc:
-            return None, (f"{exc.code}: {exc}",)
-        return plane, self.outcome(plane).notes
+            return None, (f"{exc.code}: {exc}",), refused(exc.code, str(exc))
+        _, _, notes, judgement = self.outcome(plane)
+        return plane, notes, judgement
 
     def _review(
-        self, plane: PlaneCalibration | None, notes: tuple[str, ...], *, robust: bool
+        self,
+        plane: PlaneCalibration | None,
+        notes: tuple[str, ...],
+        judgement: Judgement,
+        *,
+        robust: bool,
     ) -> Step:
         options = {
             "accept": "accept it",
@@ -211,8 +223,10 @@ class PointSource(Touches, ABC):
         elif len(self.touches) >= LEAST_POINTS and doubtful:
             options["robust"] = "leave out the points that do not agree with the others"
         label = "Point, to touch again or to remove; the worst one stands there"
-        point = pick("point", label, len(self.touches), worst)
-        return review_step(options, point, notes, self._preview(plane))
+        named = judgement.number or worst
+        count = len(self.touches)
+        point = pick("point", label, count, named if named <= count else worst)
+        return review_step(options, point, notes, judgement, self._preview(plane))
 
     def _preview(self, plane: PlaneCalibration | None) -> dict[str, Any]:
         """Return the data from which a picture of the touches is drawn."""
@@ -269,11 +283,19 @@ def review_step(
     options: Mapping[str, str],
     number: Input,
     notes: tuple[str, ...],
+    judgement: Judgement,
     preview: Mapping[str, Any] | None = None,
 ) -> Step:
     """Return the step that shows what came out, and asks what ``next``, with which ``number``."""
-    inputs = (Option(name="next", label="What next", options=options), number)
-    return Step(id="review", title="What came out", notes=notes, inputs=inputs, preview=preview)
+    default = judgement.chosen(options)
+    return Step(
+        id="review",
+        title="What came out",
+        notes=notes,
+        verdict=judgement.verdict,
+        inputs=(Option(name="next", label="What next", options=options, default=default), number),
+        preview=preview,
+    )
 
 
 async def ask_to_save(
@@ -297,6 +319,7 @@ async def ask_to_save(
         description="A calibration of that name is kept beside it as a backup.",
         button="Save",
         notes=outcome.notes,
+        verdict=outcome.judgement.verdict,
         preview=preview,
     )
     await ask(step, save)
@@ -325,7 +348,15 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
     if predicted is not None:
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
     notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
+    without = f" without {_points(left_out)}" if left_out else ""
+    judgement = judge(
+        None if held_out is None else 1e3 * held_out,
+        [one for one in calibration.warnings if not (left_out and one.code == Code.OUTLIER)],
+        worst=1 + calibration.worst,
+        without=without,
+    )
     found = {
+        **judgement.figures,
         "model": calibration.model,
         "points": points,
         "left_out": left_out,
@@ -334,4 +365,8 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
         "predicted_mm": predicted,
         "remarks": [[one.code.value, one.text] for one in calibration.warnings],
     }
-    return Calibrated(calibration, found, tuple(notes))
+    return Calibrated(calibration, found, tuple(notes), judgement)
+
+
+def _points(numbers: Sequence[int]) -> str:
+    return f"point{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
+from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._sheet.calibration import KIND, calibrate_sheet, fit_corners
@@ -32,9 +33,10 @@ from smartcam.calibration.wizards._points import (
     calibrated_plane,
 )
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Step, pick
+from smartcam.calibration.wizards._steps import Step, Verdict, pick
 from smartcam.calibration.wizards._target_drawing import draw_sheet, with_ring
 from smartcam.calibration.wizards._target_steps import ask_target
+from smartcam.calibration.wizards._verdict import Judgement
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -229,7 +231,7 @@ class _SheetSource(PointSource):
     def outcome(self, plane: PlaneCalibration) -> Calibrated:
         frame = self.about["camera_frame"] or None
         found = calibrate_sheet(self._view, plane, camera=self._camera, camera_frame=frame)
-        _, figures, lines = calibrated_plane(plane)
+        _, figures, lines, judgement = calibrated_plane(plane)
         seen, predicted = len(self._view.ids), None
         notes = [*lines, f"{seen} points seen, {found.rms:.2g} px beside their plane"]
         if plane.touch_sigma is not None:
@@ -243,7 +245,11 @@ class _SheetSource(PointSource):
         notes += [f"{one.code}: {one.text}" for one in found.remarks]
         remarks = [[one.code.value, one.text] for one in found.warnings]
         more = {"predicted_mm": predicted, "seen": seen, "rms_px": found.rms, "remarks": remarks}
-        return Calibrated(found, figures | more, tuple(notes))
+        if any(one.code == Code.POOR_FIT for one in found.remarks):
+            lens = "another lens" if found.camera else "a lens: --lens"
+            said = Verdict("poor", f"Not good enough: the picture wants {lens}, or a flat sheet")
+            judgement, more["good_for_mm"] = Judgement(said, option="more"), None
+        return Calibrated(found, figures | more, tuple(notes), judgement)
 
 
 def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:

@@ -89,6 +89,20 @@ function answers() {
   return found;
 }
 
+// a line of what came out; a warning begins with its code
+function note(text) {
+  const [, code, rest] = /^([A-Z][A-Z_]+): (.*)$/s.exec(text) ?? [];
+  return code ? make("li", { class: "warning" }, make("b", {}, "Warning"), ` ${rest} `, make("code", {}, code)) : make("li", {}, text);
+}
+
+const MARKS = { good: "\u2713", poor: "\u2717", unknown: "?" };
+
+function showVerdict(verdict) {
+  $("verdict").hidden = !verdict;
+  $("verdict").className = verdict?.level ?? "";
+  $("verdict").textContent = verdict ? `${MARKS[verdict.level]} ${verdict.text}` : "";
+}
+
 function show(next, given) {
   const moved = !view || view.token !== next.token;
   view = next;
@@ -101,7 +115,8 @@ function show(next, given) {
   $("title").textContent = asking ? view.title : view.type === "result" ? "Done" : "Aborted";
   $("description").textContent = asking ? view.description
     : view.type === "abort" ? "What was measured stands in the journal." : "";
-  $("notes").replaceChildren(...(view.notes ?? []).map((note) => make("li", {}, note)));
+  showVerdict(view.verdict);
+  $("notes").replaceChildren(...(view.notes ?? []).map(note));
   $("base").textContent = view.errors.base ?? "";
   $("result").replaceChildren(...Object.entries(view.result ?? {}).flatMap(([name, value]) =>
     [make("dt", {}, name), make("dd", {}, typeof value === "string" ? value : JSON.stringify(value))]));
