@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.calibrate_terminal import drive
+from smartcam._cli.calibrate_terminal import drive, listing_text
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
@@ -18,7 +18,7 @@ from smartcam.exceptions import CalibrationError, ConfigurationError, Unsupporte
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Mapping
+    from collections.abc import Mapping
 
     from smartcam.calibration._files.directory import Folder
     from smartcam.calibration._lens.model import CameraModel
@@ -83,6 +83,12 @@ MAX_DESCRIPTION = 65_536
     show_default=True,
     help="Where calibrations and journals stand; made if need be.",
 )
+@click.option(
+    "--list",
+    "listed",
+    is_flag=True,
+    help="List the calibrations of the folder: date, error, last check; nothing else.",
+)
 @page_options("Serve a page instead of asking here, until Ctrl-C; its address goes to stdout.")
 @click.option("--fresh", is_flag=True, help="Begin anew, also where one was broken off.")
 @click.option("--feature", metavar="ID", help="Only localizations of this feature are marks.")
@@ -108,12 +114,16 @@ async def calibrate(
     lens: str | None,
     check: str | None,
     folder: str,
+    listed: bool,
     fresh: bool,
     feature: str | None,
     web: PageOptions,
     options: Options,
 ) -> None:
     """Calibrate a camera against a robot."""
+    if listed:
+        _list(folder, options)
+        return
     if called is not None and check is not None:
         raise click.UsageError("--check names the calibration: no --name beside it")
     if wizard is not None and check is not None:
@@ -126,8 +136,10 @@ async def calibrate(
     from smartcam.calibration.wizards._verification import WIZARD
 
     sources = _Sources(options, url, pictures, target, lens)
-    parameters = {} if feature is None else {"feature": feature}
     started = WIZARD if check is not None else wizard or "plane"
+    parameters: dict[str, Any] = {} if feature is None else {"feature": feature}
+    if target is not None and started in {"sheet", "hand-eye"}:
+        parameters["target"] = sources.described
     named = next(one for one in (check, called, started) if one is not None)
     try:
         service = _service(folder, sources)
@@ -143,6 +155,20 @@ async def calibrate(
             service.close()
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
+
+
+def _list(path: str, options: Options) -> None:
+    from smartcam.calibration._files.directory import Folder
+    from smartcam.calibration.wizards._listing import listing
+
+    if not Path(path).is_dir():
+        raise ConfigurationError(f"--folder {path}: no such folder")
+    rows = listing(Folder(path))
+    if options.as_json:
+        for row in rows:
+            options.show(row, "")
+    else:
+        click.echo(listing_text(rows) if rows else f"no calibrations in {path}")
 
 
 def _exit(view: Mapping[str, Any]) -> None:
@@ -181,6 +207,13 @@ class _Sources:
     target: str | None
     lens: str | None
 
+    @property
+    def described(self) -> dict[str, Any]:
+        """What is on the sheet, as it is described."""
+        from smartcam.calibration._targets import target_to_data
+
+        return target_to_data(_read_target(str(self.target)))
+
     def wizards(self, folder: Folder) -> list[Wizard]:
         """Return the wizards that can work with what there is; the first is the page's default.
 
@@ -192,11 +225,21 @@ class _Sources:
         from smartcam.calibration.wizards._verification import drift_wizard
 
         found: list[Wizard] = []
+        connect: dict[str, Any] | None = None
         if self.url is not None:
             with self.options.camera(self.url):  # an address or option that cannot work
                 y_down = self.options.y_down
+            connect = {"url": self.url} | {
+                name: getattr(self.options, name)
+                for name in ("application", "interpret_as", "y_down")
+            }
             found = [
-                plane_wizard(localize=self.localize, save_to=folder.calibration, y_down=y_down),
+                plane_wizard(
+                    localize=self.localize,
+                    save_to=folder.calibration,
+                    y_down=y_down,
+                    connect=connect,
+                ),
                 drift_wizard(
                     localize=self.localize,
                     find=folder.find,
@@ -206,17 +249,13 @@ class _Sources:
             ]
         target = None if self.target is None else _read_target(self.target)
         lens = None if self.lens is None else _read_lens(self.lens)
-        take_picture = self._taking()
-        for make in (sheet_wizard, hand_eye_wizard):
-            found.append(
-                make(
-                    take_picture=take_picture,
-                    save_to=folder.calibration,
-                    suggested=target,
-                    camera=lens,
-                )
-            )
-        return found
+        pictures: dict[str, Any] = {
+            **self._taking(),
+            "save_to": folder.calibration,
+            "suggested": target,
+            "camera": lens,
+        }
+        return [*found, sheet_wizard(**pictures, connect=connect), hand_eye_wizard(**pictures)]
 
     async def localize(self) -> list[Localization]:
         options = self.options
@@ -231,12 +270,14 @@ class _Sources:
             )
         return found
 
-    def _taking(self) -> Callable[[], Coroutine[Any, Any, Any]]:
+    def _taking(self) -> dict[str, Any]:
+        """Return what takes pictures, and which ones are waited for."""
         from smartcam.calibration.wizards._pictures import PictureFolder
 
         if self.pictures is None:
-            return self.take_picture
-        return PictureFolder(self.pictures).take
+            return {"take_picture": self.take_picture}
+        folder = PictureFolder(self.pictures)
+        return {"take_picture": folder.take, "awaited": folder.awaited}
 
     async def take_picture(self) -> Any:
         from smartcam.calibration.wizards._pictures import decode_picture

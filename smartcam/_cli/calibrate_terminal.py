@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
+from smartcam._cli.texts import table_text
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Mapping, Sequence
 
     from smartcam._cli.options import Options
     from smartcam.calibration.wizards._sequence import WizardSession
@@ -207,9 +208,17 @@ def _errors_text(view: Mapping[str, Any]) -> str:
 def _end_text(view: Mapping[str, Any]) -> str:
     if view["type"] == "abort":
         return "\naborted; what was measured stands in the journal"
-    result = view["result"].items()
-    rows = [f"  {name}: {_result_text(value)}" for name, value in result if name != "remarks"]
+    result = dict(view["result"])
+    use, remarks = result.pop("use", {}), result.pop("remarks", [])
+    rows = [f"  {name}: {_result_text(value)}" for name, value in result.items()]
+    for one in remarks:
+        rows += _note_lines(one if isinstance(one, str) else ": ".join(one))
+    for name, text in use.items():
+        rows += ["", _USES[name], "", text.rstrip("\n")]
     return "\n".join(["", "done", *_verdict_lines(view), *rows])
+
+
+_USES = {"command": "On the command line:", "python": "In Python:"}
 
 
 def _result_text(value: Any) -> str:
@@ -218,6 +227,25 @@ def _result_text(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else "-" if value is None else str(value)
+
+
+def listing_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table of a folder's calibrations."""
+    head = ("name", "kind", "date (UTC)", "error", "last check")
+    return table_text(head, [_listed(row) for row in rows])
+
+
+def _listed(row: Mapping[str, Any]) -> tuple[str, ...]:
+    if row["problem"] is not None:
+        return row["name"], "-", "-", "-", f"cannot be read: {row['problem']}"
+    error = "not known" if row["held_out_mm"] is None else f"{row['held_out_mm']:.2f} mm rms"
+    said = "stale" if row["stale"] else "still true"
+    check = "none" if row["checked_at"] is None else f"{_minute(row['checked_at'])}: {said}"
+    return row["name"], row["kind"], _minute(row["written_at"]), error, check
+
+
+def _minute(at: str) -> str:
+    return at[:16].replace("T", " ")
 
 
 # ---------------------------------------------------------------------- standard input

@@ -159,6 +159,12 @@ def _state(service: CalibrationService, _body: object) -> object:
     return {"calibrations": service.names, "wizards": service.wizards, "name": service.name}
 
 
+@_call("GET", "/listing")
+def _listing(service: CalibrationService, _body: object) -> object:
+    """A row for each calibration: of when it is, its error, its last check."""
+    return {"listing": service.listing}
+
+
 @_call("POST", "/start", body=_StartBody, sample='{"name": "table"}')
 def _start(service: CalibrationService, body: _StartBody) -> object:
     """Start a wizard under a name, or go on with the one that was broken off; answers its step.

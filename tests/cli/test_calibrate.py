@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shlex
 import signal
+import subprocess
+import sys
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -96,6 +100,29 @@ def test_calibrate_in_the_terminal_asks_and_shows_errors(url: str, tmp_path: Pat
     assert "  file: plane.json\n" in done.out
 
 
+def test_calibrate_ends_with_lines_that_work_as_printed(url: str, tmp_path: Path) -> None:
+    folder = tmp_path / "two words"
+    about = ["", "", "cell", "", "", "m", "", "0,2"]
+    typed = [str(value) for one in TOUCHES for value in one.values()]
+    lines = [*about, "", *[""] * 7, *typed, "", "", ""]
+    done = calibrating(url, folder, lines, "--name", "table").done()
+    _, end = done.out.split("\ndone\n")
+    assert f"  path: {folder / 'table.json'}\n" in end
+    head, command, python = re.split(r"\n\nOn the command line:\n\n|\n\nIn Python:\n\n", end)
+    assert "Good for " in head
+    program, *words = shlex.split(command)
+    assert program == "smartcam"
+    shown = run(*words).done().out
+    assert [line.split()[0] for line in shown.splitlines()[2:]] == list(PIECES)
+    assert "cell" in words
+    told = subprocess.run(  # noqa: S603 - our own interpreter
+        [sys.executable, "-c", python], capture_output=True, text=True, check=True, timeout=PATIENCE
+    ).stdout
+    assert [line.split()[0] for line in told.splitlines()] == list(PIECES)
+    x = float(re.findall(r"Position\(x=([-\d.e]+)", told)[0])
+    assert x == pytest.approx(touch(next(iter(PIECES)))[0], abs=0.001)
+
+
 def test_calibrate_y_down_is_kept_and_wanted_by_the_check(url: str, tmp_path: Path) -> None:
     lines = as_lines({**ABOUT, "side": "unknown"}, {}, {}, *TOUCHES, {}, {})
     calibrating(url, tmp_path, lines, "--json", "--y-down").done()
@@ -146,7 +173,8 @@ def test_calibrate_check_in_the_terminal_shows_the_verdict(url: str, tmp_path: P
     done = calibrating(url, tmp_path, lines, "--check", "plane").done()
     assert "1. Is plane still true?  (:abort)" in done.out
     assert ". plane still holds  (:undo, :abort)" in done.out
-    assert "\ndone\nStill true: 0.0 mm rms off\n  name: plane\n  stale: no\n" in done.out
+    assert "\ndone\nStill true: 0." in done.out
+    assert " mm rms off\n  name: plane\n  stale: no\n  touches: 1\n" in done.out
 
 
 def test_calibrate_check_of_no_calibration_says_so_and_leaves_nothing(tmp_path: Path) -> None:

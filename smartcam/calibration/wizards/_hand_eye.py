@@ -22,12 +22,13 @@ from smartcam.calibration._hand_eye.closed_forms import LEAST_POSES
 from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
-from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT
+from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT, how_to_take
 from smartcam.calibration.wizards._points import Calibrated, ask_to_save, review_step
 from smartcam.calibration.wizards._sequence import Wizard, ask
 from smartcam.calibration.wizards._steps import Number, Option, Step, pick
 from smartcam.calibration.wizards._target_drawing import draw
 from smartcam.calibration.wizards._target_steps import ask_target
+from smartcam.calibration.wizards._usage import usage
 from smartcam.calibration.wizards._verdict import VIEW_CURES, Judgement, judge, refused
 from smartcam.calibration.wizards._view_suggestions import LOOKS, outline
 from smartcam.exceptions import CalibrationError
@@ -72,15 +73,17 @@ def hand_eye_wizard(
     suggested: Target | None = None,
     read_robot: ReadFlange | None = None,
     camera: CameraModel | None = None,
+    awaited: str = "",
 ) -> Wizard:
     """Return the wizard.
 
     Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
     first step ``setup`` and ``robot`` (in whose convention poses are typed, a key of
-    :data:`~smartcam.calibration.formats._robots.ROBOTS`).
+    :data:`~smartcam.calibration.formats._robots.ROBOTS`); ``target``: a description of what is on
+    the sheet, which is not asked then.
 
-    Its result: ``name, file, method, views, held_out_mm, mean_mm, translation_error_mm,
-    rotation_error_deg, remarks``.
+    Its result: ``name, file, path, good_for_mm, method, views, held_out_mm, mean_mm,
+    translation_error_mm, rotation_error_deg, remarks``, and lines that ``use`` it.
 
     Args:
         take_picture: takes a picture; the robot stands still.
@@ -89,6 +92,8 @@ def hand_eye_wizard(
         suggested: the default of what is asked.
         read_robot: reads the pose of the flange; None: it is typed.
         camera: its lens; None: calibrated from the same views.
+        awaited: which picture ``take_picture`` waits for, for people: what
+            :attr:`PictureFolder.awaited` says; empty: it takes one.
 
     Cancellation: a picture or a pose under way is given up; a calculation ends in its thread, and
     what it finds is dropped.
@@ -96,11 +101,14 @@ def hand_eye_wizard(
 
     async def script(parameters: Mapping[str, Any]) -> Any:
         setup, robot = await _ask_setup(parameters, typed=read_robot is None)
-        there = await ask_target(suggested) if target is None else target
-        views = _Views(there, setup, take_picture, read_robot or robot, camera)
+        there = target
+        if there is None:
+            there = await ask_target(suggested, known=parameters.get("target"))
+        views = _Views(there, setup, take_picture, read_robot or robot, camera, awaited)
         calibration = await views.run()
         name = str(parameters.get("name", KIND))
-        return await ask_to_save(name, save_to, KIND, _outcome(calibration), views.preview())
+        result = await ask_to_save(name, save_to, KIND, _outcome(calibration), views.preview())
+        return {**result, "use": usage(KIND, save_to(name))}
 
     return Wizard(name=KIND, version=1, script=script)
 
@@ -141,6 +149,7 @@ class _Views:
     _take_picture: TakePicture
     _robot: ReadFlange | str
     _camera: CameraModel | None
+    _awaited: str
     _samples: list[dict[str, Any]] = field(default_factory=list)
 
     async def run(self) -> HandEyeCalibration:
@@ -180,17 +189,27 @@ class _Views:
             id=f"view-{count + 1}",
             title=f"View {count + 1}",
             description=f"{_MOVES[self._setup]}: {look}. The whole sheet must be in the image, and "
-            f"the robot must stand still.{typed}",
+            f"the robot must stand still.{typed}{how_to_take(self._awaited)}",
             button="Take a picture" if count < LEAST_POSES else "Go on",
             inputs=inputs,
-            notes=(f"{count} views so far",) if count else (),
+            notes=(self._progress(count),),
             preview=self.preview(),
+            waiting=f"Waiting for {self._awaited}" if self._awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
         sample = (await ask(step, self._sample)).outcome
         if sample:
             self._samples.append(sample)
         return bool(sample)
+
+    def _progress(self, count: int) -> str:
+        """Return how many views there are, how many are good, and how to end."""
+        end = (
+            "to end, choose to calculate"
+            if count >= LEAST_POSES
+            else f"with {LEAST_POSES} it can be calculated; to end before, abort"
+        )
+        return f"{count} of {ADVISED_VIEWS} views, {MOST_VIEWS} at most; {end}"
 
     async def _sample(self, answers: Answers) -> dict[str, Any]:
         """Take a picture and read the robot, if that is wanted."""

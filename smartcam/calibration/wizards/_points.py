@@ -23,6 +23,7 @@ from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, pick
 from smartcam.calibration.wizards._touch_previews import compared, plain
 from smartcam.calibration.wizards._touches import SIDE, SIGMA, UNIT, Touch, Touches
+from smartcam.calibration.wizards._usage import usage
 from smartcam.calibration.wizards._verdict import Judgement, judge, refused
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
@@ -63,7 +64,7 @@ class PointSource(Touches, ABC):
         :func:`about_step`.
 
     Attributes:
-        camera_unit: unit of the camera's positions.
+        connect: what :func:`smartcam.connect` takes for the camera; None: it is not known.
         camera_frame: name of the only frame that localizations may come in; None: any.
         y_down: whether the camera's y axis was turned up; None: not known.
     """
@@ -81,7 +82,7 @@ class PointSource(Touches, ABC):
     SHOWN: ClassVar[Mapping[str, str]] = {}
     """Further entries of a calibration's preview."""
 
-    camera_unit: str
+    connect: Mapping[str, Any] | None = None
     camera_frame: str | None = None
     y_down: bool | None = None
 
@@ -104,6 +105,10 @@ class PointSource(Touches, ABC):
     @abstractmethod
     def sample(self, touch: Touch) -> dict[str, Any]:
         """Return the entries of a touch in a file's samples, JSON-able."""
+
+    @abstractmethod
+    def example(self) -> tuple[float, float]:
+        """Return a point that the camera saw, in its unit."""
 
     @abstractmethod
     def outcome(self, plane: PlaneCalibration) -> Calibrated:
@@ -129,7 +134,11 @@ class PointSource(Touches, ABC):
             ],
         }
         preview = self._preview(plane)
-        return await ask_to_save(name, save_to, self.KIND, outcome, preview, context)
+        result = await ask_to_save(name, save_to, self.KIND, outcome, preview, context)
+        frame = {} if self.camera_frame is None else {"name": self.camera_frame}
+        connect = None if self.connect is None else {**self.connect, **frame}
+        use = usage(self.KIND, save_to(name), connect, self.example())
+        return {**result, "use": use}
 
     async def _touch_rays(self) -> PlaneCalibration:
         origin, scale = await self.ray_origin()
@@ -231,7 +240,7 @@ class PointSource(Touches, ABC):
     def _preview(self, plane: PlaneCalibration | None) -> dict[str, Any]:
         """Return the data from which a picture of the touches is drawn."""
         if plane is None:
-            return plain(self.touches)
+            return {**plain(self.touches), "choices": self._choices()}
         found = compared(
             plane,
             self.touches,
@@ -241,7 +250,15 @@ class PointSource(Touches, ABC):
             worst=plane.worst,
             left_out=plane.outliers,
         )
-        return {**found, **self.SHOWN}
+        return {**found, **self.SHOWN, "choices": self._choices(found["points"])}
+
+    def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
+        """Return the touches as choices of a point, where they are drawn."""
+        places = [one["at"][:2] for one in points] or [[t.mark.x, t.mark.y] for t in self.touches]
+        return [
+            {"at": place, "label": str(number), "answers": {"point": number}}
+            for number, place in enumerate(places, 1)
+        ]
 
 
 def about_step(
@@ -323,7 +340,7 @@ async def ask_to_save(
         preview=preview,
     )
     await ask(step, save)
-    return {"name": name, "file": file.name, **outcome.figures}
+    return {"name": name, "file": file.name, "path": str(file), **outcome.figures}
 
 
 def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
@@ -348,13 +365,7 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
     if predicted is not None:
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
     notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
-    without = f" without {_points(left_out)}" if left_out else ""
-    judgement = judge(
-        None if held_out is None else 1e3 * held_out,
-        [one for one in calibration.warnings if not (left_out and one.code == Code.OUTLIER)],
-        worst=1 + calibration.worst,
-        without=without,
-    )
+    judgement = judge_plane(calibration, predicted)
     found = {
         **judgement.figures,
         "model": calibration.model,
@@ -368,5 +379,16 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
     return Calibrated(calibration, found, tuple(notes), judgement)
 
 
-def _points(numbers: Sequence[int]) -> str:
-    return f"point{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
+def judge_plane(
+    calibration: PlaneCalibration, predicted: float | None, where: str = ""
+) -> Judgement:
+    """Return what a plane's calibration is worth, given its predicted error in mm."""
+    held_out, out = calibration.held_out_error, [1 + index for index in calibration.outliers]
+    without = f" without point{'s' * (len(out) > 1)} {', '.join(map(str, out))}" if out else ""
+    return judge(
+        None if held_out is None else 1e3 * held_out,
+        [one for one in calibration.warnings if not (out and one.code == Code.OUTLIER)],
+        worst=1 + calibration.worst,
+        predicted=predicted,
+        where=f"{where}{without}",
+    )

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _WITHIN: Final = 2.0
 """Twice an rms error holds 95 of 100 errors or more, in one direction as in three."""
 
+_LOOK: Final = ("see the warning", "more")
 _AGAIN: Final = "touch point {number} again"
 
 CURES: Final[Mapping[Code, tuple[str, str]]] = {
@@ -64,15 +65,17 @@ def judge(
     wrong: Iterable[tuple[Code, str]],
     *,
     worst: int,
+    predicted: float | None = None,
     cures: Mapping[Code, tuple[str, str]] = CURES,
     more: str = "touch more points",
-    without: str = "",
+    where: str = "",
 ) -> Judgement:
     """Return what a calibration is worth.
 
     ``held_out``: rms error at points that were left out, mm. ``wrong``: warnings; those that have
     no cure do not count. ``worst``: number of the point to blame where a warning names none.
-    ``more``: what tells how good it is. ``without``: what was left out, for people.
+    ``predicted``: rms error that noise leads to, mm; what is promised is not below it. ``more``:
+    what tells how good it is. ``where``: of what the promise is, for people.
     """
     texts = dict(reversed(list(wrong)))
     for code in cures:
@@ -80,13 +83,13 @@ def judge(
             return refused(code, texts[code], worst=worst, cures=cures)
     if held_out is None:
         return Judgement(Verdict("unknown", f"Not known how good: {more}"), option="more")
-    good_for = _rounded_up(_WITHIN * held_out)
-    text = f"Good for {good_for:g} mm{without}: 95 of 100 new points lie within it"
+    good_for = _rounded_up(_WITHIN * max(held_out, predicted or 0.0))
+    text = f"Good for {good_for:g} mm{where}: 95 of 100 new points lie within it"
     return Judgement(Verdict("good", text), good_for)
 
 
 def refused(
-    code: Code,
+    code: str,
     text: str,
     *,
     worst: int = 1,
@@ -95,7 +98,7 @@ def refused(
     """Return that it is not good, and what to do about it. ``text`` says what is wrong."""
     named = re.search(r"\b(?:point|view) (\d+)", text)
     number = int(named[1]) if named else worst
-    cure, option = cures.get(code, ("see the warning", "more"))
+    cure, option = next((how for one, how in cures.items() if one == code), _LOOK)
     said = Verdict("poor", f"Not good enough: {cure.format(number=number)}")
     return Judgement(said, option=option, number=number)
 
@@ -103,4 +106,5 @@ def refused(
 def _rounded_up(value: float) -> float:
     """Return it with one decimal, of less than 0.1 with one digit; what is rounded is larger."""
     digits = 1 if value > 0.1 else -math.floor(math.log10(max(value, 0.001)))
-    return max(math.ceil(round(value * 10**digits, 6)), 1) / 10**digits
+    factor = 10.0**digits
+    return max(math.ceil(round(value * factor, 6)), 1) / factor

@@ -167,6 +167,7 @@ async def _loaded(
         "data": calibration.to_data(),
         "written_at": document.written_at,
         "tool": str(document.context.get("tool", "")),
+        "camera_unit": str(document.context.get("camera_unit", "m")),
     }
 
 
@@ -183,6 +184,7 @@ class _DriftCheck(Touches):
     ) -> None:
         super().__init__(about, read_robot)
         self.name = name
+        self.camera_unit = about.outcome.get("camera_unit", "m")
         self._camera = camera
         self._record_to = record_to
         found = PlaneCalibration.from_data(about.outcome["data"])

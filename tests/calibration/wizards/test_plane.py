@@ -44,7 +44,7 @@ async def touch_all(session: WizardSession, bench: Bench) -> dict[str, Any]:
         view = await say(session)
     for x, y in bench.marks:
         assert view["step"].startswith("touch-")
-        assert f"x {x:.6g}, y {y:.6g}" in view["description"]
+        assert f"x {1e3 * x:.1f} mm, y {1e3 * y:.1f} mm" in view["description"]
         view = await say(session, bench.touch_mm(x, y))
     return view
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 FIELD = np.array([(0.15 * i, 0.12 * j) for i in range(3) for j in range(3)])
+SHIFT = np.array([0.4, -0.1])
 
 
 @pytest.mark.parametrize(
@@ -35,6 +36,12 @@ def test_verdict_names_twice_the_held_out_error_rounded_up(
     judged = judge(held_out, [(Code.SIDE_UNKNOWN, "not checked")], worst=1)
     assert (judged.good_for, judged.option) == (good_for, "accept")
     assert (judged.verdict.level, judged.verdict.text[: len(text)]) == ("good", text)
+
+
+def test_verdict_promises_no_less_than_the_noise_leads_to() -> None:
+    judged = judge(0.01, [], worst=1, predicted=0.16, where=" without point 3")
+    assert judged.good_for == 0.4
+    assert judged.verdict.text.startswith("Good for 0.4 mm without point 3: 95 of 100")
 
 
 def test_verdict_without_a_held_out_error_is_not_known() -> None:
@@ -71,12 +78,12 @@ def test_verdict_holds_for_new_points() -> None:
     inside: list[float] = []
     new = random.uniform((0.0, 0.0), (0.3, 0.24), (200, 2))
     for _ in range(60):
-        touches = np.column_stack([FIELD + (0.4, -0.1), np.zeros(9)])
+        touches = np.column_stack([FIELD + SHIFT, np.zeros(9)])
         touches += random.normal(0.0, 0.0002, touches.shape)
         found = fit_plane(FIELD, touches, touch_sigma=0.0002, tool_z=(0, 0, -1))
         judged = calibrated_plane(found).judgement
         if judged.good_for is not None:
-            true = np.column_stack([new + (0.4, -0.1), np.zeros(200)])
+            true = np.column_stack([new + SHIFT, np.zeros(200)])
             off = true + random.normal(0.0, 0.0002, true.shape) - found.transform(new)
             inside.append(float((np.linalg.norm(off, axis=1) < 1e-3 * judged.good_for).mean()))
     assert len(inside) > 50
