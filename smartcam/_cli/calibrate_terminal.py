@@ -95,7 +95,8 @@ async def _from_prompts(
             if isinstance(typed, _Command):
                 return await _do(session, typed.name, token)
         if step.waiting:
-            click.echo(f"... {step.waiting}")
+            text = f"{step.waiting}; Ctrl-C ends it, and the same command goes on"
+            click.echo("\n".join(textwrap.wrap(text, WIDTH)))
         view = await session.submit(token, answers)
         wanted = [name for name in view["errors"] if name in answers] or list(answers)
         if view["token"] == token:
@@ -118,7 +119,8 @@ async def _answer(
         try:
             return one.checked(_value(schema, text))
         except ValueError as exc:
-            click.echo(f"! {one.label}: {exc}")
+            wrong = f"{text!r}: expected yes or no" if schema["type"] == "boolean" else exc
+            click.echo(f"! {one.label}: {wrong}")
 
 
 async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Command:
@@ -139,7 +141,7 @@ async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Comm
 
 def _prompt(schema: Mapping[str, Any], default: Any) -> str:
     unit = f", {schema['x-unit']}" if "x-unit" in schema else ""
-    shown = "" if default is None else f" [{_default_text(default)}]"
+    shown = "" if default in {None, ""} else f" [{_default_text(default)}]"
     rows = [f"    {one['const']}: {one['title']}\n" for one in schema.get("oneOf", ())]
     head = f"{schema['title']}{unit}"
     return f"{head}\n{''.join(rows)}  answer{shown}" if rows else f"{head}{shown}"

@@ -145,10 +145,10 @@ def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
     assert [line.get("step") for line in done.lines[-3:]] == ["picture", "picture", None]
     assert "within 0.3 s" in done.lines[-2]["errors"]["base"]
     asked = done.lines[2]
-    assert f"the next picture that comes into {tmp_path / 'ftp'}, a file" in asked["description"]
+    assert f"the next file that comes into {tmp_path / 'ftp'} counts" in asked["description"]
     assert asked["notes"] == ["picture 1 of 1; to end without it, abort"]
-    assert asked["waiting"].startswith("Waiting for the next picture that comes into ")
-    assert "for 0.3 s; what is there already does not count" in asked["waiting"]
+    assert asked["waiting"].startswith("Waiting: the next file that comes into ")
+    assert "what is there already does not. It is waited for 0.3 s" in asked["waiting"]
 
 
 def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(

@@ -194,7 +194,7 @@ class _Views:
             inputs=inputs,
             notes=(self._progress(count),),
             preview=self.preview(),
-            waiting=f"Waiting for {self._awaited}" if self._awaited else "",
+            waiting=f"Waiting: {self._awaited}" if self._awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
         sample = (await ask(step, self._sample)).outcome

@@ -75,9 +75,7 @@ def how_to_take(awaited: str) -> str:
     """Return how a picture that is waited for comes, behind a step's description."""
     if not awaited:
         return ""
-    return (
-        f" Press the button first, then have the camera take its picture: what counts is {awaited}."
-    )
+    return f" Go on here first, then have the camera take its picture: {awaited}."
 
 
 class PictureFolder:
@@ -104,9 +102,9 @@ class PictureFolder:
     def awaited(self) -> str:
         """Which picture :meth:`take` waits for, for people."""
         return (
-            f"the next picture that comes into {self.path}, a file that ends in "
-            f"{', '.join(sorted(SUFFIXES))}, for {self.deadline:g} s; what is there already does "
-            "not count"
+            f"the next file that comes into {self.path} counts, one that ends in "
+            f"{', '.join(sorted(SUFFIXES))}; what is there already does not. It is waited for "
+            f"{self.deadline:g} s"
         )
 
     async def take(self) -> NDArray[Any]:

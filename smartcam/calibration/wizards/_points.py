@@ -9,6 +9,7 @@ Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -203,9 +204,17 @@ class PointSource(Touches, ABC):
         try:
             plane = self.fit(robust=robust and len(self.touches) >= LEAST_POINTS)
         except CalibrationError as exc:
-            return None, (f"{exc.code}: {exc}",), refused(exc.code, str(exc))
+            return None, (f"{exc.code}: {exc}",), self._blamed(exc)
         _, _, notes, judgement = self.outcome(plane)
         return plane, notes, judgement
+
+    def _blamed(self, error: CalibrationError) -> Judgement:
+        """Return what to do: one touch that is far off can look like another scale."""
+        if len(self.touches) >= LEAST_POINTS:
+            with contextlib.suppress(CalibrationError):
+                for index in self.fit(robust=True).outliers:
+                    return refused(Code.OUTLIER, f"point {1 + index}")
+        return refused(error.code or "", str(error))
 
     def _review(
         self,

@@ -146,7 +146,7 @@ class _SheetSource(PointSource):
             f"hide it, and nothing must move until all is touched.{how_to_take(awaited)}",
             button="Wait for the picture" if awaited else "Take a picture",
             notes=("picture 1 of 1; to end without it, abort",) if awaited else (),
-            waiting=f"Waiting for {awaited}" if awaited else "",
+            waiting=f"Waiting: {awaited}" if awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
         found = (await ask(step, look)).outcome
@@ -202,7 +202,7 @@ class _SheetSource(PointSource):
             title=title,
             description=f"Move the tip of the tool onto point {column + 1} of row {row + 1}, which "
             "has a ring in the picture, with the tool held as at every touch; or onto another one, "
-            "and say which, or click it. The origin is point 1 of row 1, points count along ray A, "
+            "and say which. The origin is point 1 of row 1, points count along ray A, "
             "rows along ray B.",
             inputs=(
                 pick("column", "Point of its row, counted along ray A", columns, column + 1),

@@ -111,7 +111,7 @@ function shown(value, unit) {
   if (Array.isArray(value)) return value.map((one) => shown(one, unit)).join(", ") || "none";
   if (value === null) return "not known";
   if (typeof value === "boolean") return value ? "yes" : "no";
-  const text = typeof value !== "number" || Number.isInteger(value) && !unit ? `${value}` : `${Number(value.toPrecision(3))}`;
+  const text = typeof value !== "number" || Number.isInteger(value) && !unit ? `${value}` : `${Number(value.toFixed(3))}`;
   return unit ? `${text} ${unit}` : text;
 }
 
@@ -406,7 +406,7 @@ function draw(preview) {
     label(next[0], next[1], "next");
   }
   for (const one of choices) {
-    if (points.length === 0) label(...one.at, one.label);
+    if (points.length === 0) label(one.at[0] + 2 * dot, one.at[1] + 2 * dot, one.label);
     parts.push(choice(one, [one.at[0], -one.at[1]], 3 * dot));
   }
   plot.replaceChildren(...parts);

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -403,3 +406,70 @@ async def test_wizard_resumed_after_each_step_gives_the_same_calibration(tmp_pat
     assert session.result["points"] == 9
     assert bench.pictures == 1
     session.close()
+
+
+async def test_wrong_touch_that_looks_like_another_scale_is_blamed(tmp_path: Path) -> None:
+    bench = Bench(marks=[GRID[n] for n in (0, 2, 3, 5, 6, 8)])
+    session = begin(tmp_path, bench)
+    await say(session, {"touch_sigma": 0.2})
+    await say(session)
+    view = await say(session)
+    for number, mark in enumerate(bench.marks, 1):
+        answer = bench.touch_mm(*mark)
+        view = await say(session, {**answer, "x": answer["x"] + 20.0 * (number == 2)})
+    assert view["notes"][0].startswith("SCALE_MISMATCH: ")
+    assert view["verdict"]["text"] == "Not good enough: touch point 2 again"
+    assert view["defaults"] == {"next": "redo", "point": 2}
+    session.close()
+
+
+async def test_marks_can_be_chosen_where_the_picture_shows_them(tmp_path: Path) -> None:
+    session = begin(tmp_path, Bench(marks=GRID[:3]))
+    await say(session)
+    view = await say(session)
+    titles = [one["title"] for one in view["schema"]["properties"].values()]
+    assert titles[1] == "2: mark at x 150.0 mm, y 40.0 mm"
+    assert view["preview"]["choices"] == [
+        {"at": list(mark), "label": str(number), "answers": {f"mark_{number}": True}}
+        for number, mark in enumerate(GRID[:3], 1)
+    ]
+    session.close()
+
+
+async def test_origin_mark_of_a_camera_in_pixels_is_shown_in_pixels(tmp_path: Path) -> None:
+    session = begin(tmp_path, Bench(marks=[(320.25, 240.0), (10.0, 7.0)]), method="rays")
+    await say(session, {"camera_unit": "px"})
+    await say(session, {"pixel": 0.5})
+    view = await say(session)
+    (marks,) = [one["oneOf"] for one in view["schema"]["properties"].values()]
+    assert marks[0]["title"] == "mark at x 320.2 px, y 240.0 px"
+    assert [one["answers"] for one in view["preview"]["choices"]] == [{"mark": "1"}, {"mark": "2"}]
+    session.close()
+
+
+def printed(python: str) -> list[float]:
+    """Return the numbers that lines of Python print."""
+    out = subprocess.run(  # noqa: S603 - our own interpreter
+        [sys.executable, "-c", python], capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+    return [float(one) for one in out.strip("[]\n").split()]
+
+
+async def test_end_has_the_file_the_verdict_the_picture_and_lines_that_work(
+    tmp_path: Path,
+) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    await say(session, {"touch_sigma": 0.2})
+    review = await touch_all(session, bench)
+    await say(session)
+    view = await say(session)
+    result = view["result"]
+    assert result["path"] == str(tmp_path / "table.json")
+    assert view["verdict"] == review["verdict"]
+    assert view["verdict"]["text"].startswith(f"Good for {result['good_for_mm']:g} mm")
+    assert view["preview"] == review["preview"]
+    program, *_, last = shlex.split(result["use"]["command"])
+    assert (program, last) == ("smartcam", str(tmp_path))
+    told = printed(result["use"]["python"])
+    assert told == pytest.approx(where(*GRID[0]), abs=0.001)
