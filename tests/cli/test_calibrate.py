@@ -177,6 +177,29 @@ def test_calibrate_check_in_the_terminal_shows_the_verdict(url: str, tmp_path: P
     assert " mm rms off\n  name: plane\n  stale: no\n  touches: 1\n" in done.out
 
 
+def test_calibrate_lists_calibrations_in_a_table(url: str, tmp_path: Path) -> None:
+    saved(tmp_path)
+    (tmp_path / "a.json").write_text("{")
+    lines = as_lines({"unit": "m"}, {}, {}, *TOUCHES, {})
+    calibrating(url, tmp_path, lines, "--json", "--check", "plane").done()
+    listed = run("calibrate", "--list", "--folder", str(tmp_path)).done()
+    head, broken, row = listed.out.splitlines()
+    assert re.split(r" {2,}", head.strip()) == ["name", "kind", "date (UTC)", "error", "last check"]
+    assert [one.strip() for one in re.split(r" {2,}", row.strip())][:2] == ["plane", "plane"]
+    assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d  0\.00 mm rms  \d{4}-.*: still true$", row)
+    assert "cannot be read: " in broken
+    rows = run("calibrate", "--list", "--folder", str(tmp_path), "--json").done().lines
+    assert [(one["name"], one["stale"]) for one in rows] == [("a", None), ("plane", False)]
+
+
+def test_calibrate_lists_an_empty_folder_and_makes_none(tmp_path: Path) -> None:
+    listed = run("calibrate", "--list", "--folder", str(tmp_path)).done()
+    assert listed.out == f"no calibrations in {tmp_path}\n"
+    missing = tmp_path / "missing"
+    run("calibrate", "--list", "--folder", str(missing)).failed(2, "no such folder")
+    assert not missing.exists()
+
+
 def test_calibrate_check_of_no_calibration_says_so_and_leaves_nothing(tmp_path: Path) -> None:
     done = calibrating("bvs://127.0.0.1:9", tmp_path, [], "--check", "table")
     done.failed(2, "no calibration 'table'; there are none: the folder is empty")

@@ -153,11 +153,11 @@ class PictureFolder:
 
     def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
         """Say what came instead of a picture, and how many were there before."""
-        said = [f"{len(before)} are from before"] if before else []
+        said = [f"there before: {len(before)}"] if before else []
         came = sorted(self._names() - others)
         if came:
             more = f" and {len(came) - 3} more" if len(came) > 3 else ""
-            said.insert(0, f"{', '.join(came[:3])}{more} came and is none")
+            said.insert(0, f"came, but no picture: {', '.join(came[:3])}{more}")
         return f" ({'; '.join(said)})" if said else ""
 
     def _look(self) -> dict[str, tuple[int, int]]:

@@ -101,7 +101,7 @@ async def test_folder_waits_for_a_file_that_grows(
 async def test_folder_where_none_comes_says_so_in_time(tmp_path: Path) -> None:
     (tmp_path / "old.png").write_bytes(encoded())
     wanted = "expected a file that ends in one of .bmp, .jpeg"
-    with refused("NO_PICTURE", f"within 0.3 s (1 are from before); {wanted}"):
+    with refused("NO_PICTURE", f"within 0.3 s (there before: 1); {wanted}"):
         await PictureFolder(tmp_path, deadline=0.3).take()
 
 
@@ -112,7 +112,7 @@ async def test_folder_where_other_files_come_names_them(tmp_path: Path) -> None:
     await asyncio.sleep(0.1)
     for name in ("a.raw", "b.raw", "c.raw", "d.raw"):
         (tmp_path / name).write_bytes(b"no picture")
-    with refused("NO_PICTURE", "(a.raw, b.raw, c.raw and 1 more came and is none); expected"):
+    with refused("NO_PICTURE", "(came, but no picture: a.raw, b.raw, c.raw and 1 more); expected"):
         await waiting
 
 
