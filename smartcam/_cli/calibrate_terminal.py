@@ -70,7 +70,7 @@ async def _from_json(session: WizardSession, line: str) -> dict[str, Any]:
     return await _do(session, command, token)
 
 
-class _Command(NamedTuple):
+class _Instead(NamedTuple):
     """What was typed instead of an answer."""
 
     name: str
@@ -87,12 +87,12 @@ async def _from_prompts(
         for one in step.inputs:
             if one.name in wanted:
                 value = await _answer(one, answers, can, lines)
-                if isinstance(value, _Command):
+                if isinstance(value, _Instead):
                     return await _do(session, value.name, token)
                 answers[one.name] = value
         if not step.inputs:
             typed = await _typed(f"{step.button}: press Enter", can, lines)
-            if isinstance(typed, _Command):
+            if isinstance(typed, _Instead):
                 return await _do(session, typed.name, token)
         if step.waiting:
             text = f"{step.waiting}; Ctrl-C ends it, and the same command goes on"
@@ -106,13 +106,13 @@ async def _from_prompts(
 
 async def _answer(
     one: Input, answers: Mapping[str, Any], can: Collection[str], lines: Lines
-) -> Any | _Command:
+) -> Any | _Instead:
     """Return an answer that the step takes, or a command; a wrong one is asked for again."""
     schema = one.schema()
     prompt = _prompt(schema, answers.get(one.name))
     while True:
         text = await _typed(prompt, can, lines)
-        if isinstance(text, _Command):
+        if isinstance(text, _Instead):
             return text
         if not text and one.name in answers:
             return answers[one.name]
@@ -123,7 +123,7 @@ async def _answer(
             click.echo(f"! {one.label}: {wrong}")
 
 
-async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Command:
+async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Instead:
     """Return what is typed; a command that cannot be done now is refused, and it is asked again."""
     while True:
         click.echo(f"{prompt}: ", nl=False)
@@ -132,7 +132,7 @@ async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Comm
         if not text.startswith(":"):
             return text
         if command in can:
-            return _Command(command)
+            return _Instead(command)
         click.echo(f"! :{command}: expected one of {', '.join(f':{one}' for one in can)}")
 
 

@@ -34,7 +34,7 @@ from smartcam.calibration.wizards._points import (
     judge_plane,
 )
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Step, Verdict, pick
+from smartcam.calibration.wizards._steps import Step, StepVerdict, pick
 from smartcam.calibration.wizards._target_drawing import draw_sheet, place_in, with_ring
 from smartcam.calibration.wizards._target_steps import ask_target
 from smartcam.calibration.wizards._verdict import Judgement
@@ -272,7 +272,9 @@ class _SheetSource(PointSource):
         judgement = judge_plane(plane, predicted, " where the sheet lay")
         if any(one.code == Code.POOR_FIT for one in found.remarks):
             lens = "another lens" if found.camera else "a lens: --lens"
-            said = Verdict("poor", f"Not good enough: the picture wants {lens}, or a flat sheet")
+            said = StepVerdict(
+                "poor", f"Not good enough: the picture wants {lens}, or a flat sheet"
+            )
             judgement = Judgement(said, option="more")
         more = {"predicted_mm": predicted, "seen": seen, "rms_px": found.rms, "remarks": remarks}
         return Calibrated(found, figures | more | judgement.figures, tuple(notes), judgement)

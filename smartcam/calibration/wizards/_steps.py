@@ -189,7 +189,7 @@ def pick(name: str, label: str, count: int, default: int) -> Number:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class StepVerdict:
     """What something is worth, on top of a step that shows it.
 
     Attributes:
@@ -225,7 +225,7 @@ class Step:
     button: str = "Next"
     inputs: tuple[Input, ...] = ()
     notes: tuple[str, ...] = ()
-    verdict: Verdict | None = None
+    verdict: StepVerdict | None = None
     preview: Mapping[str, Any] | None = field(default=None, compare=False)
     waiting: str = ""
     timeout: float = 30.0

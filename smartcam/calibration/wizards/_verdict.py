@@ -7,7 +7,7 @@ import re
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from smartcam.calibration._codes import Code
-from smartcam.calibration.wizards._steps import Verdict
+from smartcam.calibration.wizards._steps import StepVerdict
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -45,7 +45,7 @@ VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
 class Judgement(NamedTuple):
     """A verdict, and what is advisable."""
 
-    verdict: Verdict
+    verdict: StepVerdict
     good_for: float | None = None  # mm, of 95 of 100 new points; None: not good, or not known
     option: str = "accept"  # the advisable one
     number: int | None = None  # the point or view that it is about, from 1
@@ -82,10 +82,10 @@ def judge(
         if code in texts:
             return refused(code, texts[code], worst=worst, cures=cures)
     if held_out is None:
-        return Judgement(Verdict("unknown", f"Not known how good: {more}"), option="more")
+        return Judgement(StepVerdict("unknown", f"Not known how good: {more}"), option="more")
     good_for = _rounded_up(_WITHIN * max(held_out, predicted or 0.0))
     text = f"Good for {good_for:g} mm{where}: 95 of 100 new points lie within it"
-    return Judgement(Verdict("good", text), good_for)
+    return Judgement(StepVerdict("good", text), good_for)
 
 
 def refused(
@@ -99,7 +99,7 @@ def refused(
     named = re.search(r"\b(?:point|view) (\d+)", text)
     number = int(named[1]) if named else worst
     cure, option = next((how for one, how in cures.items() if one == code), _LOOK)
-    said = Verdict("poor", f"Not good enough: {cure.format(number=number)}")
+    said = StepVerdict("poor", f"Not good enough: {cure.format(number=number)}")
     return Judgement(said, option=option, number=number)
 
 

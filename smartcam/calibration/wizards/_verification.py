@@ -21,7 +21,7 @@ from smartcam.calibration._plane.calibration import STALE_LEVEL, PlaneCalibratio
 from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._marks import MarkCamera
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Option, Step, Verdict
+from smartcam.calibration.wizards._steps import Option, Step, StepVerdict
 from smartcam.calibration.wizards._touch_previews import compared
 from smartcam.calibration.wizards._touches import SIGMA, UNIT, Touches
 from smartcam.exceptions import CalibrationError
@@ -249,9 +249,9 @@ class _DriftCheck(Touches):
             if stale
             else "",
             notes=tuple(_notes(figures)),
-            verdict=Verdict("poor", f"Stale: {figures['rms_mm']:.1f} mm rms off")
+            verdict=StepVerdict("poor", f"Stale: {figures['rms_mm']:.1f} mm rms off")
             if stale
-            else Verdict("good", f"Still true: {figures['rms_mm']:.1f} mm rms off"),
+            else StepVerdict("good", f"Still true: {figures['rms_mm']:.1f} mm rms off"),
             button="Go on",
             inputs=(
                 Option(
