@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import inspect
 import re
@@ -160,9 +161,9 @@ def _state(service: CalibrationService, _body: object) -> object:
 
 
 @_call("GET", "/listing")
-def _listing(service: CalibrationService, _body: object) -> object:
+async def _listing(service: CalibrationService, _body: object) -> object:
     """A row for each calibration: of when it is, its error, its last check."""
-    return {"listing": service.listing}
+    return {"listing": await asyncio.to_thread(lambda: service.listing)}
 
 
 @_call("POST", "/start", body=_StartBody, sample='{"name": "table"}')

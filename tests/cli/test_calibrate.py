@@ -7,8 +7,6 @@ import math
 import re
 import shlex
 import signal
-import subprocess
-import sys
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +18,7 @@ from smartcam._cli.calibrate import STALE, calibrate
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.emulator._scene import PIECES
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import PATIENCE, Outcome, Process
+from tests.processes import PATIENCE, Outcome, Process, printed_by
 
 YAW, OFFSET = math.radians(120.0), (0.5, -0.1, 0.02)
 
@@ -115,9 +113,7 @@ def test_calibrate_ends_with_lines_that_work_as_printed(url: str, tmp_path: Path
     shown = run(*words).done().out
     assert [line.split()[0] for line in shown.splitlines()[2:]] == list(PIECES)
     assert "cell" in words
-    told = subprocess.run(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", python], capture_output=True, text=True, check=True, timeout=PATIENCE
-    ).stdout
+    told = printed_by(python)
     assert [line.split()[0] for line in told.splitlines()] == list(PIECES)
     x = float(re.findall(r"Position\(x=([-\d.e]+)", told)[0])
     assert x == pytest.approx(touch(next(iter(PIECES)))[0], abs=0.001)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ from smartcam.calibration.formats._cameras import write_camera_info
 from smartcam.calibration.simulation._images import render
 from smartcam.emulator._insight.camera import EmulatedInSight
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import PATIENCE, Outcome, Process
+from tests.processes import Outcome, Process, printed_by
 
 pytestmark = pytest.mark.long
 
@@ -88,20 +86,13 @@ def by_a_sheet(tmp_path: Path, files: list[str], *more: str) -> Any:
                 shots += 1
 
 
-def python(text: str) -> str:
-    """Return what lines of Python print."""
-    return subprocess.run(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", text], capture_output=True, text=True, check=True, timeout=PATIENCE
-    ).stdout
-
-
 def test_calibrate_by_a_sheet_and_a_folder_gives_a_calibration(
     tmp_path: Path, files: list[str]
 ) -> None:
     view = by_a_sheet(tmp_path, files)
     assert view["result"]["file"] == "sheet.json"
     assert view["verdict"]["text"].startswith("Good for 0.")
-    printed = python(view["result"]["use"]["python"])
+    printed = printed_by(view["result"]["use"]["python"])
     assert np.allclose(np.fromstring(printed.strip("[]\n"), sep=" "), OFFSET, atol=1e-4)
     (row,) = run(*shlex.split(view["result"]["use"]["command"])[1:], "--json").done().lines
     assert (row["name"], row["kind"]) == ("sheet", "sheet")
@@ -119,7 +110,7 @@ def test_calibrate_by_a_sheet_ends_with_lines_for_the_camera_that_was_named(
         use = by_a_sheet(tmp_path, files, *options)["result"]["use"]
         (result,) = run(*shlex.split(use["command"])[1:], "--json").done().lines
         assert result["value"][0]["pose"]["header"]["frame_id"] == "robot"
-        assert "Position(x=" in python(use["python"])
+        assert "Position(x=" in printed_by(use["python"])
 
 
 def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) -> None:

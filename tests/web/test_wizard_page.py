@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import subprocess
-import sys
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,6 +24,7 @@ from smartcam.calibration.wizards._services import CalibrationService
 from smartcam.calibration.wizards._sheet import sheet_wizard
 from smartcam.exceptions import NotRunningError
 from smartcam.web._wizard import WizardSite
+from tests.processes import printed_by
 from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong
 from tests.web.sitekit import TOKEN
 from tests.web.test_wizard import MARKS, World, run_through, served
@@ -115,19 +114,11 @@ async def test_page_drives_the_wizard_to_a_calibration(page: Page, tmp_path: Pat
         assert await view.how_many("#plot .touched") == 4
         assert str(tmp_path) in await page.inner_text("#use-command")
         python = await page.inner_text("#use-python")
-        assert (await asyncio.to_thread(printed, python)).startswith("[[")
+        assert (await asyncio.to_thread(printed_by, python)).startswith("[[")
         await page.locator("#use button").last.click()
         await view.see("#use button", "Copied")
         await page.click("#again")
         await view.see("#names td", "table")
-
-
-def printed(python: str) -> str:
-    """Return what lines of Python print."""
-    done = subprocess.run(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", python], capture_output=True, text=True, check=True, timeout=60
-    )
-    return done.stdout
 
 
 async def test_page_says_what_is_wrong_in_words_and_chooses_what_mends_it(

@@ -335,13 +335,7 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
 def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     held_out = calibration.held_out_error
     remarks = [f"{one.code}: {one.text}" for one in calibration.warnings]
-    judgement = judge(
-        None if held_out is None else 1e3 * held_out,
-        [one for one in calibration.warnings if one.code != Code.TOO_FEW],
-        worst=1 + calibration.worst,
-        cures=VIEW_CURES,
-        more="take more views",
-    )
+    judgement = _judged(calibration)
     figures = {
         **judgement.figures,
         "method": calibration.method,
@@ -366,6 +360,21 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
             f"orientation to {figures['rotation_error_deg']:.2g} deg"
         )
     return Calibrated(calibration, figures, (*notes, *remarks), judgement)
+
+
+def _judged(calibration: HandEyeCalibration) -> Judgement:
+    """Return what a calibration is worth; of few views the error cannot be relied on."""
+    held_out, codes = calibration.held_out_error, {one.code for one in calibration.warnings}
+    left_out = [str(number) for number, used in enumerate(calibration.used, 1) if not used]
+    relied_on = held_out is not None and Code.TOO_FEW not in codes
+    return judge(
+        1e3 * held_out if held_out is not None and relied_on else None,
+        [one for one in calibration.warnings if not (left_out and one.code == Code.BAD_VIEW)],
+        worst=1 + calibration.worst,
+        cures=VIEW_CURES,
+        more="take more views",
+        where=f" without view{'s' * (len(left_out) > 1)} {', '.join(left_out)}" if left_out else "",
+    )
 
 
 def _known(factor: float, value: float) -> float | None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final
 from smartcam.calibration._files.load import KINDS
 from smartcam.calibration._files.store import read_document
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
-from smartcam.calibration._plane.calibration import PlaneCalibration
 from smartcam.calibration._sheet.calibration import SheetCalibration
 from smartcam.calibration.wizards._journal import MAX_LINE
 from smartcam.exceptions import CalibrationError
@@ -56,7 +55,7 @@ def _held_out(kind: str, data: dict[str, Any]) -> float | None:
     elif kind in KINDS:
         read = KINDS[kind].from_data(data)
         plane = read.plane if isinstance(read, SheetCalibration) else read
-        found = plane.held_out_error if isinstance(plane, PlaneCalibration) else None
+        found = plane.held_out_error
     else:
         return None
     return None if found is None else 1e3 * found

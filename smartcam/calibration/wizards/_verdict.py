@@ -37,7 +37,6 @@ VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.POOR_FIT: ("remove view {number}", "remove"),
     Code.INSUFFICIENT_ROTATION: ("take views that are tilted more to both sides", "more"),
     Code.POSES_TOO_SIMILAR: ("take views that are tilted more to both sides", "more"),
-    Code.TOO_FEW: ("take more views", "more"),
 }
 """The same for views."""
 
@@ -96,7 +95,7 @@ def refused(
     cures: Mapping[Code, tuple[str, str]] = CURES,
 ) -> Judgement:
     """Return that it is not good, and what to do about it. ``text`` says what is wrong."""
-    named = re.search(r"\b(?:point|view) (\d+)", text)
+    named = re.search(r"\bpoint (\d+)", text)
     number = int(named[1]) if named else worst
     cure, option = next((how for one, how in cures.items() if one == code), _LOOK)
     said = StepVerdict("poor", f"Not good enough: {cure.format(number=number)}")

@@ -164,6 +164,7 @@ function show(next, given) {
     $("go").textContent = view.button;
     for (const what of ["undo", "repeat", "abort"]) $(what).hidden = !view.can.includes(what);
   }
+  if (view.type === "progress") $("waiting").textContent = view.waiting;
   draw(view.preview);
   if (view.type === "progress") setTimeout(watch, 500, view.token);
   if (moved) ($("inputs").querySelector("input") ?? $("title")).focus();

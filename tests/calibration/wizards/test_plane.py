@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from smartcam.calibration.wizards._marks import MAX_MARKS
 from smartcam.calibration.wizards._plane import plane_wizard
 from smartcam.calibration.wizards._sequence import WizardSession
 from tests.calibration.wizards.bench import GRID, OFFSET, Bench, say, where
+from tests.processes import printed_by
 
 
 def begin(
@@ -447,14 +446,6 @@ async def test_origin_mark_of_a_camera_in_pixels_is_shown_in_pixels(tmp_path: Pa
     session.close()
 
 
-def printed(python: str) -> list[float]:
-    """Return the numbers that lines of Python print."""
-    out = subprocess.run(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", python], capture_output=True, text=True, check=True, timeout=60
-    ).stdout
-    return [float(one) for one in out.strip("[]\n").split()]
-
-
 async def test_end_has_the_file_the_verdict_the_picture_and_lines_that_work(
     tmp_path: Path,
 ) -> None:
@@ -471,5 +462,6 @@ async def test_end_has_the_file_the_verdict_the_picture_and_lines_that_work(
     assert view["preview"] == review["preview"]
     program, *_, last = shlex.split(result["use"]["command"])
     assert (program, last) == ("smartcam", str(tmp_path))
-    told = printed(result["use"]["python"])
+    printed = printed_by(result["use"]["python"])
+    told = [float(one) for one in printed.strip("[]\n").split()]
     assert told == pytest.approx(where(*GRID[0]), abs=0.001)
