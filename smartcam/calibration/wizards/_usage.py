@@ -16,7 +16,10 @@ import smartcam.sync
 from smartcam.calibration import load_calibration
 
 calibration = load_calibration({path!r})
-with smartcam.sync.connect({arguments}, calibration=calibration) as camera:
+with smartcam.sync.connect(
+    {arguments},
+    calibration=calibration,
+) as camera:
     for part in camera.trigger().value:
         print(part.feature_id, part.pose.position)  # of the robot, metres
 """
@@ -59,5 +62,5 @@ def usage(
     for name, value in given.items():
         words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     arguments = [repr(url), *(f"{name}={value!r}" for name, value in given.items())]
-    python = _TRIGGERED.format(path=text, arguments=", ".join(arguments))
+    python = _TRIGGERED.format(path=text, arguments=",\n    ".join(arguments))
     return {"command": shlex.join(words), "python": python}

@@ -104,7 +104,7 @@ function showVerdict(verdict) {
 }
 
 const UNITS = { mm: "mm", px: "px", deg: "\u00b0" };
-const WORDS = { path: "saved in", good_for_mm: "good for", held_out_mm: "held-out error", left_out: "left out", seen: "points seen" };
+const WORDS = { path: "saved in", good_for_mm: "good for", held_out_mm: "held-out error", left_out: "left out", seen: "points seen", expected_mm: "noise explains", needed: "touches that notice a knock", needed_at: "of the mark of touch" };
 const USES = { command: "On the command line", python: "In Python" };
 
 function shown(value, unit) {
