@@ -353,6 +353,8 @@ async def site(tmp_path: Path) -> AsyncIterator[WizardSite]:
 async def answer(page: Page, title: str, **answers: Any) -> None:
     """Answer the step of that title."""
     await page.locator("#title").filter(has_text=title).wait_for()
+    # or it is the step before, whose answer is under way
+    await page.locator("#go:enabled").wait_for()
     for name, value in answers.items():
         field = page.locator(f"#form [name={name}]")
         if await field.first.get_attribute("type") == "radio":
@@ -360,9 +362,6 @@ async def answer(page: Page, title: str, **answers: Any) -> None:
         else:
             await field.fill(str(value))
     await page.click("#go")
-    under_way = page.locator("#number").filter(has_text="under way")
-    if await page.locator("#waiting").inner_text() == "":
-        await under_way.wait_for(state="detached")
 
 
 async def picture_size(page: Page) -> list[int]:
