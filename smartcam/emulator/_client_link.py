@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults import Fault
     from smartcam.emulator.faults._delay_line import Ending
     from smartcam.emulator.faults._matching import FaultQueue
-    from smartcam.emulator.faults._wire_effects import Codec, WireFramer
+    from smartcam.emulator.faults._wire_effects import WireCodec, WireFramer
     from smartcam.exceptions import RemoteProtocolError
     from smartcam.protocols._framed.dialect import FramedDialect
     from smartcam.protocols._framed.machine import State
@@ -85,7 +85,7 @@ class LinkOwner(Protocol):
     write_limit: int  # bytes kept for a client that does not read
 
     @property
-    def codec(self) -> Codec:
+    def codec(self) -> WireCodec:
         """The words on the wire."""
         ...
 

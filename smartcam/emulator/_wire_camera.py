@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults import Fault, FiredFault
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.emulator.faults._matching import Row
-    from smartcam.emulator.faults._wire_effects import Codec, WireMessage
+    from smartcam.emulator.faults._wire_effects import WireCodec, WireMessage
     from smartcam.exceptions import RemoteProtocolError
 
 _log = logging.getLogger("smartcam.emulator")
@@ -126,7 +126,7 @@ class WireCamera(Server):
     def __init__(
         self,
         *,
-        spoken: Codec,
+        spoken: WireCodec,
         device: object,
         host: str,
         port: int,
@@ -145,7 +145,7 @@ class WireCamera(Server):
         self.clock: Clock = clock if clock is not None else RealClock()
         self.seed: int = seed
         self.fault_kinds: frozenset[str] = kinds_of(device)
-        self.codec: Codec = spoken
+        self.codec: WireCodec = spoken
         self._cues = timeline
         self._step = _Bracket(self._begin_step, self._end_step)
         self._listener: Listener = _LISTENERS[Transport(transport)](self)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, FrameError, MessageError, UnsupportedError
 from smartcam.protocols.messages import Message, Request, Sender, StatusReport, wire_fields
-from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -327,6 +326,8 @@ def load_protocol(name: str) -> Protocol:
         PluginError: unknown, or it failed to load.
         ConfigurationError: the entry point gives something else.
     """
+    from smartcam.registry import PROTOCOLS  # which logs, what a core has no need of
+
     protocol = PROTOCOLS.load(name)
     if not isinstance(protocol, Protocol):
         raise ConfigurationError(f"entry point {name!r} gives {protocol!r}, not a Protocol")

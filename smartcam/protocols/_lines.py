@@ -177,7 +177,7 @@ class LineDialect(Dialect):
         raise LocalProtocolError(f"dialect {self.name}: there are no other requests")
 
 
-class _Asked(NamedTuple):
+class _AskedLine(NamedTuple):
     """A request, and how it is said."""
 
     row: LineRow
@@ -226,7 +226,7 @@ class LineMachine:
         self._reader = dialect.reader()
         self._store = memoryview(bytearray(READ_SIZE))
         # under way is the first one; at most one of a kind
-        self._asked: collections.deque[_Asked] = collections.deque()
+        self._asked: collections.deque[_AskedLine] = collections.deque()
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
@@ -337,7 +337,7 @@ class LineMachine:
         line = self.dialect.line(message)
         if kind is m.Connect:
             self.state = State.CONNECTING
-        self._asked.append(_Asked(row, line))
+        self._asked.append(_AskedLine(row, line))
         if len(self._asked) == 1:
             self._write(line)
 

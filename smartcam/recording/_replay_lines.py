@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from smartcam.recording._reader import Recording
 
 
-class Piece(NamedTuple):
+class TimedLine(NamedTuple):
     """Bytes that the camera said, so many seconds after what they answer."""
 
     seconds: float
@@ -36,10 +36,10 @@ class Piece(NamedTuple):
 
 
 @dataclass(slots=True)
-class Answers:
+class LineAnswers:
     """What a line got, each time that it was said."""
 
-    given: list[list[Piece]] = field(default_factory=list[list[Piece]])
+    given: list[list[TimedLine]] = field(default_factory=list[list[TimedLine]])
     next: int = 0
 
     @property
@@ -52,7 +52,7 @@ class Answers:
         if self.given and not self.given[-1]:
             self.given.pop()
 
-    def take(self, *, loop: bool) -> list[Piece]:
+    def take(self, *, loop: bool) -> list[TimedLine]:
         """Return the next ones; behind the last the last again, or the first."""
         if loop and self.next >= len(self.given):
             self.next = 0
@@ -71,9 +71,9 @@ class LinesPlan:
         secrets: to a line that was not recorded, such as a password, by its place in a session.
     """
 
-    greeting: list[Piece] = field(default_factory=list[Piece])
-    answers: dict[bytes, Answers] = field(default_factory=dict[bytes, Answers])
-    secrets: dict[int, Answers] = field(default_factory=dict[int, Answers])
+    greeting: list[TimedLine] = field(default_factory=list[TimedLine])
+    answers: dict[bytes, LineAnswers] = field(default_factory=dict[bytes, LineAnswers])
+    secrets: dict[int, LineAnswers] = field(default_factory=dict[int, LineAnswers])
 
 
 def plan_lines(items: Iterable[Item], cut: Callable[[bytes], bytes]) -> LinesPlan:
@@ -84,7 +84,7 @@ def plan_lines(items: Iterable[Item], cut: Callable[[bytes], bytes]) -> LinesPla
     """
     plan = LinesPlan()
     pieces, began, place, size = plan.greeting, None, 0, 0
-    last = Answers()
+    last = LineAnswers()
     for item in items:
         if isinstance(item, Disconnected):
             last.forget_silence()
@@ -97,13 +97,13 @@ def plan_lines(items: Iterable[Item], cut: Callable[[bytes], bytes]) -> LinesPla
             raise RecordingError(f"recording: {size} bytes of lines, expected {MAX_REPLAY} at most")
         began = at if began is None else began
         if item.direction == "<":
-            pieces.append(Piece(max(0.0, at - began), data))
+            pieces.append(TimedLine(max(0.0, at - began), data))
             continue
         pieces, began = [], at
         last = (
-            plan.answers.setdefault(cut(data), Answers())
+            plan.answers.setdefault(cut(data), LineAnswers())
             if data
-            else plan.secrets.setdefault(place, Answers())
+            else plan.secrets.setdefault(place, LineAnswers())
         )
         last.given.append(pieces)
         place += 1
@@ -190,7 +190,7 @@ class ReplayedLines(LineCamera):
             tell()
 
     def _play(
-        self, client: LineClient, pieces: list[Piece], done: Callable[[], None] | None = None
+        self, client: LineClient, pieces: list[TimedLine], done: Callable[[], None] | None = None
     ) -> None:
         """Say pieces, each at its time; then it is done."""
         if not pieces:

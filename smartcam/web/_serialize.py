@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.emulator import Application, FiredFault, LogEntry, TableScene, WireCamera
     from smartcam.emulator._bvs.device import Device
     from smartcam.emulator.faults._base import BaseFault
-    from smartcam.emulator.faults._wire_effects import Codec
+    from smartcam.emulator.faults._wire_effects import WireCodec
     from smartcam.models import ByteOrder
 
 SENSOR = (1280, 1024)
@@ -188,14 +188,14 @@ def _size(text: str) -> int:
     return (len(text) + 1) // 3
 
 
-def _fields(message: m.Message, dialect: Codec) -> dict[str, Any]:
+def _fields(message: m.Message, dialect: WireCodec) -> dict[str, Any]:
     """Return the fields that the dialect has on the wire; bytes stand in the payload's hex."""
     names = _field_names(dialect).get(type(message), ())
     return {name: getattr(message, name) for name in names}
 
 
 @functools.lru_cache(maxsize=16)
-def _field_names(dialect: Codec) -> Mapping[type[m.Message], tuple[str, ...]]:
+def _field_names(dialect: WireCodec) -> Mapping[type[m.Message], tuple[str, ...]]:
     return {
         row.type: tuple(name for name, wire in row.fields if wire is not m.Wire.DATA)
         for row in dialect.table

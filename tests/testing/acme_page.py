@@ -7,6 +7,8 @@ import sys
 import types
 from typing import Any
 
+import pytest
+
 from smartcam.registry import PROTOCOLS
 from tests import ROOT
 
@@ -26,10 +28,15 @@ TESTS = _file("test_acme.py")
 """Its tests."""
 
 _made = types.ModuleType("acme_camera")
-sys.modules["acme_camera"] = _made  # where Protocol.emulator looks for the camera
 exec(compile(MODULE, str(PAGE), "exec", dont_inherit=True), vars(_made))  # noqa: S102
 
 acme: Any = _made
 """The module's names; it has no types."""
 
-PROTOCOLS.register("acme", acme.ACME)
+
+@pytest.fixture(autouse=True)
+def acme_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have its protocol known while a test runs, and its module, where Protocol.emulator looks."""
+    monkeypatch.setitem(sys.modules, "acme_camera", _made)
+    monkeypatch.setitem(PROTOCOLS._registered, "acme", acme.ACME)
+    monkeypatch.setitem(PROTOCOLS._loaded, "acme", acme.ACME)

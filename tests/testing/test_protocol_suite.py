@@ -20,7 +20,7 @@ from smartcam.testing import WireSuite
 from smartcam.testing._suites.protocols.conversations import Came, Conversation, Sent, Step
 from tests import ROOT
 from tests.protocols.insight_lines import BITMAP, GREETING, IMAGE_LINES
-from tests.testing.acme_page import MODULE, TESTS
+from tests.testing.acme_page import MODULE, TESTS, acme_is_known
 
 if TYPE_CHECKING:
     import pytest
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from smartcam.protocols._framed.dialect import FramedDialect
 
 pytest_plugins = ["pytester"]
+
+__all__ = ["acme_is_known"]
 
 EXAMPLE = ROOT / "examples" / "smartcam-acme"
 

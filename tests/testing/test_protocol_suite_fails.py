@@ -21,10 +21,12 @@ from smartcam.protocols._framed.framing import Frame
 from smartcam.protocols._framed.machine import State
 from smartcam.protocols._lines import LineDialect as Dialect
 from smartcam.protocols._lines import LineMachine as Machine
-from smartcam.protocols._lines import _Asked
+from smartcam.protocols._lines import _AskedLine
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 from smartcam.testing._suites.protocols.words import ABILITIES
-from tests.testing.acme_page import acme
+from tests.testing.acme_page import acme, acme_is_known
+
+__all__ = ["acme_is_known"]
 
 ACME: Protocol = acme.ACME
 LINES: Dialect = acme.LINES
@@ -284,7 +286,7 @@ class Willing(Machine):
             self._outbox.append(b"PROGRAM\n")
             row = self.dialect.row(m.Query)
             assert row is not None
-            self._asked.append(_Asked(row, row.line))
+            self._asked.append(_AskedLine(row, row.line))
         else:
             super().send(message, answered=answered)
 

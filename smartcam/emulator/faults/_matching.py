@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._clock import Clock
     from smartcam.emulator.faults import Fault
     from smartcam.emulator.faults._base import BaseFault
-    from smartcam.emulator.faults._wire_effects import Codec
+    from smartcam.emulator.faults._wire_effects import WireCodec
     from smartcam.protocols._framed.framing import Frame
 
 _log = logging.getLogger("smartcam.emulator")
@@ -62,7 +62,7 @@ class FaultQueue:
     The lists of rows are always the same objects, so that it costs little to see that one is empty.
     """
 
-    _dialect: Codec
+    _dialect: WireCodec
     _clock: Clock  # whose time the record tells
     _applications: Container[int] = ()  # ids of those that the camera has
     _kinds: frozenset[str] = frozenset(FAULTS)  # those that it can do
@@ -159,7 +159,7 @@ class FaultQueue:
 
 def misfit(
     fault: Fault,
-    dialect: Codec,
+    dialect: WireCodec,
     applications: Container[int],
     kinds: Container[str] = FAULTS,
 ) -> tuple[str, str] | None:

@@ -38,7 +38,7 @@ class WireFramer(Protocol):
         ...
 
 
-class Codec(Protocol):
+class WireCodec(Protocol):
     """The words on a wire, as links, faults and the log know them; a framed dialect is one."""
 
     @property
@@ -192,7 +192,7 @@ _CHANGES: Mapping[type[object], Callable[[Any, WireMessage], None]] = {
 _Sent: TypeAlias = "list[WireMessage]"
 
 
-def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: Codec) -> _Sent:
+def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: WireCodec) -> _Sent:
     result: _Sent = []
     for one in sent:
         result.append(one)
@@ -202,7 +202,7 @@ def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: Codec) -> _Sent:
     return result
 
 
-def _insert(fault: f.Insert, sent: _Sent, dialect: Codec) -> _Sent:
+def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
     places = [number for number, one in enumerate(sent) if one.changeable]
     if not places:
         return sent
@@ -219,7 +219,7 @@ def _insert(fault: f.Insert, sent: _Sent, dialect: Codec) -> _Sent:
     return [*sent[:place], new, *sent[place:]]
 
 
-def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: Codec) -> _Sent:
+def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: WireCodec) -> _Sent:
     seconds = fault.seconds if isinstance(fault, f.HalfOpen) else None
     if fault.when == "before":
         for one in sent:
@@ -230,7 +230,7 @@ def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: Codec) -> 
     return sent
 
 
-_REBUILDS: Mapping[type[object], Callable[[Any, _Sent, Codec], _Sent]] = {
+_REBUILDS: Mapping[type[object], Callable[[Any, _Sent, WireCodec], _Sent]] = {
     f.Duplicate: _duplicate,
     f.Insert: _insert,
     f.HalfOpen: _end,
@@ -240,7 +240,7 @@ _REBUILDS: Mapping[type[object], Callable[[Any, _Sent, Codec], _Sent]] = {
 """Faults that act on all transmissions of a message together."""
 
 
-def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: Codec) -> _Sent:
+def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireCodec) -> _Sent:
     """Apply wire faults one after the other; return the messages that pass, in order."""
     sent = [message]
     for fault in faults:
@@ -255,7 +255,7 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: Codec
     return sent
 
 
-def cut(data: bytes, framer: WireFramer, dialect: Codec) -> list[WireMessage]:
+def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage]:
     """Return the messages that are whole with these bytes: frames, and bytes between them.
 
     The framer keeps what is unfinished.
@@ -275,7 +275,7 @@ def cut(data: bytes, framer: WireFramer, dialect: Codec) -> list[WireMessage]:
         messages.append(WireMessage.of(frame, dialect.encode_frame(frame)))
 
 
-def cut_datagram(data: bytes, dialect: Codec) -> WireMessage:
+def cut_datagram(data: bytes, dialect: WireCodec) -> WireMessage:
     """Return a datagram as a message, with its frame if it is exactly one."""
     messages = cut(data, dialect.framer(len(data)), dialect)
     whole = [one.original for one in messages] == [data]
