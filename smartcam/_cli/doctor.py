@@ -8,6 +8,7 @@ import click
 
 from smartcam._cli.options import CAMERA, CONNECTS, Options, option, runs
 from smartcam._cli.probe import frame_text
+from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import table_text
 from smartcam.doctor import Finding, examine
 from smartcam.doctor._findings import summary
@@ -62,7 +63,8 @@ async def doctor(url: str, trigger: bool, options: Options) -> None:
 
 
 def _text(finding: Finding) -> str:
-    lines = [f"{finding.severity:<8} {finding.check}: {finding.text}"]
+    severity = tinted(finding.severity, f"{finding.severity:<8}")
+    lines = [f"{severity} {finding.check}: {finding.text}"]
     lines += [f"         {line}" for line in _broken(finding)]
     if finding.cure:
         lines.append(f"         -> {finding.cure}")

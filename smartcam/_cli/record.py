@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, runs
+from smartcam._cli.terminal import counting
 from smartcam._cli.texts import camera_value, not_running
 from smartcam.backoff import Backoff
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
@@ -82,7 +83,8 @@ async def _record(
             jobs.append(_count(results, recorder, options.count))
             if every is not None:
                 jobs.append(_trigger(camera, every, options.step(DEFAULT_TRIGGER_TIMEOUT)))
-            await _first(jobs, options.seconds)
+            async with counting(camera):
+                await _first(jobs, options.seconds)
     finally:
         await _end(recorder, unopened, options)
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from smartcam._cli.terminal import tinted
 from smartcam.exceptions import (
     CalibrationError,
     CameraFaultError,
@@ -109,8 +110,9 @@ def run(
         if debug:
             traceback.print_exc()
         text = _one_line(exc)
-        told = error_json(exc, text, exit_code(exc)) if as_json else f"{program}: error: {text}"
-        sys.stderr.write(f"{told}\n")
+        word = tinted("error", "error:")
+        told = error_json(exc, text, exit_code(exc)) if as_json else f"{program}: {word} {text}"
+        click.echo(told, err=True)
         sys.exit(exit_code(exc))
     sys.exit(0)
 

@@ -22,6 +22,7 @@ from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
 from smartcam._cli.running import JsonErrors
 from smartcam._cli.sheet import sheet
+from smartcam._cli.terminal import counting
 from smartcam._cli.texts import application_text, not_running, result_text, table_text
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
@@ -135,7 +136,7 @@ async def watch(url: str, options: Options) -> None:
                 )
             done = 0
             try:
-                async with asyncio.timeout(options.seconds):
+                async with counting(camera) as line, asyncio.timeout(options.seconds):
                     while options.count is None or done < options.count:
                         try:
                             async with asyncio.timeout(each):
@@ -145,6 +146,7 @@ async def watch(url: str, options: Options) -> None:
                                 f"{camera.name}: no result within {each:g} s; "
                                 f"status: {camera.status}"
                             ) from exc
+                        line.clear()
                         options.show(result, result_text)
                         done += 1
             except TriggerTimeoutError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +17,16 @@ if TYPE_CHECKING:
     from smartcam.emulator import WireCamera
 
 
+DIGITS = 6
+"""Of a number that people read."""
+
+SMALLEST, LARGEST = 1e-3, 1e6
+"""Columns whose largest number lies between them have all their points below each other."""
+
+
 def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return rows as aligned columns; numbers to the right."""
-    cells = [[_cell(value) for value in row] for row in rows]
+    """Return rows as aligned columns; numbers to the right, their points below each other."""
+    cells = [*zip(*map(_column, zip(*rows, strict=True)), strict=True)]
     widths = [max(len(text) for text in column) for column in zip(head, *cells, strict=True)]
     numeric = [bool(rows) and isinstance(value, (int, float)) for value in (rows or [head])[0]]
     lines = [
@@ -29,6 +37,20 @@ def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
         for line in [list(head), *cells]
     ]
     return "\n".join("  " + line for line in lines)
+
+
+def _column(values: Sequence[object]) -> list[str]:
+    """Return a column's cells: floats with as many decimals as the largest needs for 6 digits."""
+    floats = [value for value in values if isinstance(value, float) and math.isfinite(value)]
+    largest = max(map(abs, floats), default=0.0)
+    if len(floats) < len(values) or not SMALLEST <= largest < LARGEST:
+        return [_cell(value) for value in values]
+    decimals = max(0, DIGITS - 1 - math.floor(math.log10(largest)))
+    if any(0 < abs(value) < 10**-decimals for value in floats):
+        return [_cell(value) for value in values]  # one of them would be shown as nothing
+    texts = [f"{value:.{decimals}f}" for value in floats]
+    needless = min(len(text) - len(text.rstrip("0")) for text in texts) if decimals else 0
+    return [text[: len(text) - needless].removesuffix(".") for text in texts]
 
 
 def camera_value(emulator: WireCamera) -> dict[str, Any]:

@@ -1,0 +1,92 @@
+"""What only a terminal gets: colour, and a line that tells how a wait goes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import sys
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from smartcam.client import SmartCamera
+
+COLOURS = {"ok": "green", "hint": "cyan", "warning": "yellow", "error": "red"}
+"""Of words that judge; the word says the same without it."""
+
+PERIOD = 1.0
+"""Seconds between two looks of a line that counts."""
+
+
+def tinted(word: str, text: str | None = None) -> str:
+    """Return a word in its colour, or a text in the word's; :func:`click.echo` takes it off a file.
+
+    Plain where NO_COLOR is set or the terminal is dumb.
+    """
+    text = word if text is None else text
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    return click.style(text, fg=COLOURS[word], bold=word == "error" or None)
+
+
+class CountingLine:
+    """A line on the terminal's stderr that tells once a second what came; none elsewhere.
+
+    ::
+
+        async with counting(camera) as line:
+            result = await anext(results)
+            line.clear()
+            print(result)
+    """
+
+    def __init__(self, camera: SmartCamera[Any]) -> None:
+        self._camera = camera
+        self._width = 0
+
+    def clear(self) -> None:
+        """Take it away, before something else is printed."""
+        if self._width:
+            sys.stderr.write(f"\r{'':{self._width}}\r")
+            sys.stderr.flush()
+            self._width = 0
+
+    async def run(self) -> None:
+        """Show it until cancelled."""
+        loop = asyncio.get_running_loop()
+        seen, last = self._camera.statistics().received, loop.time()
+        while True:
+            await asyncio.sleep(PERIOD)
+            received = self._camera.statistics().received
+            new, seen = received - seen, received
+            last = loop.time() if new else last
+            self._show(new, received, loop.time() - last)
+
+    def _show(self, new: int, received: int, silent: float) -> None:
+        rate = f"{new / PERIOD:.0f} a second" if new else f"nothing for {silent:.0f} s"
+        lost = "" if self._camera.connected else ", not connected"
+        text = f"{received} results, {rate}{lost}"
+        self.clear()
+        sys.stderr.write(text)
+        sys.stderr.flush()
+        self._width = len(text)
+
+
+@contextlib.asynccontextmanager
+async def counting(camera: SmartCamera[Any]) -> AsyncIterator[CountingLine]:
+    """Have a line that counts a camera's results, where stderr is a terminal."""
+    line = CountingLine(camera)
+    if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+        yield line
+        return
+    task = asyncio.create_task(line.run(), name="smartcam.counting")
+    try:
+        yield line
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        line.clear()
