@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["EmulatorSite", "LiveSite", "WizardSite"]
 
-_resolve = lazy(__name__, {"_emulator": "EmulatorSite", "_live": "LiveSite", "_wizard": "WizardSite"})
+_resolve = lazy(
+    __name__, {"_emulator": "EmulatorSite", "_live": "LiveSite", "_wizard": "WizardSite"}
+)
 
 
 def __getattr__(name: str) -> Any:

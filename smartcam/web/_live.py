@@ -60,7 +60,7 @@ class LiveSite(Site):
         port: int = 0,
         token: str | None = None,
     ) -> None:
-        super().__init__(CALLS, "live", host=host, port=port, token=token)
+        super().__init__(CALLS, "live", styles=["emulator"], host=host, port=port, token=token)
         self.control: bool = control
         self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)))
 
@@ -143,7 +143,9 @@ async def _commanded(site: LiveSite, do: Callable[[], Awaitable[Any]]) -> Any:
     try:
         return await do()
     except SmartCamError as exc:
-        raise RefusedError(409, f"{type(exc).__name__}: {exc}", "a camera that can do it now") from exc
+        raise RefusedError(
+            409, f"{type(exc).__name__}: {exc}", "a camera that can do it now"
+        ) from exc
 
 
 @CALLS.add("GET", API)
@@ -174,6 +176,13 @@ def _picture(site: LiveSite, _call: CallRequest) -> web.Response:
     return web.Response(body=picture.data, content_type=kind)
 
 
+@CALLS.add("POST", f"{API}/picture")
+def _want_picture(site: LiveSite, _call: CallRequest) -> object:
+    """Ask the camera for its picture anew, once a second at most; the events tell that it is there."""
+    site.view.want_picture()
+    return site.view.state()
+
+
 @CALLS.add(
     "GET",
     f"{API}/events",
@@ -190,9 +199,7 @@ async def _trigger(site: LiveSite, call: CallRequest) -> object:
     """Trigger; answers when the result is there, which the events tell."""
     body: _Trigger = call.body
     camera = site.view.camera
-    result = await _commanded(
-        site, lambda: camera.trigger(body.application, timeout=body.timeout)
-    )
+    result = await _commanded(site, lambda: camera.trigger(body.application, timeout=body.timeout))
     return {"number": result.number, "latency": result.latency}
 
 

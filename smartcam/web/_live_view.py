@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import contextlib
 import json
+import math
+import re
 import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.exceptions import ConnectionClosedError, SmartCamError
-from smartcam.models import Connected, Disconnected, Reconnected, Result, jsonable
+from smartcam.exceptions import ConnectionTakenError, InterpretationError, SmartCamError
+from smartcam.models import Connected, Disconnected, Localization, Reconnected, Result, jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,6 +23,9 @@ MAX_RESULTS = 100
 
 MAX_VALUE = 20_000
 """Characters of JSON that a value may have on the page; a larger one is cut."""
+
+MAX_PARTS = 500
+"""Localizations of a result that the page draws."""
 
 MAX_SHOWN_RAW = 64
 """Bytes of a container that the page shows."""
@@ -45,9 +49,6 @@ class Entry(NamedTuple):
         if self.result is None:
             return {"serial": self.serial, "error": self.error}
         result = self.result
-        value = jsonable(result.value)
-        text = json.dumps(value)
-        shown = {"value": value} if len(text) <= MAX_VALUE else {"cut": text[: MAX_VALUE // 10]}
         return {
             "serial": self.serial,
             "number": result.number,
@@ -57,8 +58,7 @@ class Entry(NamedTuple):
             "latency": result.latency,
             "size": len(result.raw),
             "raw": result.raw[:MAX_SHOWN_RAW].hex(" "),
-            "verdicts": verdicts(value),
-            **shown,
+            **_shown(result.value),
         }
 
 
@@ -85,11 +85,15 @@ class LiveView:
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # when it was connected or lost at last
         self.loss: str = ""  # why it is not connected, "" where it is
+        self._end: SmartCamError | None = None  # why it will never be again
         self._is_watched = is_watched
         self._serial = 0
-        self._fresh = asyncio.Event()  # a result came since the last picture
+        self._picture_wanted = True
         self._latencies: list[float] = []  # of this second
         self._tasks: list[asyncio.Task[None]] = []
+        self._subscribe(camera)
+
+    def _subscribe(self, camera: SmartCamera[Any]) -> None:
         self._results = camera.results(batch=True, max_queue=10 * MAX_RESULTS)
         self._events = camera.events()
 
@@ -112,6 +116,21 @@ class LiveView:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
+    async def follow(self, camera: SmartCamera[Any], loss: str) -> None:
+        """Show this camera instead, which is not opened yet; ``loss``: why the one before is not.
+
+        Cancellation: leaves it stopped.
+        """
+        await self.stop()
+        self._end, self.loss = None, loss
+        self.camera = camera
+        self._subscribe(camera)
+        self.start()
+
+    def want_picture(self) -> None:
+        """Have the camera's picture fetched when its time has come, while anybody looks."""
+        self._picture_wanted = True
+
     def state(self) -> dict[str, Any]:
         """Return how the camera is, as JSON."""
         camera = self.camera
@@ -119,8 +138,9 @@ class LiveView:
         return {
             "name": camera.name,
             "url": camera.url,
-            "connected": camera.connected,
+            "connection": self._connection(),
             "loss": self.loss,
+            "last_error": "" if camera.connected else camera.statistics().last_error or "",
             "changed_at": self.changed_at,
             "status": camera.status.names if known else [],
             "application": camera.active_application,
@@ -128,12 +148,27 @@ class LiveView:
             "picture_error": self.picture_error,
         }
 
+    def _connection(self) -> str:
+        if self.camera.connected:
+            return "connected"
+        if self.camera.active_application is None:
+            return "awaited"
+        if isinstance(self._end, ConnectionTakenError):
+            return "taken"
+        return "lost" if self._end is None else "ended"
+
     def account(self) -> dict[str, Any]:
         """Return what was counted, as JSON."""
         counted = self.camera.statistics()
         names = (
             *("received", "triggered", "streamed", "late", "wrong_application"),
-            *("uninterpretable", "unclaimed", "inspections_by_others", "overtriggers", "reconnects"),
+            *(
+                "uninterpretable",
+                "unclaimed",
+                "inspections_by_others",
+                "overtriggers",
+                "reconnects",
+            ),
         )
         return {name: getattr(counted, name) for name in names} | {"not_shown": self._not_shown()}
 
@@ -144,34 +179,33 @@ class LiveView:
     # ------------------------------------------------------------------ tasks
 
     async def _follow_results(self) -> None:
-        while not self._results.ended:
+        while True:
             try:
                 batch = await anext(self._results)
-            except StopAsyncIteration:
-                return
-            except ConnectionClosedError:
-                return
-            except SmartCamError as exc:
+            except InterpretationError as exc:
                 self._add(None, str(exc))
                 continue
+            except (StopAsyncIteration, SmartCamError):
+                return
             self._serial += max(0, len(batch) - MAX_RESULTS)
             for result in batch[-MAX_RESULTS:]:
                 self._add(result)
             self._latencies += [one.latency for one in batch if one.latency is not None]
-            self._fresh.set()
+            self._picture_wanted = True
 
     def _add(self, result: Result[Any] | None, error: str = "") -> None:
         self.entries.append(Entry(self._serial, result, error))
         self._serial += 1
 
     async def _follow_events(self) -> None:
-        with contextlib.suppress(SmartCamError):  # which says how the camera ended: see below
+        try:
             async for event in self._events:
                 if isinstance(event, (Connected, Reconnected, Disconnected)):
                     self.changed_at = event.at.timestamp()
                     self.loss = event.reason if isinstance(event, Disconnected) else ""
-        self.changed_at = time.time()
-        self.loss = str(self.camera.statistics().last_error or "closed")
+                    self._picture_wanted |= not self.loss
+        except SmartCamError as exc:
+            self._end, self.changed_at, self.loss = exc, time.time(), str(exc)
 
     async def _tick(self) -> None:
         before = self.camera.statistics().received
@@ -180,20 +214,21 @@ class LiveView:
             received = self.camera.statistics().received
             latencies, self._latencies = sorted(self._latencies), []
             median = latencies[len(latencies) // 2] if latencies else None
-            self.series.append({"at": time.time(), "rate": received - before, "latency": median})
+            self.series.append(
+                {"at": time.time(), "rate": max(0, received - before), "latency": median}
+            )
             before = received
 
     async def _fetch_pictures(self) -> None:
         while True:
-            await self._fresh.wait()
-            self._fresh.clear()
-            if not (self.camera.connected and self.camera.capabilities.read_image):
-                continue
-            if self._is_watched():
-                await self.fetch_picture()
-                await asyncio.sleep(IMAGE_PERIOD)
+            if self._picture_wanted and self._is_watched() and self.camera.connected:
+                self._picture_wanted = False
+                if self.camera.capabilities.read_image:
+                    await self._fetch_picture()
+                    await asyncio.sleep(IMAGE_PERIOD)
+            await asyncio.sleep(IMAGE_PERIOD / 10)
 
-    async def fetch_picture(self) -> None:
+    async def _fetch_picture(self) -> None:
         """Fetch the camera's last picture; what went wrong is told in the state."""
         try:
             data = await self.camera.read_image()
@@ -204,14 +239,60 @@ class LiveView:
             self.picture = Picture(1 + (self.picture.serial if self.picture else 0), data)
 
 
-def verdicts(value: Any) -> dict[str, Any]:
-    """Return what a value says of good and bad: its truth values by name.
+def _shown(value: Any) -> dict[str, Any]:
+    """Return a value as the page shows it: parts that it draws, or JSON, cut where it is long."""
+    if isinstance(value, list) and all(isinstance(one, Localization) for one in value):
+        found: list[Localization] = value
+        frame = found[0].pose.header.frame_id if found else ""
+        return {
+            "parts": [_part(one) for one in found[:MAX_PARTS]],
+            "count": len(found),
+            "frame": frame,
+        }
+    value = jsonable(value)
+    text = json.dumps(value)
+    shown = {"value": value} if len(text) <= MAX_VALUE else {"cut": text[: MAX_VALUE // 10]}
+    return {"verdicts": verdicts(value), **shown}
+
+
+def _part(one: Localization) -> dict[str, Any]:
+    """Return a part as it lies on the plane: metres, and radians about z."""
+    (x, y, z), (i, j, k, w) = one.pose.position, one.pose.orientation
+    theta = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
+    part = {"name": one.feature_id, "quality": one.quality, "x": x, "y": y, "z": z, "theta": theta}
+    return {name: jsonable(item) for name, item in part.items()}
+
+
+def verdicts(value: Any) -> list[dict[str, Any]]:
+    """Return a value's truth values: ``name``, ``true``, ``of`` and ``verdict``.
 
     Of a list of records: how many of them are true, and of how many.
     """
-    if isinstance(value, dict):
-        return {str(name): one for name, one in value.items() if isinstance(one, bool)}
-    if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
-        names = [name for name, one in value[0].items() if isinstance(one, bool)]
-        return {name: [sum(one.get(name) is True for one in value), len(value)] for name in names}
-    return {}
+    rows: list[Any] = value if isinstance(value, list) else [value]
+    if not (rows and all(isinstance(one, dict) for one in rows)):
+        return []
+    names = [str(name) for name, one in rows[0].items() if isinstance(one, bool)]
+    return [_verdict(name, [one.get(name) is True for one in rows]) for name in names]
+
+
+def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
+    good = meaning(name)
+    verdict = None if good is None else "pass" if all(one is good for one in values) else "fail"
+    return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
+
+
+PASS_WORDS = frozenset({"ok", "pass", "passed", "good", "valid", "accept", "accepted", "io"})
+FAIL_WORDS = frozenset(
+    {"nok", "fail", "failed", "bad", "defect", "reject", "rejected", "error", "nio"}
+)
+NOT_WORDS = frozenset({"not", "no"})
+
+
+def meaning(name: str) -> bool | None:
+    """Return which of its values is the good one, by a field's name; None where it does not tell.
+
+    ``ok`` is good when true, ``defect`` and ``not_ok`` when false. Of ``present`` nobody knows.
+    """
+    words = set(re.findall(r"[a-z]+", name.lower()))
+    known = bool(words & PASS_WORDS) + bool(words & FAIL_WORDS)
+    return None if known != 1 else bool(words & PASS_WORDS) is not bool(words & NOT_WORDS)
