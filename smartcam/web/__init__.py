@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: the emulator's, to see and control it while it runs, a camera's, the wizard's.
+"""Pages and HTTP calls: the emulator's, which controls it, a camera's, the wizard's.
 
 ::
 

@@ -1,4 +1,4 @@
-"""The live page's site: what a camera at the wire sends, and calls that trigger it where allowed."""
+"""The live page's site: what a camera sends, and calls that trigger it where allowed."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def _picture(site: LiveSite, _call: CallRequest) -> web.Response:
 
 @CALLS.add("POST", f"{API}/picture")
 def _want_picture(site: LiveSite, _call: CallRequest) -> object:
-    """Ask the camera for its picture anew, once a second at most; the events tell that it is there."""
+    """Ask the camera for its picture anew, once a second at most; the events tell of it."""
     site.view.want_picture()
     return site.view.state()
 
@@ -186,7 +186,7 @@ def _want_picture(site: LiveSite, _call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/events",
-    about="What happens, as server-sent events: `camera`, `results`, `picture`, `account`, `clock`.",
+    about="What happens, as server-sent events: camera, results, picture, account, clock.",
 )
 def _events(site: LiveSite, call: CallRequest) -> object:
     last = call.request.headers.get("Last-Event-ID", "")

@@ -344,14 +344,15 @@ function drawParts() {
   const { clientWidth: width, clientHeight: height } = svg;
   if (!width || !results.some((one) => drawable(one).length)) return;
   fit();
-  const scale = Math.min(width / (view.right - view.left), height / (view.top - view.bottom)); // pixels per mm
+  const head = 36; // pixels, for the scale
+  const scale = Math.min(width / (view.right - view.left), (height - head) / (view.top - view.bottom)); // pixels per mm
   const middle = [(view.left + view.right) / 2, (view.bottom + view.top) / 2];
-  const at = (x, y) => [width / 2 + (x - middle[0]) * scale, height / 2 - (y - middle[1]) * scale];
+  const at = (x, y) => [width / 2 + (x - middle[0]) * scale, (height + head) / 2 - (y - middle[1]) * scale];
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const step = round(70 / scale);
   const drawn = [];
   const [left, right] = [middle[0] - width / 2 / scale, middle[0] + width / 2 / scale];
-  const [bottom, top] = [middle[1] - height / 2 / scale, middle[1] + height / 2 / scale];
+  const [bottom, top] = [middle[1] - height / scale, middle[1] + height / scale];
   for (let x = Math.ceil(left / step) * step; x <= right; x += step) {
     const [px] = at(x, 0);
     drawn.push(draw("line", { class: Math.abs(x) < step / 2 ? "axis" : "rule", x1: px, x2: px, y1: 0, y2: height }));
@@ -360,7 +361,7 @@ function drawParts() {
   for (let y = Math.ceil(bottom / step) * step; y <= top; y += step) {
     const [, py] = at(0, y);
     drawn.push(draw("line", { class: Math.abs(y) < step / 2 ? "axis" : "rule", x1: 0, x2: width, y1: py, y2: py }));
-    if (py > 24 && py < height - 24) drawn.push(draw("text", { x: 5, y: py - 3 }, number(y)));
+    if (py > head && py < height - 24) drawn.push(draw("text", { x: 5, y: py - 3 }, number(y)));
   }
   const last = results.find((one) => one.error === undefined) ?? {};
   for (const part of drawable(last)) drawn.push(drawPart(part, at(part.x * MM, part.y * MM), width));
@@ -382,7 +383,9 @@ function drawPart(part, [x, y], width) {
 }
 
 function arrange() {
-  $("main").classList.toggle("both", !$("scene-panel").hidden && !$("image-panel").hidden);
+  const shown = [$("scene-panel"), $("image-panel")].filter((one) => !one.hidden).length;
+  $("main").classList.toggle("plain", shown === 0);
+  $("main").classList.toggle("both", shown === 2);
 }
 
 // ---------------------------------------------------------------------- picture
