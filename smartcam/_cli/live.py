@@ -47,6 +47,7 @@ async def serve(url: str, web: PageOptions, options: Options, *, control: bool =
         async with asyncio.timeout(options.seconds):
             with options.cameras(url, reconnect=Backoff()) as make:
                 camera = make()
+                options.remark(camera)
                 async with LiveSite(camera, control=control, **web.place) as site:
                     options.show({"page": site.url}, f"page: {site.url}")
                     await _have_open(camera, make, site)
