@@ -79,9 +79,9 @@ def test_live_with_control_triggers(url: str) -> None:
 
 def test_live_awaits_a_camera_that_is_not_there() -> None:
     with closed_port() as place:
-        live = Process("smartcam", "live", f"bvs://{place}")
+        url = f"bvs://{place}"
+    with Process("smartcam", "live", url) as live:
         page = page_of(live)
-    with live:
         assert wait_for(page, "awaited")["status"] == []
         with Process("smartcam-emulator", "--port", place.rpartition(":")[2]):
             wait_for(page, "connected")
