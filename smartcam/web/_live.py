@@ -75,7 +75,7 @@ class LiveSite(Site):
         await super().stop()
 
 
-class Reader:
+class LiveReader:
     """What one reader knows."""
 
     def __init__(self, site: LiveSite, since: int | None = None) -> None:
@@ -121,12 +121,12 @@ class Reader:
 # ---------------------------------------------------------------------- what calls take
 
 
-class _Trigger(CallBody):
+class _TriggerBody(CallBody):
     application: int | None = Field(default=None, ge=0, le=0xFFFFFFFF)
     timeout: float = Field(default=5.0, gt=0.0, le=60.0)
 
 
-class _Switch(CallBody):
+class _SwitchBody(CallBody):
     application: int = Field(ge=0, le=0xFFFFFFFF)
 
 
@@ -191,19 +191,19 @@ def _want_picture(site: LiveSite, _call: CallRequest) -> object:
 def _events(site: LiveSite, call: CallRequest) -> object:
     last = call.request.headers.get("Last-Event-ID", "")
     since = int(last) if last.isdecimal() and len(last) < 20 else None
-    return site.streams.serve(call.request, Reader(site, since).look)
+    return site.streams.serve(call.request, LiveReader(site, since).look)
 
 
-@CALLS.add("POST", f"{API}/trigger", body=_Trigger, optional=True, sample='{"timeout": 5.0}')
+@CALLS.add("POST", f"{API}/trigger", body=_TriggerBody, optional=True, sample='{"timeout": 5.0}')
 async def _trigger(site: LiveSite, call: CallRequest) -> object:
     """Trigger; answers when the result is there, which the events tell."""
-    body: _Trigger = call.body
+    body: _TriggerBody = call.body
     camera = site.view.camera
     result = await _commanded(site, lambda: camera.trigger(body.application, timeout=body.timeout))
     return {"number": result.number, "latency": result.latency}
 
 
-@CALLS.add("POST", f"{API}/switch", body=_Switch, sample='{"application": 7}')
+@CALLS.add("POST", f"{API}/switch", body=_SwitchBody, sample='{"application": 7}')
 async def _switch(site: LiveSite, call: CallRequest) -> object:
     """Load another application."""
     await _commanded(site, lambda: site.view.camera.switch_application(call.body.application))

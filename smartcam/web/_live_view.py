@@ -37,7 +37,7 @@ IMAGE_PERIOD = 1.0
 """Seconds between two pictures that are fetched for the page, at least."""
 
 
-class Entry(NamedTuple):
+class ShownResult(NamedTuple):
     """A result, or why there is none."""
 
     serial: int  # counted from 0
@@ -79,7 +79,7 @@ class LiveView:
 
     def __init__(self, camera: SmartCamera[Any], is_watched: Callable[[], bool]) -> None:
         self.camera = camera
-        self.entries: collections.deque[Entry] = collections.deque(maxlen=MAX_RESULTS)
+        self.entries: collections.deque[ShownResult] = collections.deque(maxlen=MAX_RESULTS)
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
         self.picture: Picture | None = None
         self.picture_error: str = ""
@@ -194,7 +194,7 @@ class LiveView:
             self._picture_wanted = True
 
     def _add(self, result: Result[Any] | None, error: str = "") -> None:
-        self.entries.append(Entry(self._serial, result, error))
+        self.entries.append(ShownResult(self._serial, result, error))
         self._serial += 1
 
     async def _follow_events(self) -> None:

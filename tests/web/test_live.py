@@ -20,7 +20,7 @@ from smartcam.web._live_view import (
     MAX_RESULTS,
     MAX_SHOWN_RAW,
     MAX_VALUE,
-    Entry,
+    ShownResult,
     meaning,
     verdicts,
 )
@@ -234,7 +234,7 @@ def result_of(value: object, raw: bytes = b"") -> Result[Any]:
 
 
 def test_long_values_are_cut() -> None:
-    told = Entry(0, result_of(["x" * MAX_VALUE], bytes(1000)), "").as_json()
+    told = ShownResult(0, result_of(["x" * MAX_VALUE], bytes(1000)), "").as_json()
     assert "value" not in told
     assert len(json.dumps(told)) < MAX_VALUE
     assert told["raw"] == bytes(MAX_SHOWN_RAW).hex(" ")
@@ -245,7 +245,7 @@ def test_parts_are_told_in_the_plane_and_bounded() -> None:
     header = smartcam.Header(1, datetime.now(UTC), "table")
     pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(0.5))
     found = [Localization("bolt", 0.9, 0, pose)] * (MAX_PARTS + 1)
-    told = Entry(0, result_of(found), "").as_json()
+    told = ShownResult(0, result_of(found), "").as_json()
     assert (len(told["parts"]), told["count"], told["frame"]) == (
         MAX_PARTS,
         MAX_PARTS + 1,
@@ -254,7 +254,7 @@ def test_parts_are_told_in_the_plane_and_bounded() -> None:
     assert told["parts"][0] == pytest.approx(
         {"name": "bolt", "quality": 0.9, "x": 0.1, "y": 0.2, "z": 0.0, "theta": 0.5}
     )
-    assert Entry(0, result_of([]), "").as_json()["parts"] == []
+    assert ShownResult(0, result_of([]), "").as_json()["parts"] == []
 
 
 @pytest.mark.parametrize(
