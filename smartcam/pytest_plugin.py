@@ -29,19 +29,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
 
     from smartcam.client import SmartCamera
+    from smartcam.emulator import Scenario
     from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
 
 T = TypeVar("T")
 
 __all__ = ["camera", "emulated_camera", "emulated_fleet"]
 
-EMULATOR = frozenset(
-    {
-        "scenario", "applications", "active", "running", "builtins", "quirks", "faults", "timeline",
-        "seed", "dialect", "transport", "port", "name", "manual_clock",
-    }
-)  # fmt: skip
-"""Options of the marker that the emulated camera takes."""
+PROTOCOL = "bvs"
+"""What is spoken where nothing else is said."""
+
+TO_CAMERA = frozenset({"protocol", "manual_clock"})
+
+OWN = TO_CAMERA | frozenset({"application", "interpret_as", "connect", "cameras"})
+"""Options of the marker that are its own; the others are the emulated camera's."""
 
 FLEET = frozenset({"scenario", "quirks", "dialect", "transport"})
 """Those that an emulated fleet takes, beside ``cameras``."""
@@ -50,11 +51,12 @@ CAMERAS = 2
 """Cameras of a fleet where nothing else is said."""
 
 MARKER = (
-    "smartcam(application=None, interpret_as=None, connect={}, cameras=2, scenario=None, "
-    "dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and emulated_fleet "
-    "are made. application=ID has that application running; connect={...} are further options of "
-    "smartcam.connect(); the rest are options of smartcam.emulator.EmulatedCamera: "
-    f"{', '.join(sorted(EMULATOR))}. A scenario is looked for beside the test, then below the root."
+    "smartcam(application=None, interpret_as=None, connect={}, cameras=2, protocol='bvs', "
+    "scenario=None, dialect=..., transport=..., ...): how the fixtures emulated_camera, camera and "
+    "emulated_fleet are made. application=ID has that application running; connect={...} are "
+    "further options of smartcam.connect(); the rest are options of "
+    "smartcam.emulator.EmulatedCamera, or of the class that the protocol brings. A scenario is "
+    "looked for beside the test, then below the root."
 )
 
 _CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
@@ -90,13 +92,15 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
     It lives in a thread with an event loop of its own, so it serves synchronous and asynchronous
     tests, and programs that a test starts. The marker ``smartcam`` says what it is.
     """
+    from smartcam.emulator._makes import emulated_class
     from smartcam.testing._threads import ThreadedCamera
 
     said = _said(request)
-    options = {key: value for key, value in said.items() if key in EMULATOR}
+    protocol = said.get("protocol", PROTOCOL)
+    options = {key: one for key, one in said.items() if key not in OWN or key in TO_CAMERA}
     application = said.get("application")
     if application is not None:
-        options = {"active": application, "running": True, **options}
+        options = {**emulated_class(protocol).state_options(application, running=True), **options}
     with contextlib.ExitStack() as stack:
         yield _made(lambda: stack.enter_context(ThreadedCamera(**options)))
 
@@ -104,7 +108,6 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 @pytest.fixture
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
     """Emulated cameras by name: two, or those of a scenario; otherwise as emulated_camera."""
-    from smartcam.emulator import Scenario
     from smartcam.testing._threads import ThreadedFleet
 
     said = _said(request)
@@ -113,16 +116,26 @@ def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
     if scenarios is None:
         application = said.get("application")
         scenarios = [
-            Scenario(
-                name=f"camera{number}",
-                active=application,
-                running=application is not None,
-                seed=number,
-            )
+            _scenario(said.get("protocol", PROTOCOL), application, number)
             for number in range(1, 1 + said.get("cameras", CAMERAS))
         ]
     with contextlib.ExitStack() as stack:
         yield _made(lambda: stack.enter_context(ThreadedFleet(scenarios, **options)))
+
+
+def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
+    """Return a camera of a fleet, with an application that runs where the camera can be so."""
+    from smartcam.emulator import Scenario
+    from smartcam.emulator._makes import emulated_class
+
+    able = emulated_class(protocol).state_options(application, running=True)
+    return Scenario(
+        name=f"camera{number}",
+        protocol=protocol,
+        active=application if able else None,
+        running=bool(able) and application is not None,
+        seed=number,
+    )
 
 
 @pytest.fixture
@@ -165,7 +178,7 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
         if marker.args:
             pytest.fail("the marker smartcam takes names only: application=7", pytrace=False)
         said |= marker.kwargs
-    known = EMULATOR | {"application", "interpret_as", "connect", "cameras"}
+    known = OWN | _options(said)
     unknown = sorted(said.keys() - known)
     if unknown:
         from smartcam._suggestions import did_you_mean
@@ -178,6 +191,18 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
     if isinstance(said.get("scenario"), (str, Path)):
         said["scenario"] = _scenario_path(request, said["scenario"])
     return said
+
+
+def _options(said: dict[str, Any]) -> frozenset[str]:
+    """Return the options of the marker that an emulated camera takes."""
+    from smartcam.emulator._makes import emulated_class, options_of
+    from smartcam.exceptions import SmartCamError
+
+    try:
+        kind = emulated_class(said.get("protocol", PROTOCOL))
+    except SmartCamError as exc:
+        pytest.fail(f"the marker smartcam: {exc}", pytrace=False)
+    return options_of(kind) - {"host", "clock"}
 
 
 def _scenario_path(request: pytest.FixtureRequest, given: str | Path) -> Path:

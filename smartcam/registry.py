@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from importlib.metadata import Distribution, EntryPoint
 
-__all__ = ["INTERPRETERS", "PROTOCOLS"]
+__all__ = ["GENERATORS", "INTERPRETERS", "PROTOCOLS"]
 
 _log = logging.getLogger(__name__)
 
@@ -54,19 +54,34 @@ class Registry:
         self._aliases = aliases or {}
         self._found: dict[str, list[EntryPoint]] | None = None
         self._loaded: dict[str, object] = {}
+        self._registered: dict[str, object] = {}
 
     def available(self) -> list[PluginInfo]:
         """Return every known name, sorted; imports nothing."""
         infos = [PluginInfo(name, target, "built-in") for name, target in self._builtins.items()]
+        infos += [PluginInfo(name, "", "registered") for name in self._registered]
         for name, points in self._entry_points().items():
-            if name not in self._builtins:
+            if name not in self._builtins and name not in self._registered:
                 origin = ", ".join(_distribution(point) for point in points)
                 infos.append(PluginInfo(name, points[0].value, origin))
         return sorted(infos)
 
     def __contains__(self, name: object) -> bool:
         """Return whether ``name`` is known, as a name or an alias."""
-        return name in self._builtins or name in self._aliases or name in self._entry_points()
+        own = (self._builtins, self._aliases, self._registered)
+        return any(name in one for one in own) or name in self._entry_points()
+
+    def register(self, name: str, plugin: object) -> None:
+        """Have a plug-in in this process, without a package that brings it.
+
+        Raises:
+            PluginError: the name is taken by another one.
+        """
+        if self._registered.get(name) is plugin:
+            return
+        if name in self and self.load(name) is not plugin:
+            raise PluginError(f"{self.group}: {name!r} is there already", name=name)
+        self._registered[name] = plugin
 
     def load(self, name: str) -> object:
         """Return the plug-in of a name, importing it at the first call.
@@ -77,11 +92,12 @@ class Registry:
         """
         name = self._aliases.get(name, name)
         if name not in self._loaded:
-            self._loaded[name] = self._load(name)
+            own = self._registered.get(name)
+            self._loaded[name] = self._load(name) if own is None else own
         return self._loaded[name]
 
     def refresh(self) -> None:
-        """Forget what was found and loaded; the next call looks again."""
+        """Forget what was found and loaded, but not what was registered; the next call looks."""
         self._found = None
         self._loaded.clear()
 
@@ -184,5 +200,15 @@ PROTOCOLS = Registry(
     {
         "bvs": "smartcam.protocols._bvs:BVS",
         "insight": "smartcam.protocols._insight.dialect:INSIGHT",
+    },
+)
+
+GENERATORS = Registry(
+    "smartcam.generators",
+    {
+        "input": "smartcam.emulator._generators:_input",
+        "sequence": "smartcam.emulator._generators:_sequence",
+        "tangram": "smartcam.emulator._generators:_tangram",
+        "tangram_pixels": "smartcam.emulator._generators:_tangram_pixels",
     },
 )

@@ -44,6 +44,13 @@ LOADED = (
 LARGEST = 1 << 16
 
 
+def printed_by(python: str) -> str:
+    """Return what lines of Python print, run by themselves."""
+    return subprocess.run(  # noqa: S603 - our own interpreter
+        [sys.executable, "-c", python], capture_output=True, text=True, check=True, timeout=PATIENCE
+    ).stdout
+
+
 class Outcome(NamedTuple):
     """How a command ended."""
 

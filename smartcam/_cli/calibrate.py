@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import io
 import json
-import os
-import sys
-import textwrap
-import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from smartcam._cli.calibrate_terminal import drive, listing_text
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
@@ -23,12 +18,12 @@ from smartcam.exceptions import CalibrationError, ConfigurationError, Unsupporte
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Mapping
+    from collections.abc import Mapping
 
     from smartcam.calibration._files.directory import Folder
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import Target
-    from smartcam.calibration.wizards._sequence import Wizard, WizardSession
+    from smartcam.calibration.wizards._sequence import Wizard
     from smartcam.calibration.wizards._services import CalibrationService
 
 ABORTED = 130
@@ -39,9 +34,6 @@ STALE = 7
 
 MAX_DESCRIPTION = 65_536
 """Bytes of a target's description."""
-
-WIDTH = 88
-"""Columns of a text."""
 
 
 @click.command(
@@ -91,6 +83,12 @@ WIDTH = 88
     show_default=True,
     help="Where calibrations and journals stand; made if need be.",
 )
+@click.option(
+    "--list",
+    "listed",
+    is_flag=True,
+    help="List the calibrations of the folder: date, error, last check; nothing else.",
+)
 @page_options("Serve a page instead of asking here, until Ctrl-C; its address goes to stdout.")
 @click.option("--fresh", is_flag=True, help="Begin anew, also where one was broken off.")
 @click.option("--feature", metavar="ID", help="Only localizations of this feature are marks.")
@@ -116,12 +114,16 @@ async def calibrate(
     lens: str | None,
     check: str | None,
     folder: str,
+    listed: bool,
     fresh: bool,
     feature: str | None,
     web: PageOptions,
     options: Options,
 ) -> None:
     """Calibrate a camera against a robot."""
+    if listed:
+        _list(folder, options)
+        return
     if called is not None and check is not None:
         raise click.UsageError("--check names the calibration: no --name beside it")
     if wizard is not None and check is not None:
@@ -134,8 +136,10 @@ async def calibrate(
     from smartcam.calibration.wizards._verification import WIZARD
 
     sources = _Sources(options, url, pictures, target, lens)
-    parameters = {} if feature is None else {"feature": feature}
     started = WIZARD if check is not None else wizard or "plane"
+    parameters: dict[str, Any] = {} if feature is None else {"feature": feature}
+    if target is not None and started in {"sheet", "hand-eye"}:
+        parameters["target"] = sources.described
     named = next(one for one in (check, called, started) if one is not None)
     try:
         service = _service(folder, sources)
@@ -146,11 +150,32 @@ async def calibrate(
             if web.wanted:
                 await _serve(service, options, web)
             else:
-                await _drive(service.session, options)
+                _exit(await drive(service.session, options))
         finally:
             service.close()
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
+
+
+def _list(path: str, options: Options) -> None:
+    from smartcam.calibration._files.directory import Folder
+    from smartcam.calibration.wizards._listing import listing
+
+    if not Path(path).is_dir():
+        raise ConfigurationError(f"--folder {path}: no such folder")
+    rows = listing(Folder(path))
+    if options.as_json:
+        for row in rows:
+            options.show(row, "")
+    else:
+        click.echo(listing_text(rows) if rows else f"no calibrations in {path}")
+
+
+def _exit(view: Mapping[str, Any]) -> None:
+    if view["type"] == "abort":
+        raise SystemExit(ABORTED)
+    if view["result"].get("stale"):
+        raise SystemExit(STALE)
 
 
 async def _serve(service: CalibrationService, options: Options, web: PageOptions) -> None:
@@ -182,6 +207,13 @@ class _Sources:
     target: str | None
     lens: str | None
 
+    @property
+    def described(self) -> dict[str, Any]:
+        """What is on the sheet, as it is described."""
+        from smartcam.calibration._targets import target_to_data
+
+        return target_to_data(_read_target(str(self.target)))
+
     def wizards(self, folder: Folder) -> list[Wizard]:
         """Return the wizards that can work with what there is; the first is the page's default.
 
@@ -193,11 +225,21 @@ class _Sources:
         from smartcam.calibration.wizards._verification import drift_wizard
 
         found: list[Wizard] = []
+        connect: dict[str, Any] | None = None
         if self.url is not None:
             with self.options.camera(self.url):  # an address or option that cannot work
                 y_down = self.options.y_down
+            connect = {"url": self.url} | {
+                name: getattr(self.options, name)
+                for name in ("application", "interpret_as", "y_down")
+            }
             found = [
-                plane_wizard(localize=self.localize, save_to=folder.calibration, y_down=y_down),
+                plane_wizard(
+                    localize=self.localize,
+                    save_to=folder.calibration,
+                    y_down=y_down,
+                    connect=connect,
+                ),
                 drift_wizard(
                     localize=self.localize,
                     find=folder.find,
@@ -207,17 +249,13 @@ class _Sources:
             ]
         target = None if self.target is None else _read_target(self.target)
         lens = None if self.lens is None else _read_lens(self.lens)
-        take_picture = self._taking()
-        for make in (sheet_wizard, hand_eye_wizard):
-            found.append(
-                make(
-                    take_picture=take_picture,
-                    save_to=folder.calibration,
-                    suggested=target,
-                    camera=lens,
-                )
-            )
-        return found
+        pictures: dict[str, Any] = {
+            **self._taking(),
+            "save_to": folder.calibration,
+            "suggested": target,
+            "camera": lens,
+        }
+        return [*found, sheet_wizard(**pictures, connect=connect), hand_eye_wizard(**pictures)]
 
     async def localize(self) -> list[Localization]:
         options = self.options
@@ -232,12 +270,14 @@ class _Sources:
             )
         return found
 
-    def _taking(self) -> Callable[[], Coroutine[Any, Any, Any]]:
+    def _taking(self) -> dict[str, Any]:
+        """Return what takes pictures, and which ones are waited for."""
         from smartcam.calibration.wizards._pictures import PictureFolder
 
         if self.pictures is None:
-            return self.take_picture
-        return PictureFolder(self.pictures).take
+            return {"take_picture": self.take_picture}
+        folder = PictureFolder(self.pictures)
+        return {"take_picture": folder.take, "awaited": folder.awaited}
 
     async def take_picture(self) -> Any:
         from smartcam.calibration.wizards._pictures import decode_picture
@@ -285,204 +325,3 @@ def _read_lens(path: str) -> CameraModel:
             return read_cameras(path, "camera_info").cameras[0]
     except CalibrationError as exc:
         raise ConfigurationError(f"--lens: {exc}") from exc
-
-
-async def _drive(session: WizardSession, options: Options) -> None:
-    lines = _Lines()
-    view = session.current
-    while view["type"] not in {"result", "abort"}:
-        options.show(view, _step_text)
-        if options.as_json:
-            view = await _from_json(session, await lines.next())
-        else:
-            view = await _from_prompts(session, view, lines)
-    options.show(view, _end_text)
-    if view["type"] == "abort":
-        raise SystemExit(ABORTED)
-    if view["result"].get("stale"):
-        raise SystemExit(STALE)
-
-
-_COMMANDS = ("undo", "repeat", "abort")
-
-
-async def _do(session: WizardSession, command: str, token: str) -> dict[str, Any]:
-    view: dict[str, Any] = await getattr(session, command)(token)
-    return view
-
-
-async def _from_json(session: WizardSession, line: str) -> dict[str, Any]:
-    try:
-        asked = json.loads(line)
-        token = asked.get("token", session.token)
-        answers, command = asked.get("answers"), asked.get("do")
-    except (ValueError, RecursionError, AttributeError) as exc:
-        raise ConfigurationError(
-            f'a line of input: expected {{"answers": {{...}}}}, got {line[:64]!r}'
-        ) from exc
-    if command is None:
-        return await session.submit(token, answers)
-    if command not in _COMMANDS:
-        raise ConfigurationError(f"do: expected one of {', '.join(_COMMANDS)}, got {command!r}")
-    return await _do(session, command, token)
-
-
-async def _from_prompts(
-    session: WizardSession, view: dict[str, Any], lines: _Lines
-) -> dict[str, Any]:
-    """Ask for a step's answers until it is left; what was answered stands there again."""
-    defaults = dict(view["defaults"])
-    token = view["token"]
-    while view["token"] == token:
-        answers: dict[str, Any] = {}
-        properties = view["schema"]["properties"]
-        for name, schema in properties.items():
-            text = await _ask(lines, _prompt(schema, defaults.get(name)))
-            if text.startswith(":"):
-                return await _command(session, view, text[1:])
-            if text or name in defaults:
-                answers[name] = _value(schema, text) if text else defaults[name]
-        if not properties:
-            text = await _ask(lines, f"{view['button']}: press Enter")
-            if text.startswith(":"):
-                return await _command(session, view, text[1:])
-        view = await session.submit(token, answers)
-        wrong = view["errors"]
-        defaults.update({name: value for name, value in answers.items() if name not in wrong})
-        if view["token"] == token:
-            click.echo(_errors_text(view))
-    return view
-
-
-async def _command(session: WizardSession, view: Mapping[str, Any], text: str) -> dict[str, Any]:
-    command = text.strip()
-    if command in view["can"]:
-        return await _do(session, command, view["token"])
-    possible = ", ".join(f":{one}" for one in view["can"])
-    click.echo(f"! :{command}: expected one of {possible}")
-    return session.current
-
-
-async def _ask(lines: _Lines, prompt: str) -> str:
-    click.echo(f"{prompt}: ", nl=False)
-    return await lines.next()
-
-
-# ---------------------------------------------------------------------- texts
-
-
-def _prompt(schema: Mapping[str, Any], default: Any) -> str:
-    unit = f", {schema['x-unit']}" if "x-unit" in schema else ""
-    shown = "" if default is None else f" [{_default_text(default)}]"
-    rows = [f"    {one['const']}: {one['title']}\n" for one in schema.get("oneOf", ())]
-    head = f"{schema['title']}{unit}"
-    return f"{head}\n{''.join(rows)}  answer{shown}" if rows else f"{head}{shown}"
-
-
-def _default_text(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
-
-
-_BOOLEANS = {"y": True, "yes": True, "n": False, "no": False}
-
-
-def _value(schema: Mapping[str, Any], text: str) -> Any:
-    """Return the value of a text; one that stands for nothing is the session's to refuse."""
-    kind = schema.get("type")
-    if kind == "boolean":
-        return _BOOLEANS.get(text.lower(), text)
-    if kind == "string":
-        return text
-    with contextlib.suppress(ValueError):
-        return float(text.replace(",", "."))
-    return text
-
-
-def _step_text(view: Mapping[str, Any]) -> str:
-    commands = ", ".join(f":{one}" for one in view["can"])
-    lines = ["", f"{view['number']}. {view['title']}  ({commands})"]
-    lines += textwrap.wrap(view["description"], WIDTH)
-    for note in view["notes"]:
-        lines += textwrap.wrap(note, WIDTH, initial_indent="  - ", subsequent_indent="    ")
-    errors = _errors_text(view)
-    return "\n".join([*lines, errors] if errors else lines)
-
-
-def _errors_text(view: Mapping[str, Any]) -> str:
-    properties = view["schema"]["properties"]
-    rows = [
-        f"! {text}" if name == "base" else f"! {properties[name]['title']}: {text}"
-        for name, text in view["errors"].items()
-    ]
-    return "\n".join(rows)
-
-
-def _end_text(view: Mapping[str, Any]) -> str:
-    if view["type"] == "abort":
-        return "\naborted; what was measured stands in the journal"
-    result = view["result"].items()
-    rows = [f"  {name}: {_result_text(value)}" for name, value in result if name != "remarks"]
-    return "\n".join(["", "done", *rows])
-
-
-def _result_text(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_result_text, value)) or "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) else "-" if value is None else str(value)
-
-
-# ---------------------------------------------------------------------- standard input
-
-
-class _Lines:
-    """Lines of standard input, one when it is asked for; the event loop goes on meanwhile.
-
-    A thread waits for each. It reads the descriptor itself: one that is left waiting in Python's
-    own buffer at the end would stop the interpreter from ending.
-    """
-
-    def __init__(self) -> None:
-        self._buffer = b""
-
-    async def next(self) -> str:
-        """Return the next line without its end; ConfigurationError: there is none.
-
-        Cancellation: the thread goes on waiting, and ends with the process.
-        """
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[str] = loop.create_future()
-
-        def tell(line: str) -> None:
-            if not future.done():
-                future.set_result(line)
-
-        def wait() -> None:
-            line = self._read()
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                loop.call_soon_threadsafe(tell, line)
-
-        threading.Thread(target=wait, name="stdin", daemon=True).start()
-        line = await future
-        if not line:
-            raise ConfigurationError(
-                "the input has ended before the calibration has; what was done is kept: "
-                "the same command goes on with it"
-            )
-        return line.strip()
-
-    def _read(self) -> str:
-        try:
-            descriptor = sys.stdin.fileno()
-        except (io.UnsupportedOperation, AttributeError, ValueError):
-            return sys.stdin.readline() if sys.stdin is not None else ""
-        while b"\n" not in self._buffer:
-            more = os.read(descriptor, 4096)
-            if not more:
-                break
-            self._buffer += more
-        line, end, self._buffer = self._buffer.partition(b"\n")
-        return (line + end).decode(errors="replace")

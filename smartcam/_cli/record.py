@@ -24,7 +24,8 @@ from smartcam.exceptions import (
     TriggerError,
     UnsupportedError,
 )
-from smartcam.recording import Recorder, ReplayedCamera, load_recording, write_pcap
+from smartcam.recording import Recorder, load_recording, write_pcap
+from smartcam.recording import replay as replay_camera
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -187,20 +188,18 @@ async def replay(
     names = list(loaded.cameras) if camera is None else [camera]
     async with contextlib.AsyncExitStack() as stack:
         for index, name in enumerate(names or [None]):
-            emulator = ReplayedCamera(
+            emulator = replay_camera(
                 loaded,
                 camera=name,
                 speed=speed,
                 loop=loop,
                 host=host,
                 port=port + index if port else 0,
-                transport=transport,
                 on_over=_over,
+                **({} if transport is None else {"transport": transport}),
             )
             await stack.enter_async_context(emulator)
-            ids = emulator.device.applications
-            value = camera_value(emulator, emulator.transport, emulator.dialect, ids)
-            options.show({**value, "camera": emulator.name}, emulator.url)
+            options.show({**camera_value(emulator), "camera": emulator.name}, emulator.url)
         await asyncio.Event().wait()
 
 

@@ -25,7 +25,6 @@ from smartcam._cli.record import pcap, record, replay
 from smartcam._cli.running import JsonErrors
 from smartcam._cli.sheet import sheet
 from smartcam._cli.texts import application_text, not_running, result_text, table_text
-from smartcam._client.handshake import load_protocol
 from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     NotRunningError,
@@ -36,6 +35,7 @@ from smartcam.exceptions import (
 )
 from smartcam.interpreters import resolve
 from smartcam.models import Status
+from smartcam.protocols._base import load_protocol
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 
 if TYPE_CHECKING:

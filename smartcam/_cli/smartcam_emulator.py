@@ -15,19 +15,32 @@ from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.running import JsonErrors
 from smartcam._cli.texts import camera_value
-from smartcam.emulator import EmulatedCamera, Scenario, load_scenarios, scenario_schema
-from smartcam.emulator._insight.camera import EmulatedInSight
-from smartcam.emulator._insight.job import BUILTIN_JOBS
+from smartcam.emulator import Scenario, load_scenarios, scenario_schema
+from smartcam.emulator._generators import find_generator
+from smartcam.emulator._makes import emulated_class
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout._yamls import BadYamlError, load
 from smartcam.protocols._bvs import BVS
-from smartcam.protocols._insight.dialect import INSIGHT
+from smartcam.registry import GENERATORS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from smartcam.emulator import WireCamera
+
 DIALECTS = tuple(BVS.dialects)
-PROTOCOLS = (BVS.name, INSIGHT.name)
+
+SHOWN = 7
+"""The application that runs where a page shows a camera of no scenario."""
+
+_SAID = {
+    "scenario": "scenario",
+    "dialect": "--dialect",
+    "transport": "--transport",
+    "seed": "--seed",
+    "web": "--web",
+}
+"""What not every emulated camera takes, as it is said."""
 
 
 @click.command(cls=JsonErrors, context_settings={"help_option_names": ["-h", "--help"]})
@@ -41,10 +54,9 @@ PROTOCOLS = (BVS.name, INSIGHT.name)
 )
 @click.option(
     "--protocol",
-    type=click.Choice(PROTOCOLS),
-    default=PROTOCOLS[0],
-    show_default=True,
-    help="Whose cameras; insight takes no scenario, --dialect or --transport.",
+    metavar="NAME",
+    help="Whose cameras: a name of `smartcam protocols`, where it brings an emulated camera; "
+    f"default what the scenario says, else {BVS.name}.",
 )
 @click.option(
     "--dialect",
@@ -73,6 +85,9 @@ PROTOCOLS = (BVS.name, INSIGHT.name)
     help="Of all that is left to chance; default what the scenario says, else 0.",
 )
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of scenario files, and end.")
+@click.option(
+    "--generators", is_flag=True, help="List what can make an application's values, and end."
+)
 @page_options("Serve a page that shows and controls the cameras; its address goes to stderr.")
 @runs(*OUTPUT, program="smartcam-emulator", interrupted=0, terminated=0)
 @click.version_option(smartcam.__version__)
@@ -83,13 +98,14 @@ async def command(
     scenario: str | None,
     host: str,
     port: int | None,
-    protocol: str,
+    protocol: str | None,
     dialect: str | None,
     transport: Literal["tcp", "udp"] | None,
     cameras: int,
     quirks: tuple[str, ...],
     seed: int | None,
     schema: bool,
+    generators: bool,
     web: PageOptions,
     options: Options,
 ) -> None:
@@ -98,53 +114,52 @@ async def command(
     Prints one line per camera, its URL. Without a scenario there are the built-in applications:
     1 three strings, 3 mixed fields, 7 the tangram table's localizations, 9 a free-running counter,
     21 "Hello World". An In-Sight camera has the jobs 1 (constants), 7 (a counter of triggers) and
-    9 (free-running), and is offline at first.
+    9 (free-running), and is offline at first. With --web and without a scenario 7 runs at once.
     """
     if schema:
         click.echo(json.dumps(scenario_schema(), indent=2))
         return
-    in_sight = protocol == INSIGHT.name
-    if in_sight:
-        _refuse_what_does_not_fit(context)
-
-    emulators: list[EmulatedCamera] | list[EmulatedInSight]
-    if in_sight:
-        chosen = _quirks(None, quirks)
-        emulators = [
-            EmulatedInSight(
-                BUILTIN_JOBS,
-                host=host,
-                port=port + index if port else 0,
-                quirks=chosen,
-                name=f"camera{index + 1}",
-            )
-            for index in range(cameras)
-        ]
-    else:
-        emulators = [
-            EmulatedCamera(
-                scenario=plan,
-                host=host,
-                port=port + index if port else port,
-                dialect=dialect,
-                transport=transport,
-                quirks=_quirks(plan, quirks),
-                seed=None if seed is None else seed + index,
-            )
-            for index, plan in enumerate(_scenarios(scenario, dialect, cameras))
-        ]
+    if generators:
+        _list_generators(options)
+        return
+    plans = _scenarios(scenario, protocol, dialect, cameras, shown=web.wanted)
+    for plan in plans:
+        _refuse_what_does_not_fit(context, plan)
+    chosen = dict(map(_quirk, quirks)) or None
+    emulators = [
+        emulated_class(plan.protocol).from_scenario(
+            plan,
+            host=host,
+            port=port + index if port else port,
+            dialect=dialect,
+            transport=transport,
+            quirks=chosen,
+            seed=None if seed is None else seed + index,
+        )
+        for index, plan in enumerate(plans)
+    ]
     async with contextlib.AsyncExitStack() as stack:
         for emulator in emulators:
             await stack.enter_async_context(emulator)
-        shown = [one for one in emulators if isinstance(one, EmulatedCamera)]
-        address = await _open_page(web, stack, shown)
+        address = await _open_page(web, stack, emulators)
         for emulator in emulators:
             _announce(emulator, options, named=scenario is not None, page=address)
         await asyncio.Event().wait()
 
 
+def _list_generators(options: Options) -> None:
+    """Print a line for each generator; a broken plug-in costs only its own."""
+    for info in GENERATORS.available():
+        try:
+            about = (find_generator(info.name).__doc__ or "").partition("\n")[0]
+        except ConfigurationError as exc:
+            about = f"broken: {exc}"
+        value = {"name": info.name, "origin": info.origin, "about": about}
+        options.show(value, f"{info.name} ({info.origin}): {about}")
+
+
 async def _open_page(
-    web: PageOptions, stack: contextlib.AsyncExitStack, cameras: Iterable[EmulatedCamera]
+    web: PageOptions, stack: contextlib.AsyncExitStack, cameras: Iterable[WireCamera]
 ) -> str | None:
     """Serve the page until the stack ends, print its address to stderr and return it."""
     if not web.wanted:
@@ -157,13 +172,21 @@ async def _open_page(
     return site.url
 
 
-def _scenarios(path: str | None, dialect: str | None, copies: int) -> tuple[Scenario, ...]:
+def _scenarios(
+    path: str | None, protocol: str | None, dialect: str | None, copies: int, *, shown: bool
+) -> tuple[Scenario, ...]:
     """Return a scenario for each camera.
 
     Raises ConfigurationError: the file is wrong, or copies are wanted of several cameras;
     MissingExtraError: PyYAML is not installed.
     """
-    loaded = (Scenario(),) if path is None else load_scenarios(path, dialect=dialect)
+    plain = _plain(protocol or BVS.name, shown=shown)
+    loaded = (plain,) if path is None else load_scenarios(path, dialect=dialect)
+    for plan in loaded:
+        if protocol not in {None, plan.protocol}:
+            raise ConfigurationError(
+                f"--protocol {protocol}: the scenario {path} has a camera of {plan.protocol}"
+            )
     if copies == 1:
         return loaded
     one, *others = loaded
@@ -177,16 +200,11 @@ def _scenarios(path: str | None, dialect: str | None, copies: int) -> tuple[Scen
     )
 
 
-def _quirks(scenario: Scenario | None, given: Iterable[str]) -> dict[str, Any] | None:
-    """Return the quirks that were given, with those of the scenario behind them; None for none.
-
-    Raises ConfigurationError: a value is no YAML; MissingExtraError: PyYAML is not installed.
-    """
-    options = dict(_quirk(text) for text in given)
-    if not options:
-        return None
-    before = {} if scenario is None else scenario.quirks.model_dump(exclude_unset=True)
-    return {**before, **options}
+def _plain(protocol: str, *, shown: bool) -> Scenario:
+    """Return a camera without a scenario; one with a page has something to show."""
+    if not (shown and emulated_class(protocol).state_options(SHOWN, running=True)):
+        return Scenario(protocol=protocol)
+    return Scenario(protocol=protocol, active=SHOWN, running=True)
 
 
 def _quirk(text: str) -> tuple[str, Any]:
@@ -199,39 +217,23 @@ def _quirk(text: str) -> tuple[str, Any]:
         raise ConfigurationError(f"--quirk {text:.200}: {exc}") from exc
 
 
-def _refuse_what_does_not_fit(context: click.Context) -> None:
-    """Refuse what was said for the cameras of another protocol; click.UsageError names it."""
-    said = {
-        "scenario": "scenario",
-        "dialect": "--dialect",
-        "transport": "--transport",
-        "seed": "--seed",
-        "web": "--web",
-    }
-    for name, text in said.items():
-        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"--protocol {INSIGHT.name} takes no {text}")
+def _refuse_what_does_not_fit(context: click.Context, plan: Scenario) -> None:
+    """Refuse what a camera of this protocol does not take; click.UsageError names what it does."""
+    takes = emulated_class(plan.protocol).takes
+    for name, text in _SAID.items():
+        given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if given and name not in takes:
+            able = ", ".join(text for name, text in _SAID.items() if name in takes)
+            raise click.UsageError(f"--protocol {plan.protocol} takes no {text}; it takes {able}")
 
 
-def _announce(
-    emulator: EmulatedCamera | EmulatedInSight,
-    options: Options,
-    *,
-    named: bool,
-    page: str | None,
-) -> None:
-    if isinstance(emulator, EmulatedInSight):
-        transport, dialect = INSIGHT.schemes["insight"].value, next(iter(INSIGHT.dialects))
-        ids = [job.id for job in emulator.device.jobs.values() if job.id is not None]
-    else:
-        transport, dialect = emulator.transport, emulator.dialect
-        ids = list(emulator.device.applications)
-    value = camera_value(emulator, transport, dialect, ids)
+def _announce(emulator: WireCamera, options: Options, *, named: bool, page: str | None) -> None:
+    value = camera_value(emulator)
     if named or page is not None:
         value["name"] = emulator.name
     if page is not None:
         value["web"] = page
-    if isinstance(emulator, EmulatedCamera) and emulator.scenario.is_random:
+    if emulator.is_random:
         value["seed"] = emulator.seed
         click.echo(
             f"{emulator.name}: what is left to chance has the seed {emulator.seed}", err=True

@@ -10,11 +10,10 @@ from smartcam.models import Localization, Result, jsonable
 from smartcam.protocols.messages import UNNAMED_APPLICATION
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from smartcam.client import SmartCamera
-    from smartcam.emulator import EmulatedCamera
-    from smartcam.emulator._insight.camera import EmulatedInSight
+    from smartcam.emulator import WireCamera
 
 
 def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -32,17 +31,15 @@ def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     return "\n".join("  " + line for line in lines)
 
 
-def camera_value(
-    emulator: EmulatedCamera | EmulatedInSight, transport: str, dialect: str, ids: Iterable[int]
-) -> dict[str, Any]:
+def camera_value(emulator: WireCamera) -> dict[str, Any]:
     """Return an emulated camera's address and applications, for JSON."""
     return {
         "url": emulator.url,
         "host": emulator.host,
         "port": emulator.port,
-        "transport": transport,
-        "dialect": dialect,
-        "applications": sorted(ids),
+        "transport": emulator.transport,
+        "dialect": emulator.dialect,
+        "applications": sorted(emulator.application_ids),
     }
 
 

@@ -19,12 +19,11 @@ from smartcam._client.attempts import CONNECTING, OPENING, SessionRefusedError, 
 from smartcam._client.link import Chunk, Link, open_link
 from smartcam.exceptions import (
     CommandRejectedError,
-    ConfigurationError,
     ConnectFailedError,
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.protocols._base import Dialect, Protocol, Transport, Verdict
+from smartcam.protocols._base import Dialect, Transport, Verdict, load_protocol
 from smartcam.protocols._framed.machine import LinkEnded, LinkFailed
 from smartcam.protocols.messages import (
     Connect,
@@ -37,7 +36,6 @@ from smartcam.protocols.messages import (
     StatusReport,
     UnknownMessage,
 )
-from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -180,19 +178,6 @@ def code_text(dialect: Dialect, code: int, request: type[Message] | None = None)
     """Return the text of a result code in the answer to a request."""
     number = f"{code:#04x}" if code >= 0 else str(code)
     return f"code {number} ({dialect.code(code, request).text})"
-
-
-def load_protocol(name: str) -> Protocol:
-    """Return the protocol of this name.
-
-    Raises:
-        PluginError: unknown, or it failed to load.
-        ConfigurationError: the entry point gives something else.
-    """
-    protocol = PROTOCOLS.load(name)
-    if not isinstance(protocol, Protocol):
-        raise ConfigurationError(f"entry point {name!r} gives {protocol!r}, not a Protocol")
-    return protocol
 
 
 async def attempt(

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam._client.attempts import Try
-from smartcam._client.handshake import attempt, load_protocol, names_of
+from smartcam._client.handshake import attempt, names_of
 from smartcam.exceptions import SmartCamError
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
-from smartcam.protocols._base import Transport
+from smartcam.protocols._base import Transport, load_protocol
 from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH
 from smartcam.protocols.messages import QueryAnswer, StatusReport
 

@@ -8,7 +8,7 @@ import socket
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.attempts import reason_for, words
-from smartcam._client.handshake import load_protocol, remarks
+from smartcam._client.handshake import remarks
 from smartcam.doctor._findings import Exit
 from smartcam.doctor._probing import trials
 from smartcam.doctor._timing import figures
@@ -17,7 +17,7 @@ from smartcam.exceptions import (
     ProtocolError,
     ResponseTimeoutError,
 )
-from smartcam.protocols._base import Transport
+from smartcam.protocols._base import Transport, load_protocol
 
 if TYPE_CHECKING:
     from smartcam._client.attempts import Reason, Try

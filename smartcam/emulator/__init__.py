@@ -24,12 +24,14 @@ if TYPE_CHECKING:
     from smartcam.emulator._insight.camera import EmulatedInSight
     from smartcam.emulator._insight.commands import InSightQuirks
     from smartcam.emulator._insight.job import Job
+    from smartcam.emulator._line_camera import LineCamera, LineClient
     from smartcam.emulator._scenario.file import load_scenario, load_scenarios, scenario_schema
     from smartcam.emulator._scenario.scenario import Scenario
     from smartcam.emulator._scenario.states import DeviceState
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator._scene import TablePose, TableScene
     from smartcam.emulator._traffic import LogEntry, Visit
+    from smartcam.emulator._wire_camera import WireCamera
     from smartcam.emulator.faults import FiredFault
 
 __all__ = [
@@ -43,6 +45,8 @@ __all__ = [
     "FiredFault",
     "InSightQuirks",
     "Job",
+    "LineCamera",
+    "LineClient",
     "LogEntry",
     "ManualClock",
     "Quirks",
@@ -51,6 +55,7 @@ __all__ = [
     "TablePose",
     "TableScene",
     "Visit",
+    "WireCamera",
     "faults",
     "load_scenario",
     "load_scenarios",
@@ -71,6 +76,7 @@ if not TYPE_CHECKING:
             "_fleet": "EmulatedFleet",
             "_generators": "Run register_generator",
             "_insight.camera": "EmulatedInSight",
+            "_line_camera": "LineCamera LineClient",
             "_insight.commands": "InSightQuirks",
             "_insight.job": "Job",
             "_scenario.file": "load_scenario load_scenarios scenario_schema",
@@ -79,6 +85,7 @@ if not TYPE_CHECKING:
             "_scenario.timeline": "Cue",
             "_scene": "TablePose TableScene",
             "_traffic": "LogEntry Visit",
+            "_wire_camera": "WireCamera",
             "faults": "FiredFault",
         },
     )

@@ -8,92 +8,62 @@ the device's next event.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, cast
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from smartcam._server import Server
 from smartcam.emulator._bvs.behaviour import behaviour_of
+from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK
 from smartcam.emulator._bvs.device import Device
-from smartcam.emulator._client_link import SecondClientSession
-from smartcam.emulator._clock import Clock, OneTimer, RealClock, nanoseconds
-from smartcam.emulator._links import TcpListener, UdpListener
-from smartcam.emulator._port import Port
+from smartcam.emulator._client_link import MAX_INPUT, SecondClientSession
+from smartcam.emulator._clock import ManualClock, nanoseconds
 from smartcam.emulator._scenario.merge import make_plan
-from smartcam.emulator._scenario.timeline import Timeline
+from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._scene import TableScene
-from smartcam.emulator._traffic import TrafficLog, Visit
-from smartcam.emulator.faults._base import DeviceFault
-from smartcam.emulator.faults._device_effects import Stage, act
-from smartcam.emulator.faults._matching import FaultQueue
-from smartcam.exceptions import ConfigurationError
+from smartcam.emulator._wire_camera import WireCamera
+from smartcam.emulator.faults._matching import misfit
+from smartcam.exceptions import ConfigurationError, FrameError
+from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
-from smartcam.protocols._framed.framing import Frame
-from smartcam.registry import PROTOCOLS
+from smartcam.protocols._base import POLICIES, Policy, Role, Transport
+from smartcam.protocols._bvs import BVS
+from smartcam.protocols._framed.machine import Machine
 from smartcam.settings import Address
 
 if TYPE_CHECKING:
-    from collections import deque
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-    from contextlib import AbstractContextManager
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from smartcam.emulator._application import Application
+    from smartcam.emulator._bvs.device import LastReport
     from smartcam.emulator._bvs.quirks import Quirks
-    from smartcam.emulator._client_link import ClientLink
-    from smartcam.emulator._clock import TimerHandle
-    from smartcam.emulator._links import Listener
-    from smartcam.emulator._scenario.scenario import Scenario
-    from smartcam.emulator._scenario.states import DeviceState
+    from smartcam.emulator._client_link import ClientLink, Trace
+    from smartcam.emulator._clock import Clock
+    from smartcam.emulator._scenario.scenario import Mistake, Scenario
     from smartcam.emulator._scenario.timeline import Cue
-    from smartcam.emulator._traffic import Log
-    from smartcam.emulator.faults import Fault, FiredFault
     from smartcam.emulator.faults._base import BaseFault
-    from smartcam.emulator.faults._matching import Row
-    from smartcam.emulator.faults._wire_effects import WireMessage
-    from smartcam.exceptions import RemoteProtocolError
-    from smartcam.protocols._base import Protocol
     from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols._framed.framing import Frame
+
+CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
+"""What an operator can set and clear, by name."""
+
+SHOWN = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
+"""What the page shows of an application."""
+
+_SHOWN = 20  # ids that an error names
 
 _log = logging.getLogger("smartcam.emulator")
 
-_LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
-    Transport.TCP: TcpListener,
-    Transport.UDP: UdpListener,
+BAD_FRAME: Mapping[str, Policy] = {
+    "skip": POLICIES[Role.CAMERA, Transport.TCP],
+    "close": Policy(fatal=(FrameError,), exact_length=True),
 }
+"""What the quirk ``bad_frame`` means on TCP; a broken body or an unknown id never matters."""
 
 
-@dataclass(slots=True, eq=False)
-class _Bracket:
-    """A context that begins and ends something; inside itself it does nothing."""
-
-    _begin: Callable[[], None]  # called on the way in; where it raises there is no step
-    _end: Callable[[], None]  # called on the way out, after an error too
-    _depth: int = 0
-
-    def __enter__(self) -> None:
-        if not self._depth:
-            self._depth = 1
-            try:
-                self._begin()
-            except BaseException:
-                self._depth = 0
-                raise
-        else:
-            self._depth += 1
-
-    def __exit__(self, *error: object) -> None:
-        if self._depth > 1:
-            self._depth -= 1
-            return
-        try:
-            self._end()
-        finally:
-            self._depth = 0
-
-
-class EmulatedCamera(Server):
+class EmulatedCamera(WireCamera):
     """A camera made of software, on a real port.
 
     ::
@@ -143,6 +113,11 @@ class EmulatedCamera(Server):
         ConfigurationError: something given is wrong.
     """
 
+    takes: ClassVar[frozenset[str]] = frozenset(
+        {"scenario", "dialect", "transport", "seed", "web", "replay"}
+    )
+    states: ClassVar[frozenset[DeviceState]] = frozenset(DeviceState)
+
     def __init__(
         self,
         applications: Iterable[Application | dict[str, Any]] = (),
@@ -176,60 +151,108 @@ class EmulatedCamera(Server):
             seed=seed,
             builtins=builtins,
         )
-        self.host = host
-        self.transport: Literal["tcp", "udp"] = plan.transport
-        self.dialect: str = plan.dialect
         self.scenario: Scenario = plan
-        self.name: str = plan.name
-        self.clock: Clock = clock if clock is not None else RealClock()
-        self.seed: int = plan.seed
-        self._protocol = cast("Protocol", PROTOCOLS.load("bvs"))
-        dialect_spoken = cast("FramedDialect", self._protocol.dialects[plan.dialect])
-        self.spoken: FramedDialect = dialect_spoken.with_quirks(plan.quirks.of_the_wire)
+        self.spoken: FramedDialect = BVS.dialects[plan.dialect].with_quirks(plan.quirks.of_the_wire)
         self.device: Device = Device(
             plan.all_applications,
             active=plan.active,
             running=plan.running,
             quirks=plan.quirks,
             scene=TableScene(seed=plan.seed),
+            clock_time=LOST_CLOCK if isinstance(clock, ManualClock) else datetime.now(UTC),
             behaviour=behaviour_of(self.spoken, plan.quirks),
         )
-        self._step = _Bracket(self._begin_step, self._end_step)
-        self.device.around = self.step
-        kind = Transport(plan.transport)
-        self._scheme = next(s for s, t in self._protocol.schemes.items() if t is kind)
-        self._listener: Listener = _LISTENERS[kind](self)
-        self._port = Port(self._listener, host, plan.port, self.name)
-        self._traffic = TrafficLog(self.spoken)
-        self.queue: FaultQueue = FaultQueue(self.spoken, self.clock, self.device.applications)
-        self._stage = Stage(
+        super().__init__(
+            spoken=self.spoken,
             device=self.device,
-            refuse=self._refuse,
-            let_second_client_in=self._let_second_client_in,
-            clear=self.clear_faults,
+            host=host,
+            port=plan.port,
+            transport=plan.transport,
+            dialect=plan.dialect,
+            name=plan.name,
+            clock=clock,
+            seed=plan.seed,
+            timeline=plan.timeline,
+            applications=self.device.applications,
         )
-        self._timeline = self._make_timeline()
+        self.device.around = self.step
         self._active: ClientLink | SecondClientSession | None = None
-        self._refusal: TimerHandle | None = None
-        self._refused_until = 0.0
-        self._started = False
-        self._down = False
         self._moved_at = 0.0
-        self._timer = OneTimer(self.clock, self._wake)
         self.queue.add(faults)
+
+    @classmethod
+    def from_scenario(
+        cls,
+        plan: Scenario,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+        seed: int | None = None,
+    ) -> EmulatedCamera:
+        """Return a camera of a scenario; what is given beside it goes before it."""
+        own = plan.quirks.model_dump(exclude_unset=True)
+        return cls(
+            scenario=plan,
+            host=host,
+            port=port,
+            transport=transport,
+            dialect=dialect,
+            quirks={**own, **quirks} if quirks else None,
+            clock=clock,
+            seed=seed,
+        )
+
+    @classmethod
+    def mistake(cls, plan: Scenario) -> Mistake | None:
+        """Return the place in it of what the camera cannot do, and why; None where all is well."""
+        dialect = BVS.dialects[plan.dialect]
+        known = [application.id for application in plan.all_applications]
+        for number, application in enumerate(plan.applications):
+            ids = dialect.application_ids
+            if application.id not in ids:
+                text = (
+                    f"application id {application.id} does not fit dialect {dialect.name}: "
+                    f"{ids.start} to {ids.stop - 1}"
+                )
+                return ("applications", number, "id"), text
+        if plan.active is not None and plan.active not in known:
+            there = ", ".join(str(number) for number in known[:_SHOWN])
+            more = ", ..." if len(known) > _SHOWN else ""
+            asked = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
+            return ("active",), f"no application has {asked}; there are {there}{more}"
+        try:
+            spoken = dialect.with_quirks(plan.quirks.of_the_wire)
+        except ConfigurationError as exc:
+            return ("quirks",), str(exc)
+        for number, cue in enumerate(plan.timeline):
+            for place, fault in enumerate(cue.do):
+                found = misfit(fault, spoken, known)
+                if found is not None:
+                    return ("timeline", number, "do", place, found[0]), found[1]
+        return None
+
+    @classmethod
+    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
+        """Return the options with which an application is active, and runs, from the beginning."""
+        return {"active": active, "running": running}
 
     # ------------------------------------------------------------------ what it is
 
     @property
-    def port(self) -> int:
-        """The port it listens on; the one given until it is started."""
-        return self._port.number
-
-    @property
     def url(self) -> str:
         """Its address with the dialect pinned."""
-        quirks = self.spoken.quirks
-        return Address("bvs", self._scheme, self.host, self.port, self.dialect, quirks).url
+        kind = Transport(self.transport)
+        scheme = next(s for s, t in BVS.schemes.items() if t is kind)
+        return Address("bvs", scheme, self.host, self.port, self.dialect, self.spoken.quirks).url
+
+    @property
+    def application_ids(self) -> list[int]:
+        """Ids of the applications on it."""
+        return list(self.device.applications)
 
     def __repr__(self) -> str:
         return f"<EmulatedCamera {self.name} {self.url}>"
@@ -240,14 +263,47 @@ class EmulatedCamera(Server):
         return self.device.scene
 
     @property
+    def clock_time(self) -> datetime:
+        """What its own clock shows."""
+        return self.device.clock_time
+
+    @property
+    def last_report(self) -> LastReport | None:
+        """What the last run reported, whether anybody heard it or not; its time is the log's."""
+        last = self.device.last_report
+        if last is None:
+            return None
+        return last._replace(time=self._moved_at - (self.device.time - last.time))
+
+    def application_of(self, message: m.ResultContainer) -> Application | None:
+        """Return the application that describes a result; None where none does."""
+        return self.device.applications.get(message.application)
+
+    def shown(self) -> dict[str, Any]:
+        """Return what its page shows of its state."""
+        device = self.device
+        return {
+            **super().shown(),
+            "mode": device.mode,
+            "status": device.status,
+            "active_application": device.active_application,
+            "conditions": {name: bit in device.status for name, bit in CONDITIONS.items()},
+            "running": device.running,
+            "processing": device.processing,
+            "endian": device.endian,
+            "next_number": device.next_number,
+            "queued_inputs": device.queued_inputs,
+            "applications": [
+                {key: getattr(one, key) for key in SHOWN} for one in device.applications.values()
+            ],
+            "quirks": self.quirks,
+            "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),
+        }
+
+    @property
     def quirks(self) -> Quirks:
         """Its quirks."""
         return self.device.quirks
-
-    @property
-    def log(self) -> Log:
-        """The last frames in both directions, oldest first."""
-        return self._traffic.entries
 
     @property
     def has_session(self) -> bool:
@@ -259,209 +315,24 @@ class EmulatedCamera(Server):
         """Address and port of the client that has the session, or nothing."""
         return [] if self._active is None else [self._active.peer]
 
-    @property
-    def links(self) -> list[str]:
-        """Address and port of all clients that are connected, with a session or without."""
-        return [link.peer for link in self._listener.all_links]
+    # ------------------------------------------------------------------ links and the session
 
-    @property
-    def crowded_out(self) -> int:
-        """Clients without a session that were sent away because too many were connected."""
-        return self._listener.crowded_out
+    def make_machine(self, transport: Transport, trace: Trace) -> Machine:
+        """Return the machine of a new link."""
+        return Machine(
+            self.spoken,
+            Role.CAMERA,
+            transport,
+            max_length=MAX_INPUT,
+            policy=self._policy(transport),
+            trace=trace,
+        )
 
-    @property
-    def faults(self) -> list[Fault]:
-        """The faults that still wait, in the order in which they were given."""
-        return self.queue.waiting
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """The commands that the timeline knows, sorted."""
-        return self.scenario.commands
-
-    @property
-    def cues_done(self) -> list[int]:
-        """How often each cue of ``scenario.timeline`` has happened since the start."""
-        return self._timeline.done
-
-    @property
-    def visits(self) -> deque[Visit]:
-        """The last connections that have ended, oldest first; over UDP there are none."""
-        return self._traffic.visits
-
-    @property
-    def fired(self) -> deque[FiredFault]:
-        """The last faults that have happened, oldest first."""
-        return self.queue.fired
-
-    async def wait_received(
-        self, what: int | type[m.Message], *, count: int = 1, timeout: float = 5.0
-    ) -> None:
-        """Wait until clients have sent ``count`` whole frames of a kind since the beginning.
-
-        When it returns, the device has handled them. The timeout runs in real time, whatever the
-        emulator's clock is.
-
-        Args:
-            what: a message id, or a message type.
-            count: how many, those that came before this call included.
-            timeout: seconds.
-
-        Raises:
-            ResponseTimeoutError: they did not come in time.
-
-        Cancellation: safe.
-        """
-        await self._traffic.wait_received(what, count=count, timeout=timeout)
-
-    # ------------------------------------------------------------------ life
-
-    async def start(self) -> None:
-        """Open the port; does nothing if it is started already.
-
-        Raises:
-            ConfigurationError: it cannot listen there.
-
-        Cancellation: leaves it stopped.
-        """
-        if self._started:
-            return
-        try:
-            await self._port.open()
-        except (OSError, ValueError, OverflowError) as exc:
-            raise ConfigurationError(
-                f"emulator: cannot listen on {self.transport} {self.host}:{self.port}: {exc}"
-            ) from exc
-        self._started = True
-        self._down = False
-        self._moved_at = self.clock.now
-        self._timeline = self._make_timeline()
-        if self._timeline.watches:
-            self.device.watch(self._entered)
-        with self.step():
-            self._act_at_once()
-            self._timeline.start()
-        _log.info("= %s: listening on %s", self.name, self.url)
-        if self.scenario.is_random:
-            _log.info("= %s: chance has the seed %d", self.name, self.seed)
-
-    async def stop(self) -> None:
-        """Close the port and every connection; the device stands still. Does nothing if stopped.
-
-        Cancellation: everything is closed nevertheless.
-        """
-        if self._started:
-            self._started = False
-            self._timer.set(None)
-            self._timeline.stop()
-            self._end_refusal()
-            if isinstance(self._active, SecondClientSession):
-                self._leave_session()
-            self._port.shut()
-            await self._port.wait_closed()
-
-    # ------------------------------------------------------------------ faults
-
-    def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
-        """Add faults behind those that wait; what waits for no message happens now.
-
-        Call it in the event loop's thread. Before the emulator is started they wait until then.
-
-        Args:
-            faults: faults of :mod:`smartcam.emulator.faults`, or mappings with ``kind``.
-
-        Raises:
-            ConfigurationError: one is wrong, or too many would wait; none was added.
-        """
-        with self.step():
-            self._collect()  # what was said before is not changed
-            self.queue.add(faults)
-            if self._started:
-                self._act_at_once()
-
-    def command(self, name: str) -> None:
-        """Give a command: the timeline's cues that wait for it happen.
-
-        Call it in the event loop's thread, while the emulator is started.
-
-        Raises:
-            ConfigurationError: no cue has it.
-        """
-        self._timeline.command(name)
-
-    def clear_faults(self) -> None:
-        """Forget the faults that wait, and end those that last.
-
-        BUSY falls, the port opens, the second client goes, connections that are half open or
-        stalled are reset. What is delayed comes at its time, and a reboot takes its time.
-        """
-        self.queue.clear()
-        with self.step():
-            self.device.end_faults()
-            self._end_refusal()
-            if isinstance(self._active, SecondClientSession):
-                self._leave_session()
-            for link in self._listener.all_links:
-                link.heal()
-
-    def _refuse(self, seconds: float) -> None:
-        """Close the port for a time; connections that are open stay."""
-        self._refused_until = max(self._refused_until, self.clock.now + seconds)
-        if self._refusal is not None:
-            self._refusal.cancel()
-        elif not self._down:
-            self._port.close()
-        self._refusal = self.clock.call_at(self._refused_until, self._wake_port)
-
-    def _let_second_client_in(self) -> None:
-        """Another client connects and gets the session, unless a quirk refuses newcomers."""
-        if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
-            return
-        self._hand_session(SecondClientSession(self.spoken, self._told_second_client))
-
-    def _make_timeline(self) -> Timeline:
-        cues, seed = self.scenario.timeline, self.seed
-        return Timeline(cues, clock=self.clock, seed=seed, inject=lambda do: self.inject(*do))
-
-    def _entered(self, state: DeviceState) -> None:
-        """The device has entered a state: what it said before is not changed by what follows."""
-        self._collect()
-        self._timeline.entered(state)
-
-    def _act_at_once(self) -> None:
-        self._act(self.queue.at_once(), None)
-
-    def _provoke(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
-        """Let the device faults happen that come before a message; return all it brings about."""
-        if not waiting:
-            return ()
-        faults = self.queue.by_message(waiting, message)
-        self._act(faults, "before")
-        return faults
-
-    def _act(self, faults: Iterable[Fault], when: Literal["before", "after"] | None) -> None:
-        """Let device faults happen; what the camera says to it wakes no other device fault."""
-        for fault in faults:
-            if isinstance(fault, DeviceFault) and when in {None, fault.when}:
-                act(self._stage, fault)
-                self._say_all(self.device.take_output(), provoke=False)
-
-    # ------------------------------------------------------------------ steps
-
-    def step(self) -> AbstractContextManager[None]:
-        """Bring the device's time up, do the body, deliver what came of it, set the timer.
-
-        Inside another step it is a part of that one.
-        """
-        return self._step
-
-    def _begin_step(self) -> None:
-        if self._started:
-            self._move()
-
-    def _end_step(self) -> None:
-        if self._started:
-            self._settle()
+    def _policy(self, transport: Transport) -> Policy:
+        """Return the policy for broken input."""
+        tcp = transport is Transport.TCP
+        policy = BAD_FRAME[self.quirks.bad_frame] if tcp else POLICIES[Role.CAMERA, transport]
+        return dataclasses.replace(policy, tells=self.device.behaviour.tells_bad_messages)
 
     def received(self, link: ClientLink, message: m.Message) -> None:
         """A link received a message; who has no session is heard with Connect only."""
@@ -491,45 +362,14 @@ class EmulatedCamera(Server):
         if link is self._active:
             self._leave_session()
 
-    def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
-        """A connection has ended."""
-        by: Literal["client", "camera"] = "client" if by_client else "camera"
-        self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
-
-    def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        """A machine saw a frame, or bytes that make none."""
-        self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
-        if _log.isEnabledFor(logging.DEBUG):
-            self._show_last()
-        if sender is m.Sender.CLIENT and isinstance(what, Frame):
-            self._traffic.count(what)
-
-    def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
-        """What faults made of a message has passed, or is lost."""
-        faults = ", ".join(message.faults) or None
-        self._note(link.peer, sender, message.what, faults, message.wire)
+    def _let_second_client_in(self) -> None:
+        """Another client connects and gets the session, unless a quirk refuses newcomers."""
+        if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
+            return
+        self._hand_session(SecondClientSession(self.spoken, self._told_second_client))
 
     def _told_second_client(self, frame: Frame) -> None:
         self._note(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
-
-    def _note(
-        self,
-        peer: str,
-        sender: m.Sender,
-        what: Frame | bytes,
-        fault: str | None,
-        wire: bytes | None,
-    ) -> None:
-        self._traffic.add(self.clock.now, peer, sender, what, fault, wire)
-        if _log.isEnabledFor(logging.DEBUG):
-            self._show_last()
-
-    def _show_last(self) -> None:
-        entry = self.log[-1]
-        mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
-        faulty = f" ({entry.fault}; on the wire: {entry.wire})" if entry.fault else ""
-        said = entry.error or entry.message or f"message {entry.message_id}: {entry.hex}"
-        _log.debug("%s %s: %s%s", mark, entry.peer, said, faulty)
 
     def _connect(self, link: ClientLink) -> None:
         """Give the session to ``link``: the newcomer wins, unless a quirk says otherwise."""
@@ -554,9 +394,23 @@ class EmulatedCamera(Server):
         self._active = None
         self.device.disconnect()
 
-    def _wake(self) -> None:
-        with self.step():
-            pass
+    # ------------------------------------------------------------------ steps
+
+    def _began(self) -> None:
+        self._moved_at = self.clock.now
+        if self._timeline.watches:
+            self.device.watch(self._entered)
+
+    def _ends(self) -> None:
+        if isinstance(self._active, SecondClientSession):
+            self._leave_session()
+
+    def _end_device_faults(self) -> None:
+        self.device.end_faults()
+        self._ends()
+
+    def _deliver_at_once(self) -> None:
+        self._say_all(self.device.take_output(), provoke=False)
 
     def _move(self) -> None:
         now = self.clock.now
@@ -609,16 +463,3 @@ class EmulatedCamera(Server):
         self._down = False
         if self._refusal is None:
             self._port.reopen()
-
-    def _end_refusal(self) -> None:
-        """Open the port that a fault closed."""
-        refusal, self._refusal = self._refusal, None
-        self._refused_until = 0.0
-        if refusal is not None:
-            refusal.cancel()
-            if self._started and not self._down:
-                self._port.reopen()
-
-    def _wake_port(self) -> None:
-        with self.step():
-            self._end_refusal()

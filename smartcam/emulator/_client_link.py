@@ -1,38 +1,38 @@
 """One client's way to the camera, and the way of its messages while faults act on them.
 
-Each link has a :class:`~smartcam.protocols._framed.machine.Machine` in the camera's role. It is
-faulty only while wire faults wait or something of theirs is under way. What the camera says then
-goes ``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; what a client sends goes
+Each link has a machine in the camera's role, which its owner makes. It is faulty only while wire
+faults wait or something of theirs is under way. What the camera says then goes
+``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; what a client sends goes
 ``FaultyLink.take -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias
 
 from smartcam.emulator._clock import OneTimer, nanoseconds
 from smartcam.emulator.faults._delay_line import DelayLine
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
-from smartcam.exceptions import FrameError, LocalProtocolError, RemoteProtocolError
+from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import POLICIES, Policy, Role, Transport
-from smartcam.protocols._framed.framing import Frame, Framer
-from smartcam.protocols._framed.machine import Machine
+from smartcam.protocols._base import Transport
+from smartcam.protocols._framed.framing import Frame
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable
     from contextlib import AbstractContextManager
 
-    from smartcam.emulator._bvs.device import Device
     from smartcam.emulator._clock import Clock
     from smartcam.emulator.faults import Fault
     from smartcam.emulator.faults._delay_line import Ending
     from smartcam.emulator.faults._matching import FaultQueue
+    from smartcam.emulator.faults._wire_effects import WireCodec, WireFramer
+    from smartcam.exceptions import RemoteProtocolError
     from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols._framed.machine import State
 
 _log = logging.getLogger("smartcam.emulator")
 
@@ -40,36 +40,65 @@ MAX_INPUT = 1 << 16
 """Bytes of payload the camera takes: input data has the container's limit of about 64 kB (HALCON
 script manual p. 35, published for that side)."""
 
-WRITE_LIMIT = 1 << 20
-"""Bytes kept for a client that does not read, or held back by faults; more end its connection."""
-
 _ENDED = "connection ended"
 _UNSENT = "not sent"
 
-BAD_FRAME: Mapping[str, Policy] = {
-    "skip": POLICIES[Role.CAMERA, Transport.TCP],
-    "close": Policy(fatal=(FrameError,), exact_length=True),
-}
-"""What the quirk ``bad_frame`` means on TCP; a broken body or an unknown id never matters."""
+Trace: TypeAlias = "Callable[[m.Sender, Frame | RemoteProtocolError], None]"
 
 
-def _policy(owner: LinkOwner, transport: Transport) -> Policy:
-    """Return the policy for broken input."""
-    tcp = transport is Transport.TCP
-    policy = BAD_FRAME[owner.device.quirks.bad_frame] if tcp else POLICIES[Role.CAMERA, transport]
-    return dataclasses.replace(policy, tells=owner.device.behaviour.tells_bad_messages)
+class CameraMachine(Protocol):
+    """What a link needs of the machine that speaks over it, in the camera's role."""
+
+    transport: Transport
+
+    @property
+    def state(self) -> State:
+        """Where the link is."""
+        ...
+
+    @property
+    def buffered(self) -> int:
+        """Bytes that wait for more."""
+        ...
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes; never raises for what is in them."""
+
+    def events(self) -> Iterable[object]:
+        """Return what was heard since the last call."""
+        ...
+
+    def send(self, message: Any) -> None:
+        """Say something; LocalProtocolError: not now."""
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the bytes to write, in order."""
+        ...
 
 
 class LinkOwner(Protocol):
     """What links want from the emulator behind them."""
 
-    spoken: FramedDialect
     clock: Clock
     queue: FaultQueue  # the faults that wait
-    device: Device  # the camera behind the wire
+    max_links: int  # clients that are looked at
+    write_limit: int  # bytes kept for a client that does not read
+
+    @property
+    def codec(self) -> WireCodec:
+        """The words on the wire."""
+        ...
 
     def step(self) -> AbstractContextManager[object]:
         """Bring the device's time up; afterwards deliver what it said."""
+        ...
+
+    def make_machine(self, transport: Transport, trace: Trace) -> CameraMachine:
+        """Return the machine of a new link."""
+        ...
+
+    def arrived(self, link: ClientLink) -> None:
+        """A connection was made."""
         ...
 
     def received(self, link: ClientLink, message: m.Message) -> None:
@@ -106,14 +135,7 @@ class ClientLink(ABC):
         self.hearing: str | None = None
         """Kinds of the faults that acted on what the camera hears just now."""
         self._owner = owner
-        self._machine = Machine(
-            owner.spoken,
-            Role.CAMERA,
-            transport,
-            max_length=MAX_INPUT,
-            policy=_policy(owner, transport),
-            trace=self._trace,
-        )
+        self.machine: CameraMachine = owner.make_machine(transport, self._trace)
         self._faulty: FaultyLink | None = None  # there while faults act
 
     def say(self, message: m.Message) -> None:
@@ -121,18 +143,18 @@ class ClientLink(ABC):
         if self._owner.queue.said and self._faulty is None:
             self._enter_faulty()
         try:
-            self._machine.send(message)
+            self.machine.send(message)
         except LocalProtocolError as exc:
             _log.warning("! %s: not sent: %s", self.peer, exc)
             return
         if self._faulty is not None:
-            self._faulty.say(message, b"".join(self._machine.data_to_send()))
+            self._faulty.say(message, b"".join(self.machine.data_to_send()))
 
     def flush(self) -> None:
         """Write everything said."""
         faulty = self._faulty
         if faulty is None:
-            self._write_frames(self._machine.data_to_send())
+            self._write_frames(self.machine.data_to_send())
             return
         faulty.run()
         if faulty.idle:
@@ -156,8 +178,8 @@ class ClientLink(ABC):
 
     def feed(self, data: bytes) -> None:
         """Feed the machine and pass its messages on."""
-        self._machine.receive_data(data)
-        for event in self._machine.events():
+        self.machine.receive_data(data)
+        for event in self.machine.events():
             if isinstance(event, m.Message) and not self.closed:
                 self._owner.received(self, event)
 
@@ -166,8 +188,11 @@ class ClientLink(ABC):
         """Write bytes that belong together; False if it was not possible."""
 
     @abstractmethod
-    def part(self, how: Literal["close", "reset"]) -> None:
-        """End the link as a fault has it."""
+    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+        """End the link behind what was written, or by a reset."""
+
+    def hold(self, on: bool) -> None:  # noqa: B027  only where the network keeps what is not read
+        """Read nothing more for a time, or go on."""
 
     @abstractmethod
     def stop_listening(self) -> None:
@@ -179,7 +204,7 @@ class ClientLink(ABC):
 
     def overflow(self) -> None:
         """Faults hold back too much."""
-        self.close(f"more than {WRITE_LIMIT} bytes are held back")
+        self.close(f"more than {self._owner.write_limit} bytes are held back")
 
     @abstractmethod
     def _write_frames(self, frames: list[bytes]) -> None:
@@ -194,8 +219,8 @@ class ClientLink(ABC):
 
     def _enter_faulty(self) -> FaultyLink:
         if self._faulty is None:
-            self._write_frames(self._machine.data_to_send())
-            self._faulty = FaultyLink(self, self._owner, self._machine)
+            self._write_frames(self.machine.data_to_send())
+            self._faulty = FaultyLink(self, self._owner, self.machine)
         return self._faulty
 
     def _leave(self) -> None:
@@ -214,14 +239,14 @@ class FaultyLink:
 
     _link: ClientLink
     _owner: LinkOwner
-    _machine: Machine
+    machine: CameraMachine
 
     def __post_init__(self) -> None:
         self.muted: str | None = None  # kind of the fault that keeps the camera silent on this link
         self.dead: bool = False  # nothing is read either
         self._outgoing = self._line(m.Sender.CAMERA, self._wake_outgoing, self._carry_out)
         self._incoming = self._line(m.Sender.CLIENT, self._wake_incoming, self._carry_in)
-        self._framer: Framer | None = None  # where it is, the client's bytes go through it
+        self._framer: WireFramer | None = None  # where it is, the client's bytes go through it
         self._revival = OneTimer(self._owner.clock, self._revive)
 
     def _line(
@@ -232,7 +257,7 @@ class FaultyLink:
     ) -> DelayLine[WireMessage]:
         return DelayLine(
             self._owner.clock,
-            ordered=self._machine.transport is Transport.TCP,
+            ordered=self.machine.transport is Transport.TCP,
             wake=wake,
             carry=carry,
             end=self._end,
@@ -270,8 +295,8 @@ class FaultyLink:
 
     def say(self, message: m.Message, data: bytes) -> None:
         """Take a message that the camera says, and its bytes; :meth:`run` next."""
-        dialect, queue = self._owner.spoken, self._owner.queue
-        frame = Frame(dialect.message_id(message), data[dialect.header.size :])
+        dialect, queue = self._owner.codec, self._owner.queue
+        frame = dialect.to_frame(message)
         faults = queue.by_message(queue.said, message)
         self._put(self._outgoing, apply_faults(WireMessage.of(frame, data), faults, dialect))
 
@@ -302,16 +327,16 @@ class FaultyLink:
         if self.dead:
             return
         heard = self._owner.queue.heard
-        if self._machine.transport is Transport.UDP:
-            self._take_message(cut_datagram(data, self._owner.spoken))
+        if self.machine.transport is Transport.UDP:
+            self._take_message(cut_datagram(data, self._owner.codec))
             return
         if self._framer is None:
             data = self._finish_frame(data) if heard else data
-            if not heard or self._machine.buffered:
+            if not heard or self.machine.buffered:
                 self._link.feed(data)
                 return
-            self._framer = Framer(self._owner.spoken.header, MAX_INPUT)
-        for message in cut(data, self._framer, self._owner.spoken):
+            self._framer = self._owner.codec.framer(MAX_INPUT)
+        for message in cut(data, self._framer, self._owner.codec):
             if self.dead or self._link.closed:
                 return
             self._take_message(message)
@@ -326,7 +351,7 @@ class FaultyLink:
     def _finish_frame(self, data: bytes) -> bytes:
         """Let the frame pass that was under way when the faults were given; return the rest."""
         done = 0
-        while self._machine.buffered and done < len(data):
+        while self.machine.buffered and done < len(data):
             self._link.feed(data[done : done + 1])
             done += 1
         return data[done:]
@@ -336,7 +361,7 @@ class FaultyLink:
         faults: list[Fault] = []
         if isinstance(frame, Frame):
             faults = queue.by_frame(queue.heard, frame)
-        self._put(self._incoming, apply_faults(message, faults, self._owner.spoken))
+        self._put(self._incoming, apply_faults(message, faults, self._owner.codec))
         self._incoming.run()
 
     def _carry_in(self, batch: list[tuple[WireMessage, bytes]]) -> None:
@@ -361,7 +386,7 @@ class FaultyLink:
     # ------------------------------------------------------------------ both
 
     def _put(self, line: DelayLine[WireMessage], sent: list[WireMessage]) -> None:
-        if line.size + sum(one.size for one in sent) > WRITE_LIMIT:
+        if line.size + sum(one.size for one in sent) > self._owner.write_limit:
             self._link.overflow()
         outgoing = line is self._outgoing
         if self._link.closed or (outgoing and self.muted is not None):

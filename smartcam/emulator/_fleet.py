@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from smartcam._server import Server
-from smartcam.emulator._camera import EmulatedCamera
+from smartcam.emulator._makes import emulated_class
 from smartcam.emulator._scenario.file import load_scenarios
 from smartcam.exceptions import ConfigurationError
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from smartcam.emulator._clock import Clock
     from smartcam.emulator._scenario.scenario import Scenario
+    from smartcam.emulator._wire_camera import WireCamera
 
 
 class EmulatedFleet(Server):
@@ -54,22 +55,21 @@ class EmulatedFleet(Server):
             if isinstance(scenarios, (str, Path))
             else tuple(scenarios)
         )
-        self._cameras: dict[str, EmulatedCamera] = {}
+        self._cameras: dict[str, WireCamera] = {}
         for scenario in given:
             if scenario.name in self._cameras:
                 raise ConfigurationError(f"emulator: two cameras are called {scenario.name!r}")
-            own = scenario.quirks.model_dump(exclude_unset=True)
-            self._cameras[scenario.name] = EmulatedCamera(
-                scenario=scenario,
+            self._cameras[scenario.name] = emulated_class(scenario.protocol).from_scenario(
+                scenario,
                 host=host,
                 transport=transport,
                 dialect=dialect,
-                quirks={**own, **quirks} if quirks else None,
+                quirks=quirks,
                 clock=clock,
             )
         self._stack = contextlib.AsyncExitStack()
 
-    def __getitem__(self, name: str) -> EmulatedCamera:
+    def __getitem__(self, name: str) -> WireCamera:
         """Return a camera.
 
         Raises:
@@ -83,14 +83,14 @@ class EmulatedFleet(Server):
                 f"the fleet has no camera {name!r}; there are {there}"
             ) from exc
 
-    def __iter__(self) -> Iterator[EmulatedCamera]:
+    def __iter__(self) -> Iterator[WireCamera]:
         return iter(self._cameras.values())
 
     def __len__(self) -> int:
         return len(self._cameras)
 
     @property
-    def cameras(self) -> dict[str, EmulatedCamera]:
+    def cameras(self) -> dict[str, WireCamera]:
         """All by name, in order; a new mapping each time."""
         return dict(self._cameras)
 

@@ -1,17 +1,19 @@
 """Where an application's values may come from beside constants: functions with a name.
 
 A generator takes a :class:`Run` and returns what ``Layout.build`` takes: a mapping for a record, a
-list of mappings for ``( ... )*``. :func:`register_generator` adds one that scenario files can name;
-in Python the function itself can be given.
+list of mappings for ``( ... )*``. :func:`register_generator` adds one that scenario files can name,
+and so does a plug-in (entry points ``smartcam.generators``); in Python the function itself can be
+given.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 from smartcam._suggestions import did_you_mean
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, PluginError
+from smartcam.registry import GENERATORS
 
 if TYPE_CHECKING:
     from smartcam.emulator._scene import Observation, TableScene
@@ -62,35 +64,43 @@ def wrap_number(field: Field, number: int) -> int:
     return (number - low) % (high - low + 1) + low
 
 
+_FOUND: dict[str, Generator] = {}  # those that were used: a run asks for its generator each time
+
+
 def find_generator(name: str) -> Generator:
     """Return the generator of that name.
 
     Raises:
         ConfigurationError: there is none; the text names those there are.
+        PluginError: a plug-in's failed to load, or is no function.
     """
-    try:
-        return _GENERATORS[name]
-    except KeyError as exc:
+    found = _FOUND.get(name)
+    if found is not None:
+        return found
+    if name not in GENERATORS:
         raise ConfigurationError(
             f"generator {name!r} is unknown; known are {', '.join(generator_names())}"
             f"{did_you_mean(name, generator_names())}"
-        ) from exc
+        )
+    loaded = GENERATORS.load(name)
+    if not callable(loaded):
+        raise PluginError(f"generator {name!r}: {loaded!r} is no function", name=name)
+    found = _FOUND[name] = cast("Generator", loaded)
+    return found
 
 
 def generator_names() -> list[str]:
-    """Return the names of all generators, sorted."""
-    return sorted(_GENERATORS)
+    """Return the names of all generators, sorted; those of plug-ins are not loaded for it."""
+    return [info.name for info in GENERATORS.available()]
 
 
 def register_generator(name: str, function: Generator) -> None:
     """Let applications name ``function`` as their generator.
 
     Raises:
-        ConfigurationError: the name is taken by another function.
+        PluginError: the name is taken by another function.
     """
-    if _GENERATORS.get(name, function) is not function:
-        raise ConfigurationError(f"generator {name!r} is there already")
-    _GENERATORS[name] = function
+    GENERATORS.register(name, function)
 
 
 def _tangram(run: Run) -> Values:
@@ -155,11 +165,3 @@ def _input(run: Run) -> Values:
     values = zeros(run.layout.fields)
     values.update((key, value) for key, value in (run.input or {}).items() if key in values)
     return values if run.layout.repeat is None else [values]
-
-
-_GENERATORS: dict[str, Generator] = {
-    "tangram": _tangram,
-    "tangram_pixels": _tangram_pixels,
-    "sequence": _sequence,
-    "input": _input,
-}

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from smartcam._accepting import Acceptor
-from smartcam.emulator._client_link import WRITE_LIMIT, ClientLink
+from smartcam.emulator._client_link import ClientLink
 from smartcam.protocols._base import Transport
 from smartcam.protocols._framed.machine import State
 
@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from smartcam.emulator._client_link import LinkOwner
 
 _log = logging.getLogger("smartcam.emulator")
-
-MAX_LINKS = 32
-"""Clients that are looked at. The camera serves one; a few more may wait to take over. A newcomer
-always gets in: the one without a session for longest makes room."""
 
 FAREWELL = 1.0
 """Seconds of real time that a client has to close its side after a fault closed the camera's."""
@@ -67,6 +63,7 @@ class _TcpLink(ClientLink, asyncio.Protocol):
         # the camera does so too (newest SC manual p. 40: published)
         with contextlib.suppress(OSError):  # the client may be gone already
             transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._owner.arrived(self)
 
     def data_received(self, data: bytes) -> None:
         if self.closed:  # it says farewell
@@ -82,7 +79,7 @@ class _TcpLink(ClientLink, asyncio.Protocol):
 
     def heard(self) -> None:
         self.flush()  # also what was said before a Disconnect in the same bytes
-        if self._machine.state is State.FAILED:
+        if self.machine.state is State.FAILED:
             self.close("a broken frame came")
         elif self._end_waits and (self._faulty is None or not self._faulty.unheard):
             self._transport.close()
@@ -100,8 +97,8 @@ class _TcpLink(ClientLink, asyncio.Protocol):
     def write(self, data: bytes) -> bool:
         if self.closed:
             return False
-        if self._transport.get_write_buffer_size() + len(data) > WRITE_LIMIT:
-            self.close(f"it does not read: more than {WRITE_LIMIT} bytes wait for it")
+        if self._transport.get_write_buffer_size() + len(data) > self._owner.write_limit:
+            self.close(f"it does not read: more than {self._owner.write_limit} bytes wait for it")
             return False
         self._transport.write(data)
         return True
@@ -119,7 +116,7 @@ class _TcpLink(ClientLink, asyncio.Protocol):
             self._owner.lost(self)
         self._transport.abort()
 
-    def part(self, how: Literal["close", "reset"]) -> None:
+    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         if how == "reset":
             with contextlib.suppress(OSError):  # the client may be gone already
                 sock = self._transport.get_extra_info("socket")
@@ -127,7 +124,7 @@ class _TcpLink(ClientLink, asyncio.Protocol):
             self.close("a fault resets it")
             return
         self._leave()
-        _log.info("= %s: connection closed: a fault ends it", self.peer)
+        _log.info("= %s: connection closed: %s", self.peer, why)
         self._owner.lost(self)
         # a socket that is closed with unread bytes sends a reset, so it stays until the client
         # has closed its side, too
@@ -138,6 +135,12 @@ class _TcpLink(ClientLink, asyncio.Protocol):
 
     def stop_listening(self) -> None:
         self._transport.pause_reading()
+
+    def hold(self, on: bool) -> None:
+        if on:
+            self._transport.pause_reading()
+        elif self._faulty is None or not self._faulty.dead:
+            self._transport.resume_reading()
 
     def heal(self) -> None:
         if self._faulty is not None and self._faulty.muted is not None:
@@ -229,9 +232,9 @@ class TcpListener(Listener):
     def enter(self, link: _TcpLink) -> None:
         """Take a new connection; where there are too many, another one makes room."""
         self.links[link] = None
-        if len(self.links) > MAX_LINKS:
+        if len(self.links) > self._owner.max_links:
             one = next(one for one in self.links if not self._owner.serves(one))
-            why = f"{MAX_LINKS} others are open, it was without a session for longest"
+            why = f"{self._owner.max_links} others are open, it was without a session for longest"
             self.crowd_out(one, why)
 
 
@@ -254,8 +257,8 @@ class _UdpLink(ClientLink):
     def write(self, data: bytes) -> bool:
         return not data or self._listener.send(data, self._address)
 
-    def part(self, how: Literal["close", "reset"]) -> None:
-        self.close(f"a fault ends it ({how})")
+    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+        self.close(f"{why} ({how})")
 
     def stop_listening(self) -> None:
         pass  # the faulty link takes nothing any more
@@ -332,7 +335,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             return  # the port is shut, the loop had this one already
         link = self.links.pop(addr, None) or _UdpLink(self, self._owner, addr)
         self.links[addr] = link
-        if len(self.links) > MAX_LINKS:
+        if len(self.links) > self._owner.max_links:
             old = next(old for old in self.all_links if not self._owner.serves(old))
             self.crowd_out(old, "idle")
         link.datagram_received(data)
@@ -346,7 +349,10 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         if self._transport is None:
             return False
         # the abstract class lacks it, every transport of asyncio has it
-        if cast("asyncio.Transport", self._transport).get_write_buffer_size() > WRITE_LIMIT:
+        if (
+            cast("asyncio.Transport", self._transport).get_write_buffer_size()
+            > self._owner.write_limit
+        ):
             _log.warning("! %s: datagram dropped: the network is too slow", _peer_text(address))
             return False
         self._transport.sendto(frame, address)

@@ -9,12 +9,13 @@ import socket
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from smartcam.emulator._links import MAX_LINKS
-
 if TYPE_CHECKING:
     from smartcam.emulator._links import Listener
 
 _log = logging.getLogger("smartcam.emulator")
+
+BACKLOG = 32
+"""Connections that the system keeps until they are accepted."""
 
 _RETRY = 0.2  # seconds between tries to get the port back
 
@@ -95,7 +96,7 @@ class Port:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.bind((address[0], self.number, *address[2:]))
             if self._listener.kind is socket.SOCK_STREAM:
-                sock.listen(MAX_LINKS)
+                sock.listen(BACKLOG)
         except BaseException:
             sock.close()
             raise

@@ -16,7 +16,8 @@ from smartcam.protocols.messages import Message, Sender, UnknownMessage
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.emulator.faults._wire_effects import WireCodec
+
 
 MAX_ENTRIES = 10_000
 """Entries kept; the oldest go first. A day of a fast line is not what the log is for."""
@@ -70,6 +71,12 @@ class LogEntry(NamedTuple):
     fault: str | None = None
     wire: str | None = None
 
+    @property
+    def text(self) -> str:
+        """What was heard as a line without its end, or said as it was; of cameras that speak so."""
+        text = bytes.fromhex(self.hex).decode("latin-1")
+        return text.rstrip("\r\n\0") if self.direction == "in" else text
+
 
 class Visit(NamedTuple):
     """A TCP connection that has ended.
@@ -112,7 +119,7 @@ class Log(Sequence[LogEntry]):
     """
 
     def __init__(
-        self, dialect: FramedDialect, maxlen: int = MAX_ENTRIES, max_bytes: int = MAX_BYTES
+        self, dialect: WireCodec, maxlen: int = MAX_ENTRIES, max_bytes: int = MAX_BYTES
     ) -> None:
         self.maxlen: int = maxlen
         self.max_bytes: int = max_bytes
@@ -242,7 +249,7 @@ class Log(Sequence[LogEntry]):
 class TrafficLog:
     """Keeps the last entries and counts what clients sent."""
 
-    def __init__(self, dialect: FramedDialect) -> None:
+    def __init__(self, dialect: WireCodec) -> None:
         self.visits: deque[Visit] = deque(maxlen=MAX_VISITS)  # the last connections that have ended
         self.entries: Log = Log(dialect)  # the last ones
         self._dialect = dialect
@@ -293,13 +300,13 @@ class TrafficLog:
 
 
 @functools.lru_cache(maxsize=256)
-def _kind(dialect: FramedDialect, message_id: int, size: int) -> type[Message] | None:
+def _kind(dialect: WireCodec, message_id: int, size: int) -> type[Message] | None:
     """Return the type of a client's frame; id and size of its payload decide that."""
     message = _decode(dialect, Sender.CLIENT, Frame(message_id, bytes(size)))
     return None if message is None else type(message)
 
 
-def _decode(dialect: FramedDialect, sender: Sender, frame: Frame) -> Message | None:
+def _decode(dialect: WireCodec, sender: Sender, frame: Frame) -> Message | None:
     """Return a frame decoded; None for an unknown id and for a body that does not fit."""
     if dialect.surplus(sender, frame) > 0:
         return None

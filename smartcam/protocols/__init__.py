@@ -28,9 +28,11 @@ if TYPE_CHECKING:
         LinkEnded,
         LinkFailed,
         LinkMachine,
+        Machine,
         State,
     )
     from smartcam.protocols._insight.dialect import INSIGHT
+    from smartcam.protocols._lines import LineDialect, LineMachine, LineRow
 
 __all__ = [
     "BVS",
@@ -41,9 +43,13 @@ __all__ = [
     "Frame",
     "FramedDialect",
     "HeaderLayout",
+    "LineDialect",
+    "LineMachine",
+    "LineRow",
     "LinkEnded",
     "LinkFailed",
     "LinkMachine",
+    "Machine",
     "MessageRow",
     "Protocol",
     "RawRequest",
@@ -64,7 +70,8 @@ if not TYPE_CHECKING:
             "_bvs": "BVS",
             "_framed.dialect": "FramedDialect MessageRow StatusBits WireQuirk",
             "_framed.framing": "Frame HeaderLayout",
-            "_framed.machine": "Counters LinkEnded LinkFailed LinkMachine State",
+            "_framed.machine": "Counters LinkEnded LinkFailed LinkMachine Machine State",
             "_insight.dialect": "INSIGHT",
+            "_lines": "LineDialect LineMachine LineRow",
         },
     )

@@ -275,6 +275,8 @@ class Protocol:
             the host there.
         detection: what a client tries that was told no dialect, the most probable first, each on a
             fresh link: dialects that begin a session alike. Default: each dialect by itself.
+        emulator: ``module:attribute`` of the class of its emulated cameras, a
+            :class:`~smartcam.emulator.LineCamera` for one; "" where it brings none.
     """
 
     name: str
@@ -287,6 +289,7 @@ class Protocol:
     detection: Mapping[Transport, tuple[tuple[Dialect, ...], ...]] = field(
         default_factory=dict[Transport, "tuple[tuple[Dialect, ...], ...]"]
     )
+    emulator: str = ""
 
     def tries(
         self,
@@ -314,3 +317,18 @@ class Protocol:
         if not parameters:
             return list(groups)
         return [tuple(d.with_parameters(parameters) for d in group) for group in groups]
+
+
+def load_protocol(name: str) -> Protocol:
+    """Return the protocol of this name.
+
+    Raises:
+        PluginError: unknown, or it failed to load.
+        ConfigurationError: the entry point gives something else.
+    """
+    from smartcam.registry import PROTOCOLS  # which logs, what a core has no need of
+
+    protocol = PROTOCOLS.load(name)
+    if not isinstance(protocol, Protocol):
+        raise ConfigurationError(f"entry point {name!r} gives {protocol!r}, not a Protocol")
+    return protocol

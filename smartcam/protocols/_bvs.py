@@ -369,5 +369,6 @@ BVS = _Bvs(
         Transport.TCP: (_16_BIT_KIN, (HANDBOOK,), (THESIS,)),
         Transport.UDP: ((HANDBOOK,), _16_BIT_KIN, (THESIS,)),
     },
+    emulator="smartcam.emulator._camera:EmulatedCamera",
 )
 """What the entry point ``bvs`` gives."""

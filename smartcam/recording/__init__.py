@@ -5,7 +5,7 @@
     with Recorder("run.mcap") as recorder:
         async with smartcam.connect(url, observers=[recorder]) as camera:
             ...
-    async with ReplayedCamera(load_recording("run.mcap")) as emulator:
+    async with replay(load_recording("run.mcap")) as emulator:
         emulator.url
 
 The container is MCAP, which Foxglove and others open. It needs the extra ``record``.
@@ -14,12 +14,13 @@ The container is MCAP, which Foxglove and others open. It needs the extra ``reco
 from smartcam.recording._pcap import write_pcap
 from smartcam.recording._reader import Recording, load_recording
 from smartcam.recording._recorder import Recorder
-from smartcam.recording._replay import ReplayedCamera
+from smartcam.recording._replay import ReplayedCamera, replay
 
 __all__ = [
     "Recorder",
     "Recording",
     "ReplayedCamera",
     "load_recording",
+    "replay",
     "write_pcap",
 ]

@@ -23,9 +23,12 @@ from pydantic import PrivateAttr
 from smartcam.emulator._application import Application
 from smartcam.emulator._camera import EmulatedCamera
 from smartcam.emulator._generators import wrap_number
+from smartcam.emulator._line_camera import LineCamera
+from smartcam.emulator._makes import check_options, emulated_class
 from smartcam.exceptions import ConfigurationError
 from smartcam.interpreters._base import resolve
 from smartcam.protocols import messages as m
+from smartcam.recording._replay_lines import ReplayedLines
 from smartcam.recording._schedule import CONDITIONS, plan_replay
 
 if TYPE_CHECKING:
@@ -34,10 +37,11 @@ if TYPE_CHECKING:
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._clock import Clock, TimerHandle
     from smartcam.emulator._scene import TableScene
+    from smartcam.emulator._wire_camera import WireCamera
     from smartcam.layout import Field
     from smartcam.models import ByteOrder, Status
     from smartcam.recording._reader import Recording
-    from smartcam.recording._schedule import ReplayPlan, Take, TakeList
+from smartcam.recording._schedule import ReplayPlan, Take, TakeList
 
 MAX_SPEED = 1000.0
 """Times faster, or slower, than recorded: beyond it timers of a millisecond decide."""
@@ -192,10 +196,7 @@ class ReplayedCamera(EmulatedCamera):
         name: str | None = None,
         on_over: Callable[[], None] | None = None,
     ) -> None:
-        if not 1 / MAX_SPEED <= speed <= MAX_SPEED:
-            raise ConfigurationError(
-                f"replay: a speed from {1 / MAX_SPEED:g} to {MAX_SPEED:g} was expected, got {speed}"
-            )
+        check_speed(speed)
         self.plan: ReplayPlan = plan_replay(recording, camera)
         self.speed: float = speed
         self._loop = loop
@@ -403,3 +404,56 @@ def _application(found: TakeList, speed: float) -> _PlayedApplication:
     else:
         fields["rate"] = NEVER
     return _PlayedApplication(**fields)
+
+
+def replay(
+    recording: Recording,
+    *,
+    camera: str | None = None,
+    speed: float = 1.0,
+    loop: bool = False,
+    on_over: Callable[[], None] | None = None,
+    **options: Any,
+) -> WireCamera:
+    """Return an emulated camera that plays a recording, of whatever protocol.
+
+    One of frames is a :class:`ReplayedCamera`. One of lines gives the n-th of equal lines what the
+    recorded n-th one got, after the same time.
+
+    Args:
+        recording: what to play.
+        camera: name of the camera in it; default the only one there is.
+        speed: how many times faster than recorded, 0.001 to 1000.
+        loop: begin again where something is over.
+        on_over: called once, in the event loop, when no trigger is left; never with ``loop``.
+        options: of :class:`ReplayedCamera`, or of a :class:`~smartcam.emulator.LineCamera`.
+
+    Raises:
+        ConfigurationError: something given is wrong, or the camera cannot be replayed.
+        UnsupportedError: its protocol brings no emulated camera.
+    """
+    known = recording.camera(camera)
+    if not known.url:
+        raise ConfigurationError(
+            f"recording {recording.path}: there was no session with camera {known.name!r}"
+        )
+    check_speed(speed)
+    kind = emulated_class(known.protocol)
+    given: dict[str, Any] = {"camera": camera, "speed": speed, "loop": loop, "on_over": on_over}
+    if issubclass(kind, LineCamera):
+        check_options(LineCamera, options)
+        return ReplayedLines(kind, recording, **given, **options)
+    if issubclass(kind, EmulatedCamera):
+        return ReplayedCamera(recording, **given, **options)
+    raise ConfigurationError(
+        f"recording {recording.path}: cameras of {known.protocol} cannot be replayed; those that "
+        "speak in lines, and bvs, can"
+    )
+
+
+def check_speed(speed: float) -> None:
+    """Refuse a speed that cannot be kept; ConfigurationError."""
+    if not 1 / MAX_SPEED <= speed <= MAX_SPEED:
+        raise ConfigurationError(
+            f"replay: a speed from {1 / MAX_SPEED:g} to {MAX_SPEED:g} was expected, got {speed}"
+        )

@@ -142,8 +142,8 @@ def _spoken(
     address = parse_address(camera.url)
     if address.protocol != "bvs" or address.dialect is None:
         raise ConfigurationError(
-            f"recording {recording.path}: camera {camera.name!r} speaks {address.protocol}; only "
-            "cameras that speak bvs can be replayed"
+            f"recording {recording.path}: camera {camera.name!r} speaks {address.protocol}, not "
+            "bvs; smartcam.recording.replay() plays it where that can be played"
         )
     protocol = cast("Protocol", PROTOCOLS.load("bvs"))
     dialect = cast("FramedDialect", protocol.dialects[address.dialect])

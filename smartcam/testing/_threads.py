@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from smartcam._loop_thread import CALL_TIMEOUT, LoopThread
 from smartcam.emulator import EmulatedCamera, EmulatedFleet, ManualClock
-from smartcam.exceptions import ConfigurationError
+from smartcam.emulator._makes import check_options, emulated_class
+from smartcam.exceptions import ConfigurationError, UnsupportedError
 from smartcam.testing._logs import CameraLog
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from smartcam.emulator import Device, FiredFault, Scenario, TableScene, Visit
+    from smartcam.emulator import Device, FiredFault, Scenario, TableScene, Visit, WireCamera
     from smartcam.emulator.faults import Fault
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.protocols.messages import Message
@@ -50,7 +51,7 @@ class _InLoop:
     """Something with ``start()`` and ``stop()`` that lives in a thread's loop."""
 
     _thread: LoopThread
-    _hosted: EmulatedCamera | EmulatedFleet
+    _hosted: WireCamera | EmulatedFleet
     _owns_thread: bool  # it is started and ended with it
 
     def start(self) -> None:
@@ -91,33 +92,42 @@ class _InLoop:
 
 
 class ThreadedCamera(_InLoop):
-    """An :class:`~smartcam.emulator.EmulatedCamera` in a thread; a context manager.
+    """An emulated camera in a thread; a context manager.
+
+    What only a BVS camera has (``scene``, ``scenario``, ``wait_received`` of ids) is there for one.
 
     Args:
+        protocol: what it speaks: the name of a protocol that brings an emulated camera.
         manual_clock: its time stands still until :meth:`advance` moves it.
-        options: those of :class:`~smartcam.emulator.EmulatedCamera`.
+        options: those of :class:`~smartcam.emulator.EmulatedCamera`, or of the class that the
+            protocol brings.
 
     Attributes:
         log: what went over the wire, with expectations.
 
     Raises:
-        ConfigurationError: something given is wrong.
+        ConfigurationError: something given is wrong; names what the camera takes.
+        UnsupportedError: the protocol brings no emulated camera.
     """
 
-    def __init__(self, *, manual_clock: bool = False, **options: Any) -> None:
-        emulator = EmulatedCamera(clock=ManualClock() if manual_clock else None, **options)
+    def __init__(
+        self, *, protocol: str = "bvs", manual_clock: bool = False, **options: Any
+    ) -> None:
+        kind: Any = emulated_class(protocol)
+        check_options(kind, options)
+        emulator: WireCamera = kind(clock=ManualClock() if manual_clock else None, **options)
         self._host(LoopThread(f"smartcam.emulator[{emulator.name}]"), emulator, owns=True)
 
     @classmethod
-    def in_thread(cls, thread: LoopThread, emulator: EmulatedCamera) -> Self:
+    def in_thread(cls, thread: LoopThread, emulator: WireCamera) -> Self:
         """Return the synchronous face of an emulator that lives in a thread already."""
         self = cls.__new__(cls)
         self._host(thread, emulator, owns=False)
         return self
 
-    def _host(self, thread: LoopThread, emulator: EmulatedCamera, *, owns: bool) -> None:
+    def _host(self, thread: LoopThread, emulator: WireCamera, *, owns: bool) -> None:
         super().__init__(thread, emulator, owns)
-        self._emulator = emulator
+        self._emulator: WireCamera = emulator
         self.log: CameraLog = CameraLog(
             read=lambda: self._look(lambda: list(emulator.log)),
             visits=lambda: self.visits,
@@ -168,7 +178,7 @@ class ThreadedCamera(_InLoop):
     @property
     def scenario(self) -> Scenario:
         """What it was made of."""
-        return self._emulator.scenario
+        return self._bvs("scenario").scenario
 
     @property
     def device(self) -> Device:
@@ -178,7 +188,7 @@ class ThreadedCamera(_InLoop):
     @property
     def scene(self) -> TableScene:
         """The table it looks at; ``scene.pieces`` may be changed in any thread."""
-        return self._emulator.scene
+        return self._bvs("scene").scene
 
     @property
     def has_session(self) -> bool:
@@ -244,8 +254,8 @@ class ThreadedCamera(_InLoop):
             raise ConfigurationError("the emulator runs in real time: give it manual_clock=True")
         self._thread.run(clock.advance, seconds)
 
-    def run(self, function: Callable[[EmulatedCamera], T]) -> T:
-        """Call ``function`` with the :class:`~smartcam.emulator.EmulatedCamera`, in its thread."""
+    def run(self, function: Callable[..., T]) -> T:
+        """Call ``function`` with the emulated camera, in its thread."""
         return self._thread.run(function, self._emulator)
 
     def wait_received(
@@ -281,6 +291,12 @@ class ThreadedCamera(_InLoop):
             await anyio.to_thread.run_sync(future.result, abandon_on_cancel=True)
         else:
             await asyncio.wrap_future(future)
+
+    def _bvs(self, what: str) -> EmulatedCamera:
+        """Return the emulator; UnsupportedError: it is of another make."""
+        if isinstance(self._emulator, EmulatedCamera):
+            return self._emulator
+        raise UnsupportedError(f"{self._emulator!r} has no {what}; an EmulatedCamera has")
 
     def _look(self, function: Callable[[], T]) -> T:
         """Call in the thread; here, where it does not run and nothing changes any more."""

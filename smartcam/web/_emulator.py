@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
+from smartcam.emulator._camera import CONDITIONS
 from smartcam.emulator._scene import PIECES, TablePose
 from smartcam.emulator.faults import Fault
 from smartcam.exceptions import ConfigurationError
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-    from smartcam.emulator import EmulatedCamera
+    from smartcam.emulator import WireCamera
+    from smartcam.emulator._scene import TableScene
 
 MAX_ENTRIES = 1000
 """Log entries that one answer tells; ``next`` says where to go on."""
@@ -67,7 +69,7 @@ class EmulatorSite(Site):
 
     def __init__(
         self,
-        cameras: Mapping[str, EmulatedCamera],
+        cameras: Mapping[str, WireCamera],
         *,
         host: str = "127.0.0.1",
         port: int = 0,
@@ -77,7 +79,7 @@ class EmulatorSite(Site):
             if not name.isprintable() or name in {"", ".", ".."}:
                 raise ConfigurationError(f"web: {name!r} cannot stand in a path: name the camera")
         super().__init__(CALLS, "emulator", host=host, port=port, token=token)
-        self.cameras: Mapping[str, EmulatedCamera] = cameras
+        self.cameras: Mapping[str, WireCamera] = cameras
         self._waiting = 0
 
     async def wait_for(
@@ -178,8 +180,25 @@ def _name(site: EmulatorSite, call: CallRequest) -> str:
     return name
 
 
-def _emulator(site: EmulatorSite, call: CallRequest) -> EmulatedCamera:
+def _emulator(site: EmulatorSite, call: CallRequest) -> WireCamera:
     return site.cameras[_name(site, call)]
+
+
+def _operator(site: EmulatorSite, call: CallRequest, what: str) -> Any:
+    """Return what an operator does with a camera; RefusedError: it has nothing like that."""
+    emulator = _emulator(site, call)
+    if not hasattr(emulator.device, what):
+        able = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
+        raise RefusedError(409, f"{what} of a camera that speaks {emulator.dialect}", able)
+    return getattr(emulator.device, what)
+
+
+def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
+    """Return the table that a camera looks at; RefusedError: it looks at none."""
+    scene = _emulator(site, call).scene
+    if scene is None:
+        raise RefusedError(409, "a camera without a scene", "one that looks at a table")
+    return scene
 
 
 @CALLS.add("GET", API)
@@ -209,21 +228,21 @@ def _state(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("POST", f"{_CAMERA}/trigger")
 def _trigger(site: EmulatorSite, call: CallRequest) -> object:
     """Trigger by the digital input; `taken` tells whether an inspection began."""
-    taken = _emulator(site, call).device.trigger()
+    taken = _operator(site, call, "trigger")()
     return {"taken": taken, "camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/start")
 def _start(site: EmulatorSite, call: CallRequest) -> object:
     """Enter run mode."""
-    _emulator(site, call).device.start()
+    _operator(site, call, "start")()
     return {"camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/stop")
 def _stop(site: EmulatorSite, call: CallRequest) -> object:
     """Leave run mode."""
-    _emulator(site, call).device.stop()
+    _operator(site, call, "stop")()
     return {"camera": _state(site, call)}
 
 
@@ -232,14 +251,16 @@ def _stop(site: EmulatorSite, call: CallRequest) -> object:
 )
 def _application(site: EmulatorSite, call: CallRequest) -> object:
     """Load another application behind the client's back; 409 while one is loaded."""
-    device = _emulator(site, call).device
+    switch, emulator = _operator(site, call, "switch_application"), _emulator(site, call)
     wanted: _ApplicationBody = call.body
-    if wanted.id not in device.applications:
-        known = ", ".join(str(one) for one in device.applications)
+    if wanted.id not in emulator.application_ids:
+        known = ", ".join(str(one) for one in emulator.application_ids)
         field = {"field": "id", "came": str(wanted.id), "expected": f"one of {known}"}
         raise RefusedError(422, f"application {wanted.id}", f"one of {known}", (field,))
-    if not device.switch_application(wanted.id, running=wanted.running):
-        raise RefusedError(409, f"the camera is {device.mode.value}", "it to be stopped or running")
+    if not switch(wanted.id, running=wanted.running):
+        mode = emulator.device.mode
+        said = getattr(mode, "value", mode)
+        raise RefusedError(409, f"the camera is {said}", "it to be stopped or running")
     return {"camera": _state(site, call)}
 
 
@@ -247,18 +268,18 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
 def _reboot(site: EmulatorSite, call: CallRequest) -> object:
     """Restart it, as by its power switch; without a body as the quirk says."""
     wanted: _RebootBody = call.body
-    _emulator(site, call).device.reboot(wanted.seconds)
+    _operator(site, call, "reboot")(wanted.seconds)
     return {"camera": _state(site, call)}
 
 
 @CALLS.add("POST", f"{_CAMERA}/conditions", body=_Conditions, sample='{"overheat": true}')
 def _conditions(site: EmulatorSite, call: CallRequest) -> object:
     """Set or clear Overheat and System Error."""
-    device = _emulator(site, call).device
-    for name, bit in serialize.CONDITIONS.items():
+    set_condition = _operator(site, call, "set_condition")
+    for name, bit in CONDITIONS.items():
         on = getattr(call.body, name)
         if on is not None:
-            device.set_condition(bit, on)
+            set_condition(bit, on)
     return {"camera": _state(site, call)}
 
 
@@ -266,7 +287,7 @@ def _conditions(site: EmulatorSite, call: CallRequest) -> object:
 def _endian(site: EmulatorSite, call: CallRequest) -> object:
     """Byte order of results: 0 little, 1 big."""
     wanted: _Endian = call.body
-    _emulator(site, call).device.set_endian(wanted.endian)
+    _operator(site, call, "set_endian")(wanted.endian)
     return {"camera": _state(site, call)}
 
 
@@ -312,8 +333,7 @@ def _command(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("GET", f"{_CAMERA}/scene")
 def _scene(site: EmulatorSite, call: CallRequest) -> object:
     """The table: parts at their true poses, the field of view, and what was reported."""
-    emulator = _emulator(site, call)
-    return {**serialize.scene_state(emulator.scene), "reported": serialize.reported(emulator)}
+    return serialize.scene_state(_emulator(site, call), _table(site, call))
 
 
 @CALLS.add(
@@ -324,7 +344,7 @@ def _scene(site: EmulatorSite, call: CallRequest) -> object:
 )
 def _put_part(site: EmulatorSite, call: CallRequest) -> object:
     """Put a part there, or move it: metres and radians."""
-    pieces, name = _emulator(site, call).scene.pieces, call.path["part"]
+    pieces, name = _table(site, call).pieces, call.path["part"]
     if not (name.isascii() and name.isprintable() and len(name) <= 50):
         raise RefusedError(
             422, f"the part {name!r}", "a name of 1 to 50 printable ASCII characters"
@@ -339,7 +359,7 @@ def _put_part(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("DELETE", f"{_CAMERA}/scene/parts/{{part}}")
 def _remove_part(site: EmulatorSite, call: CallRequest) -> object:
     """Take a part off the table."""
-    pieces, name = _emulator(site, call).scene.pieces, call.path["part"]
+    pieces, name = _table(site, call).pieces, call.path["part"]
     if pieces.pop(name, None) is None:
         known = ", ".join(pieces) or "nothing: the table is empty"
         raise RefusedError(404, f"no part is called {name!r}", known)
@@ -349,7 +369,7 @@ def _remove_part(site: EmulatorSite, call: CallRequest) -> object:
 @CALLS.add("POST", f"{_CAMERA}/scene/reset")
 def _reset_scene(site: EmulatorSite, call: CallRequest) -> object:
     """Put all parts back to where they lay at first."""
-    pieces = _emulator(site, call).scene.pieces
+    pieces = _table(site, call).pieces
     pieces.clear()
     pieces.update(PIECES)
     return _scene(site, call)

@@ -10,7 +10,7 @@ from smartcam.web._streams import PERIOD, News
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from smartcam.emulator import EmulatedCamera
+    from smartcam.emulator import WireCamera
 
 MAX_LOG_NEWS = 200
 """Log entries in one event; at ten events a second it keeps up with 2000 messages a second."""
@@ -28,12 +28,11 @@ class Watcher:
     ``since`` is the serial of the first log entry that is wanted; None: what comes from now on.
     """
 
-    def __init__(self, name: str, emulator: EmulatedCamera, since: int | None = None) -> None:
+    def __init__(self, name: str, emulator: WireCamera, since: int | None = None) -> None:
         self._name = name
         self._emulator = emulator
         self._serial = serialize.log_count(emulator) if since is None else since
         self._known: dict[str, Any] = {}
-        self._reported = serialize.reported(emulator)
         self._looks = 0
 
     def look(self) -> Iterator[News]:
@@ -41,8 +40,8 @@ class Watcher:
         emulator = self._emulator
         log = self._log()
         yield from self._changed("camera", serialize.camera_state(self._name, emulator))
-        scene = {**serialize.scene_state(emulator.scene), "reported": self._reported}
-        yield from self._changed("scene", scene)
+        if emulator.scene is not None:
+            yield from self._changed("scene", serialize.scene_state(emulator, emulator.scene))
         if self._changed_faults():
             yield News("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
         if log is not None:
@@ -68,5 +67,4 @@ class Watcher:
         self._serial = part["next"]  # a serial of another emulator's time may have been higher
         if not entries and not part["missed"]:
             return None
-        self._reported = serialize.reported(emulator, entries) or self._reported
         return News("log", part, self._serial)

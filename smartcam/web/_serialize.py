@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import functools
-import math
 import sys
 from typing import TYPE_CHECKING, Any
 
+from smartcam.emulator._line_camera import LineCamera
 from smartcam.emulator._scene import TABLE_SIZE, Observation, TablePose
 from smartcam.emulator.faults import FAULTS
 from smartcam.emulator.faults._base import DeviceFault
 from smartcam.exceptions import InterpretationError
-from smartcam.models import Status, jsonable
+from smartcam.models import jsonable
 from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import BVS
 from smartcam.web._shapes import OUTLINES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from smartcam.emulator import Application, EmulatedCamera, FiredFault, LogEntry, TableScene
+    from smartcam.emulator import Application, FiredFault, LogEntry, TableScene, WireCamera
     from smartcam.emulator._bvs.device import Device
     from smartcam.emulator.faults._base import BaseFault
+    from smartcam.emulator.faults._wire_effects import WireCodec
     from smartcam.models import ByteOrder
-    from smartcam.protocols._framed.dialect import FramedDialect
 
 SENSOR = (1280, 1024)
 """Pixels of the sensor for which the scene is scaled (derived: 1280 stands in the type's code)."""
@@ -40,83 +41,86 @@ end the list; an answer stays a few megabytes of JSON, and no more than its entr
 MAX_LISTED = 1000
 """Faults that a list shows."""
 
-MAX_LOOK_BACK = 1000
-"""Log entries among which the last result that has poses is searched."""
-
-CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
-"""What an operator can set and clear, by name."""
+LOOKING = {"tangram": False, "tangram_pixels": True}
+"""Generators that look at the table, and whether they tell pixels."""
 
 
 # ---------------------------------------------------------------------- the camera
 
 
-def camera_row(name: str, emulator: EmulatedCamera) -> dict[str, Any]:
+OPERATOR = (
+    "trigger",
+    "start",
+    "stop",
+    "switch_application",
+    "set_condition",
+    "set_endian",
+    "reboot",
+)
+"""What an operator may be able to do, as devices have it."""
+
+
+def abilities(emulator: WireCamera) -> list[str]:
+    """Return what the operator of a camera can do; ``scene`` and ``clock`` where it has them."""
+    able = [one for one in OPERATOR if hasattr(emulator.device, one)]
+    has = {"scene": emulator.scene, "clock": emulator.clock_time}
+    return able + [name for name, one in has.items() if one is not None]
+
+
+def camera_row(name: str, emulator: WireCamera) -> dict[str, Any]:
     """Return a camera as a list of cameras shows it."""
-    device = emulator.device
+    return _row(name, emulator, emulator.shown())
+
+
+def _row(name: str, emulator: WireCamera, shown: dict[str, Any]) -> dict[str, Any]:
     return {
         "name": name,
         "url": emulator.url,
-        "mode": device.mode,
-        "status": device.status,
-        "active_application": device.active_application,
+        **{key: shown[key] for key in ("mode", "status", "active_application")},
         "session": next(iter(emulator.sessions), None),
     }
 
 
-def camera_state(name: str, emulator: EmulatedCamera) -> dict[str, Any]:
+def camera_state(name: str, emulator: WireCamera) -> dict[str, Any]:
     """Return all there is to know of a camera but scene, faults and log."""
-    device = emulator.device
-    status = device.status
+    shown = emulator.shown()
     return {
-        **camera_row(name, emulator),
-        "status_word": status.value,
-        "conditions": {key: bool(status & bit) for key, bit in CONDITIONS.items()},
-        "running": device.running,
-        "processing": device.processing,
-        "endian": device.endian,
-        "next_number": device.next_number,
-        "queued_inputs": device.queued_inputs,
+        **_row(name, emulator, shown),
+        **shown,
+        "status_word": shown["status"].value,
         "links": emulator.links,
-        "applications": [_application(one) for one in device.applications.values()],
         "commands": list(emulator.commands),
         "host": emulator.host,
         "port": emulator.port,
         "transport": emulator.transport,
         "dialect": emulator.dialect,
-        "quirks": emulator.quirks,
-        "quirks_chosen": emulator.quirks.model_dump(exclude_defaults=True),
+        "abilities": abilities(emulator),
+        "fault_kinds": sorted(emulator.fault_kinds),
         "faults": {"waiting": len(emulator.faults), "fired": len(emulator.fired)},
     }
 
 
-def times(emulator: EmulatedCamera) -> dict[str, Any]:
+def times(emulator: WireCamera) -> dict[str, Any]:
     """Return the time of the log, seconds, and what the camera's own clock shows."""
     with emulator.step():  # which brings the device's time up
-        return {"time": emulator.clock.now, "clock_time": emulator.device.clock_time}
-
-
-def _application(application: Application) -> dict[str, Any]:
-    shown = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
-    return {key: getattr(application, key) for key in shown}
+        return {"time": emulator.clock.now, "clock_time": emulator.clock_time}
 
 
 # ---------------------------------------------------------------------- the log
 
 
-def log_count(emulator: EmulatedCamera) -> int:
+def log_count(emulator: WireCamera) -> int:
     """Return the number of entries that the log has had: the serial behind the last one."""
     return emulator.log.since(sys.maxsize, 0)[1]
 
 
-def log_range(emulator: EmulatedCamera) -> dict[str, int]:
+def log_range(emulator: WireCamera) -> dict[str, int]:
     """Return the serials of the log: ``first`` that is there, ``next`` that will be."""
     count = log_count(emulator)
     return {"first": count - len(emulator.log), "next": count}
 
 
-def log_part(
-    emulator: EmulatedCamera, since: int, limit: int
-) -> tuple[dict[str, Any], list[LogEntry]]:
+def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
     """Return entries from a serial on as JSON, and themselves: so many, or :data:`MAX_TOLD`.
 
     ``next`` is the serial to go on with, ``missed`` how many are gone.
@@ -135,7 +139,7 @@ def log_part(
 
 
 def camera_entry(
-    serial: int, entry: LogEntry, emulator: EmulatedCamera, *, whole: bool = False
+    serial: int, entry: LogEntry, emulator: WireCamera, *, whole: bool = False
 ) -> dict[str, Any]:
     """Return an entry of the log; ``serial`` is its place among all that there have been, from 0.
 
@@ -144,7 +148,7 @@ def camera_entry(
     """
     shown = None if whole else MAX_HEX * 3 - 1
     message, wire = entry.message, entry.wire
-    values = None if message is None else _values(message, emulator.device, whole=whole)
+    values = None if message is None else _values(message, emulator, whole=whole)
     return {
         "serial": serial,
         "time": entry.time,
@@ -152,15 +156,31 @@ def camera_entry(
         "peer": entry.peer,
         "message_id": entry.message_id,
         "message": None if message is None else type(message).__name__,
-        "fields": {} if message is None else _fields(message, emulator.spoken),
+        "fields": {} if message is None else _fields(message, emulator.codec),
         "values": values,
+        "text": entry.text[:MAX_HEX] if isinstance(emulator, LineCamera) else None,
         "hex": entry.hex[:shown],
         "size": _size(entry.hex),
         "error": entry.error,
+        "search": _search(entry.hex) if entry.error and entry.direction == "in" else None,
         "fault": entry.fault,
         "wire": None if wire is None else wire[:shown],
         "wire_size": None if wire is None else _size(wire),
     }
+
+
+def _search(data: str) -> str | None:
+    """Return the dialect in which a client greeted that searches for the camera's, or None."""
+    return next((name for hello, name in _greetings() if data.startswith(hello)), None)
+
+
+@functools.cache
+def _greetings() -> list[tuple[str, str]]:
+    return [
+        (dialect.encode(hello).hex(" "), dialect.name)
+        for dialect in BVS.dialects.values()
+        for hello in (m.Disconnect(), m.Connect())
+    ]
 
 
 def _size(text: str) -> int:
@@ -168,30 +188,32 @@ def _size(text: str) -> int:
     return (len(text) + 1) // 3
 
 
-def _fields(message: m.Message, dialect: FramedDialect) -> dict[str, Any]:
+def _fields(message: m.Message, dialect: WireCodec) -> dict[str, Any]:
     """Return the fields that the dialect has on the wire; bytes stand in the payload's hex."""
     names = _field_names(dialect).get(type(message), ())
     return {name: getattr(message, name) for name in names}
 
 
 @functools.lru_cache(maxsize=16)
-def _field_names(dialect: FramedDialect) -> Mapping[type[m.Message], tuple[str, ...]]:
+def _field_names(dialect: WireCodec) -> Mapping[type[m.Message], tuple[str, ...]]:
     return {
         row.type: tuple(name for name, wire in row.fields if wire is not m.Wire.DATA)
         for row in dialect.table
     }
 
 
-def _values(message: m.Message, device: Device, *, whole: bool) -> Any:
+def _values(message: m.Message, emulator: WireCamera, *, whole: bool) -> Any:
     """Return a result's values as its application's layout has them, None where there is none."""
     if not isinstance(message, m.ResultContainer):
         return None
-    application = device.applications.get(message.application)
+    if message.cells is not None:
+        return {cell.cell: cell.text for cell in message.cells}
+    application = emulator.application_of(message)
     layout = None if application is None else application.result_layout
     if layout is None or (not whole and len(message.data) > MAX_VALUES):
         return None
     try:
-        return layout.parse(message.data, _byte_order(device))
+        return layout.parse(message.data, _byte_order(emulator.device))
     except InterpretationError:
         return None  # a fault may have changed the bytes
 
@@ -203,7 +225,7 @@ def _byte_order(device: Device) -> ByteOrder:
 # ---------------------------------------------------------------------- faults
 
 
-def faults_state(emulator: EmulatedCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
+def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
     """Return the faults that wait and the last ones that have happened."""
     waiting, fired = emulator.faults, list(emulator.fired)
     last = (one.fault for one in reversed(fired))
@@ -251,11 +273,13 @@ def kinds() -> list[dict[str, Any]]:
 # ---------------------------------------------------------------------- the scene
 
 
-def scene_state(scene: TableScene) -> dict[str, Any]:
-    """Return the table: parts at their true poses, and what the camera sees of it.
+def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
+    """Return the table: parts at their true poses, what the camera sees of it and reported last.
 
-    Lengths are metres on the table, angles radians.
+    Lengths are metres on the table, angles radians. ``lookers`` are the ids of the applications
+    that look at it.
     """
+    applications = emulator.device.applications.values()
     return {
         "table": {"width": TABLE_SIZE[0], "depth": TABLE_SIZE[1]},
         "sensor": {"width": SENSOR[0], "height": SENSOR[1]},
@@ -267,6 +291,8 @@ def scene_state(scene: TableScene) -> dict[str, Any]:
         "seed": scene.seed,
         "y_down": scene.y_down,
         "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
+        "lookers": [one.id for one in applications if _looks(one)],
+        "reported": _reported(emulator, scene),
     }
 
 
@@ -292,39 +318,24 @@ def _part(scene: TableScene, name: str, pose: TablePose) -> dict[str, Any]:
     }
 
 
-def reported(
-    emulator: EmulatedCamera, entries: Iterable[LogEntry] | None = None
-) -> dict[str, Any] | None:
-    """Return the reported poses of the last result that has some, or None.
-
-    Those are results of the generators ``tangram`` and ``tangram_pixels``, which fill ``x``, ``y``
-    and ``theta``. Entries are searched, oldest first, by default the log's last ones.
-    """
-    if entries is None:
-        entries = emulator.log.since(log_count(emulator) - MAX_LOOK_BACK)[0]
-    for entry in reversed(list(entries)):
-        message = entry.message
-        if entry.direction == "out" and isinstance(message, m.ResultContainer):
-            parts = _poses(message, emulator.device)
-            if parts is not None:
-                return {"application": message.application, "time": entry.time, "parts": parts}
-    return None
-
-
-def _poses(message: m.ResultContainer, device: Device) -> list[dict[str, Any]] | None:
-    application = device.applications.get(message.application)
+def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
+    """Return the poses that the last run reported, whether or not a client heard it, or None."""
+    last = emulator.last_report
+    application = None if last is None else emulator.application_of(last.result)
     layout = None if application is None else application.result_layout
-    if application is None or layout is None:
+    if last is None or application is None or layout is None or not _looks(application):
         return None
-    pixels = {"tangram": False, "tangram_pixels": True}.get(str(application.generator))
-    if pixels is None or not {"x", "y", "theta"} <= {field.name for field in layout.fields}:
-        return None
-    try:
-        records = layout.parse_records(message.data, _byte_order(device))
-    except InterpretationError:
-        return None
-    found = [_pose(record, device.scene, pixels=pixels) for record in records]
-    return [one for one in found if one is not None]
+    records = layout.parse_records(last.result.data, last.byte_order)
+    found = [_pose(one, scene, pixels=LOOKING[str(application.generator)]) for one in records]
+    parts = [one for one in found if one is not None]
+    return {"application": application.id, "time": round(last.time, 6), "parts": parts}
+
+
+def _looks(application: Application) -> bool:
+    """Return whether an application looks at the table, and tells where the parts are."""
+    layout = application.result_layout
+    fields = set[str]() if layout is None else {field.name for field in layout.fields}
+    return str(application.generator) in LOOKING and {"x", "y", "theta"} <= fields
 
 
 def _pose(record: Any, scene: TableScene, *, pixels: bool) -> dict[str, Any] | None:
@@ -332,8 +343,6 @@ def _pose(record: Any, scene: TableScene, *, pixels: bool) -> dict[str, Any] | N
     if not any(values.values()):
         return None  # a slot that is not filled
     pose = TablePose(values["x"], values["y"], values["theta"])
-    if not all(map(math.isfinite, pose)):
-        return None  # a fault may have changed the bytes
     if pixels:
         pose = scene.to_table(Observation("", *pose, 1.0))
     name = values.get("feature_id")

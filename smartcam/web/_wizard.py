@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import inspect
 import re
@@ -157,6 +158,12 @@ def _calls(_site: WizardSite, _ask: CallRequest) -> object:
 def _state(service: CalibrationService, _body: object) -> object:
     """Names of the calibrations and of the wizards, and the one that is under way."""
     return {"calibrations": service.names, "wizards": service.wizards, "name": service.name}
+
+
+@_call("GET", "/listing")
+async def _listing(service: CalibrationService, _body: object) -> object:
+    """A row for each calibration: of when it is, its error, its last check."""
+    return {"listing": await asyncio.to_thread(lambda: service.listing)}
 
 
 @_call("POST", "/start", body=_StartBody, sample='{"name": "table"}')

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shlex
 import signal
 import urllib.request
 from collections.abc import Iterator
@@ -16,7 +18,7 @@ from smartcam._cli.calibrate import STALE, calibrate
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.emulator._scene import PIECES
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import PATIENCE, Outcome, Process
+from tests.processes import PATIENCE, Outcome, Process, printed_by
 
 YAW, OFFSET = math.radians(120.0), (0.5, -0.1, 0.02)
 
@@ -78,15 +80,43 @@ def test_calibrate_in_json_gives_a_calibration(url: str, tmp_path: Path) -> None
 
 def test_calibrate_in_the_terminal_asks_and_shows_errors(url: str, tmp_path: Path) -> None:
     typed = [str(value) for one in TOUCHES for value in one.values()]
-    about = ["marks", "m", "", "", "pin", "inch", "", "", "", "", "", "", "", "m", "", "0,2"]
-    lines = [*about, "", *["yes"] * 6, "n", *typed[:18], ":undo", *typed[15:18], "", "", ""]
+    about = ["marks", "m", "", "", "pin", "inch", "m", "", "0,2"]
+    touches = [*typed[:1], "much", "", ":repeat", *typed[1:18], ":undo", *typed[15:18]]
+    lines = [*about, "", *["yes"] * 6, "n", *touches, "", "", ""]
     done = calibrating(url, tmp_path, lines).done()
     assert "1. Camera, robot and tool  (:abort)" in done.out
-    assert "! Unit of the robot's coordinates: 'inch': expected one of mm, m" in done.out
-    assert "x, m: y, m: z, m: " in done.out
+    unit, again = done.out.split(
+        "! Unit of the robot's coordinates: 'inch': expected one of mm, m\n"
+    )
+    assert unit.count("Unit of the robot's coordinates\n") == 1
+    assert again.startswith("Unit of the robot's coordinates\n")
+    assert "x, m: y, m: ! y: 'much': expected a number\ny, m: ! y: '': expected a number\n" in again
+    assert "y, m: ! :repeat: expected one of :undo, :abort\ny, m: z, m: " in again
     assert "  - model " in done.out
     assert "from 6 points" in done.out
-    assert "\ndone\n  name: plane\n  file: plane.json\n" in done.out
+    assert "\ndone\nGood for 0." in done.out
+    assert "  file: plane.json\n" in done.out
+
+
+def test_calibrate_ends_with_lines_that_work_as_printed(url: str, tmp_path: Path) -> None:
+    folder = tmp_path / "two words"
+    about = ["", "", "cell", "", "", "m", "", "0,2"]
+    typed = [str(value) for one in TOUCHES for value in one.values()]
+    lines = [*about, "", *[""] * 7, *typed, "", "", ""]
+    done = calibrating(url, folder, lines, "--name", "table").done()
+    _, end = done.out.split("\ndone\n")
+    assert f"  path: {folder / 'table.json'}\n" in end
+    head, command, python = re.split(r"\n\nOn the command line:\n\n|\n\nIn Python:\n\n", end)
+    assert "Good for " in head
+    program, *words = shlex.split(command)
+    assert program == "smartcam"
+    shown = run(*words).done().out
+    assert [line.split()[0] for line in shown.splitlines()[2:]] == list(PIECES)
+    assert "cell" in words
+    told = printed_by(python)
+    assert [line.split()[0] for line in told.splitlines()] == list(PIECES)
+    x = float(re.findall(r"Position\(x=([-\d.e]+)", told)[0])
+    assert x == pytest.approx(touch(next(iter(PIECES)))[0], abs=0.001)
 
 
 def test_calibrate_y_down_is_kept_and_wanted_by_the_check(url: str, tmp_path: Path) -> None:
@@ -139,7 +169,31 @@ def test_calibrate_check_in_the_terminal_shows_the_verdict(url: str, tmp_path: P
     done = calibrating(url, tmp_path, lines, "--check", "plane").done()
     assert "1. Is plane still true?  (:abort)" in done.out
     assert ". plane still holds  (:undo, :abort)" in done.out
-    assert "\ndone\n  name: plane\n  stale: no\n  touches: 1\n" in done.out
+    assert "\ndone\nStill true: 0." in done.out
+    assert " mm rms off\n  name: plane\n  stale: no\n  touches: 1\n" in done.out
+
+
+def test_calibrate_lists_calibrations_in_a_table(url: str, tmp_path: Path) -> None:
+    saved(tmp_path)
+    (tmp_path / "a.json").write_text("{")
+    lines = as_lines({"unit": "m"}, {}, {}, *TOUCHES, {})
+    calibrating(url, tmp_path, lines, "--json", "--check", "plane").done()
+    listed = run("calibrate", "--list", "--folder", str(tmp_path)).done()
+    head, broken, row = listed.out.splitlines()
+    assert re.split(r" {2,}", head.strip()) == ["name", "kind", "date (UTC)", "error", "last check"]
+    assert [one.strip() for one in re.split(r" {2,}", row.strip())][:2] == ["plane", "plane"]
+    assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d  0\.00 mm rms  \d{4}-.*: still true$", row)
+    assert "cannot be read: " in broken
+    rows = run("calibrate", "--list", "--folder", str(tmp_path), "--json").done().lines
+    assert [(one["name"], one["stale"]) for one in rows] == [("a", None), ("plane", False)]
+
+
+def test_calibrate_lists_an_empty_folder_and_makes_none(tmp_path: Path) -> None:
+    listed = run("calibrate", "--list", "--folder", str(tmp_path)).done()
+    assert listed.out == f"no calibrations in {tmp_path}\n"
+    missing = tmp_path / "missing"
+    run("calibrate", "--list", "--folder", str(missing)).failed(2, "no such folder")
+    assert not missing.exists()
 
 
 def test_calibrate_check_of_no_calibration_says_so_and_leaves_nothing(tmp_path: Path) -> None:
@@ -170,7 +224,8 @@ def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:
 def test_calibrate_killed_at_every_step_loses_no_sample(url: str, tmp_path: Path) -> None:
     touched = {f"mark_{number}": number in {1, 2, 6} for number in range(1, 8)}
     some = [TOUCHES[index] for index in (0, 1, 5)]
-    for number, line in enumerate(as_lines(ABOUT, {}, touched, *some, {}, {}), 1):
+    lines = as_lines(ABOUT, {}, touched, *some, {"next": "accept"}, {})
+    for number, line in enumerate(lines, 1):
         with process(url, tmp_path, "--json") as killed:
             killed.read_until(b"\n")
             killed.write(f"{line}\n".encode())

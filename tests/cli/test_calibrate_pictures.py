@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from smartcam.calibration.formats._cameras import write_camera_info
 from smartcam.calibration.simulation._images import render
 from smartcam.emulator._insight.camera import EmulatedInSight
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import Outcome, Process
+from tests.processes import Outcome, Process, printed_by
 
 pytestmark = pytest.mark.long
 
@@ -63,17 +64,16 @@ def files(tmp_path: Path) -> list[str]:
     return ["--target", str(target), "--lens", str(lens), "--pictures", str(pictures)]
 
 
-def test_calibrate_by_a_sheet_and_a_folder_gives_a_calibration(
-    tmp_path: Path, files: list[str]
-) -> None:
+def by_a_sheet(tmp_path: Path, files: list[str], *more: str) -> Any:
+    """Go through the wizard over a folder that pictures come into; return the last view."""
     options = ["--wizard", "sheet", "--json", "--folder", str(tmp_path / "kept"), *files]
-    with Process("smartcam", "calibrate", *options) as process:
+    with Process("smartcam", "calibrate", *more, *options) as process:
         number = shots = 0
         while True:
             number += 1
             view = json.loads(process.read_until(b"\n", count=number).splitlines()[-1])
             if view["type"] == "result":
-                break
+                return view
             assert view["errors"] == {}
             answer: dict[str, Any] = ABOUT if view["step"] == "about" else {}
             if view["step"].startswith("touch-"):
@@ -84,10 +84,33 @@ def test_calibrate_by_a_sheet_and_a_folder_gives_a_calibration(
             while view["step"] == "picture" and not process.says(0.5):
                 (tmp_path / "ftp" / f"shot{shots}.bmp").write_bytes(bitmap())
                 shots += 1
+
+
+def test_calibrate_by_a_sheet_and_a_folder_gives_a_calibration(
+    tmp_path: Path, files: list[str]
+) -> None:
+    view = by_a_sheet(tmp_path, files)
     assert view["result"]["file"] == "sheet.json"
+    assert view["verdict"]["text"].startswith("Good for 0.")
+    printed = printed_by(view["result"]["use"]["python"])
+    assert np.allclose(np.fromstring(printed.strip("[]\n"), sep=" "), OFFSET, atol=1e-4)
+    (row,) = run(*shlex.split(view["result"]["use"]["command"])[1:], "--json").done().lines
+    assert (row["name"], row["kind"]) == ("sheet", "sheet")
     found = SheetCalibration.load(tmp_path / "kept" / "sheet.json")
     place = found.transform(CAMERA.project(SEEN.apply(TARGET.points[[10]])))[0]
     assert place == pytest.approx(OFFSET + TARGET.points[10], abs=1e-5)
+
+
+def test_calibrate_by_a_sheet_ends_with_lines_for_the_camera_that_was_named(
+    tmp_path: Path, files: list[str]
+) -> None:
+    spec = "localizations: (x: uint8 px, y: uint8 px)*"
+    with emulators(tmp_path, ()) as (url,):
+        options = (url, "--application", "21", "--interpret-as", spec)
+        use = by_a_sheet(tmp_path, files, *options)["result"]["use"]
+        (result,) = run(*shlex.split(use["command"])[1:], "--json").done().lines
+        assert result["value"][0]["pose"]["header"]["frame_id"] == "robot"
+        assert "Position(x=" in printed_by(use["python"])
 
 
 def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) -> None:
@@ -107,34 +130,39 @@ def test_calibrate_by_a_folder_where_nothing_comes_keeps_the_step(
 
     monkeypatch.setattr(pictures, "DEADLINE", 0.3)
     monkeypatch.setattr(pictures.PictureFolder.__init__, "__kwdefaults__", {"deadline": 0.3})
-    lines = [*answers(ABOUT, {}, {}, {}), {"do": "abort"}]
+    lines = [*answers(ABOUT, {}, {}), {"do": "abort"}]
     done = calibrating(tmp_path, lines, "--wizard", "sheet", *files)
     assert done.code == 130
     assert [line.get("step") for line in done.lines[-3:]] == ["picture", "picture", None]
     assert "within 0.3 s" in done.lines[-2]["errors"]["base"]
+    asked = done.lines[2]
+    assert f"the next file that comes into {tmp_path / 'ftp'} counts" in asked["description"]
+    assert asked["notes"] == ["picture 1 of 1; to end without it, abort"]
+    assert asked["waiting"].startswith("Waiting: the next file that comes into ")
+    assert "what is there already does not. It is waited for 0.3 s" in asked["waiting"]
 
 
 def test_calibrate_hand_eye_asks_for_the_pose_in_the_robots_way(
     tmp_path: Path, files: list[str]
 ) -> None:
     lines = [
-        *answers({"robot": "kuka", "setup": "eye-to-hand"}, {}, {}, {"x": 1.0}),
+        *answers({"robot": "kuka", "setup": "eye-to-hand"}, {}, {"x": 1.0}),
         {"do": "abort"},
     ]
     done = calibrating(tmp_path, lines, "--wizard", "hand-eye", *files)
     assert [line.get("step") for line in done.lines] == [
-        "about", "sheet", "rulers", "view-1", "view-1", None,
+        "about", "rulers", "view-1", "view-1", None,
     ]  # fmt: skip
-    properties = done.lines[3]["schema"]["properties"]
+    properties = done.lines[2]["schema"]["properties"]
     assert list(properties) == ["x", "y", "z", "a", "b", "c"]
     assert (properties["x"]["x-unit"], "x-unit" in properties["a"]) == ("mm", False)
-    assert set(done.lines[4]["errors"]) == {"y", "z", "a", "b", "c"}
+    assert set(done.lines[3]["errors"]) == {"y", "z", "a", "b", "c"}
 
 
 def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_says_so(
     tmp_path: Path, files: list[str]
 ) -> None:
-    lines = [*answers(ABOUT, {}, {}, {}), {"do": "abort"}]
+    lines = [*answers(ABOUT, {}, {}), {"do": "abort"}]
     with emulators(tmp_path, ()) as urls:
         done = calibrating(tmp_path, lines, urls[0], "--wizard", "sheet", *files[:4])
     assert (
@@ -147,7 +175,7 @@ def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_says_so(
 async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
     tmp_path: Path, files: list[str]
 ) -> None:
-    lines = [*answers(ABOUT, {}, {}, {}), {"do": "abort"}]
+    lines = [*answers(ABOUT, {}, {}), {"do": "abort"}]
     options = ["--wizard", "sheet", *files[:4]]
     async with EmulatedInSight(image=render(TARGET, CAMERA, SEEN), online=True) as emulator:
         command = ("calibrate", emulator.url, "--json", "--folder", str(tmp_path), *options)
@@ -155,9 +183,9 @@ async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
             process.write("".join(f"{json.dumps(one)}\n" for one in lines).encode())
             views = (await asyncio.to_thread(process.wait)).lines
     assert [view.get("step") for view in views] == [
-        "about", "sheet", "rulers", "picture", "touch-1", None,
+        "about", "rulers", "picture", "touch-1", None,
     ]  # fmt: skip
-    assert views[4]["notes"][0] == "54 of 54 points of the target seen"
+    assert views[3]["notes"][0] == "54 of 54 points of the target seen"
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,6 @@ def test_emulator_takes_quirks_and_several_cameras() -> None:
     [
         (("--dialect", "handbook"), "--protocol insight takes no --dialect"),
         (("--transport", "tcp"), "--protocol insight takes no --transport"),
-        (("scenario.yaml",), "--protocol insight takes no scenario"),
     ],
 )
 def test_emulator_refuses_what_does_not_fit(given: tuple[str, ...], text: str) -> None:

@@ -151,7 +151,6 @@ def test_record_of_a_camera_that_sends_nothing_asks_for_every(tmp_path: Path) ->
     assert "the camera sends no results by itself" in first.err
     assert "while it is recorded: --every SECONDS" in first.err
     assert load_recording(tmp_path / "b.mcap").counts.results == 2
-    run("replay", str(tmp_path / "b.mcap")).failed(2, "speaks insight; only cameras that speak bvs")
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ import pytest
 
 from smartcam._client import handshake
 from smartcam._client.attempts import Try
-from smartcam._client.handshake import Session, establish, load_protocol
+from smartcam._client.handshake import Session, establish
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -24,6 +24,7 @@ from smartcam.exceptions import (
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
+from smartcam.protocols._base import load_protocol
 from smartcam.protocols._bvs import BVS, HANDBOOK, THESIS
 from smartcam.protocols._framed.machine import Event, State
 from smartcam.registry import PROTOCOLS

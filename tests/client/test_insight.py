@@ -709,8 +709,8 @@ async def test_garbage_ends_the_link_with_its_text() -> None:
     async with insight() as (emulator, camera):
         events = camera.events()
         emulator.answer_next(77, command="GJ")
-        (connection,) = emulator._connections
-        connection.answer(b"77\r\n")
+        (client,) = emulator._clients.values()
+        client.say("77")
         lost = await anext(events)
         assert isinstance(lost, Disconnected)
         assert lost.reason == "'77' came, nothing was asked"

@@ -324,7 +324,7 @@ SINS = (
     Sin("second-switch-meanwhile", doubled(m.SwitchAnswer), "SwitchAnswer"),
     Sin("second-switch-meanwhile", replaced(m.QueryAnswer, code=2), "code=2", "bid"),
     Sin("clock-is-told", replaced(m.ClockAnswer, month=13), "month=13"),
-    Sin("clock-is-set", deaf(m.SetClock), "1970"),
+    Sin("clock-is-set", deaf(m.SetClock), " 20"),
     Sin("impossible-date-is-harmless", hears(_keep_bad_date), "month=13"),
     Sin("impossible-date-is-harmless", replaced(m.SetClockAnswer, code=0), "code=0", "bid"),
     Sin("sequence-number-is-set", deaf(m.SetSequenceNumber), "00 00 00"),

@@ -685,7 +685,7 @@ async def test_faults_given_in_the_middle_of_a_frame_leave_that_frame(
     listener: Any = emulator._listener
     (link,) = listener.links
     session.send(wire.QUERY[:7])
-    await until(lambda: link._machine.buffered == 7)
+    await until(lambda: link.machine.buffered == 7)
     emulator.inject(faults.Drop(on="Query"), faults.Drop(on="GetClock"))
     session.send(wire.QUERY[7:], wire.QUERY, wire.QUERY, wire.GET_CLOCK)
     await session.expect(wire.ACTIVE_1, wire.ACTIVE_1)
@@ -801,7 +801,7 @@ async def test_client_that_is_turned_away_is_not_heard_any_more(clock: ManualClo
 async def test_client_that_does_not_read_is_gone_before_a_fault_ends_it(
     emulator: EmulatedCamera, session: RawClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("smartcam.emulator._client_link.WRITE_LIMIT", 20)
+    monkeypatch.setattr(EmulatedCamera, "write_limit", 20)
     emulator.inject(faults.Close(on="Start", when="after"), faults.Duplicate(on="StatusReport"))
     session.send(wire.START)
     await session.expect_fin()

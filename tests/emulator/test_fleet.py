@@ -134,6 +134,7 @@ async def test_fleet_starts_and_stops_all(tmp_path: Path) -> None:
     async with fleet:
         assert fleet.urls == {name: fleet[name].url for name in ("left", "camera2")}
         for emulator in fleet:
+            assert isinstance(emulator, EmulatedCamera)
             assert emulator.quirks.reboot_time == 9
             async with smartcam.connect(emulator.url) as camera:
                 assert camera.active_application in {5, 6}

@@ -20,13 +20,16 @@ from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults
 from smartcam.models import Status
 from smartcam.protocols import messages as m
+from smartcam.protocols._base import Role
+from smartcam.protocols._base import Transport as CarriedBy
 from smartcam.protocols._bvs import HANDBOOK, MESSAGES, THESIS
 from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._framed.machine import Machine
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import RawClient, UdpClient, until
 
 if TYPE_CHECKING:
-    from smartcam.emulator._client_link import ClientLink
+    from smartcam.emulator._client_link import ClientLink, Trace
     from smartcam.emulator._clock import Clock
 
 ECHO = Application(
@@ -202,8 +205,9 @@ class Transport(asyncio.Transport):
 class Owner:
     """Answers a Connect and writes down the rest."""
 
-    spoken = HANDBOOK
-    device = Device([Application(id=1)])
+    codec = HANDBOOK
+    max_links = 32
+    write_limit = 1 << 20
 
     def __init__(self) -> None:
         self.clock: Clock = ManualClock()
@@ -212,6 +216,12 @@ class Owner:
 
     def step(self) -> nullcontext[None]:
         return nullcontext()
+
+    def make_machine(self, transport: CarriedBy, trace: Trace) -> Machine:
+        return Machine(HANDBOOK, Role.CAMERA, transport, max_length=MAX_INPUT, trace=trace)
+
+    def arrived(self, link: ClientLink) -> None:
+        pass
 
     def received(self, link: ClientLink, message: m.Message) -> None:
         self.messages.append(message)
@@ -260,7 +270,7 @@ def test_link_any_bytes_in_any_chunks_give_the_same_messages(
         cut.data_received(rest)
     assert one.messages == other.messages
     assert one.messages[0] == m.Connect()
-    assert whole._machine.buffered == cut._machine.buffered < MAX_INPUT
+    assert whole.machine.buffered == cut.machine.buffered < MAX_INPUT
 
 
 def test_link_every_split_point_of_a_conversation() -> None:

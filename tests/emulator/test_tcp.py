@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
-from smartcam.emulator import _links as links
 from smartcam.emulator._client_link import MAX_INPUT
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
@@ -348,7 +347,7 @@ async def test_tcp_client_that_does_not_read_is_disconnected(
 async def test_tcp_connections_are_bounded(
     emulator: EmulatedCamera, session: TcpClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(links, "MAX_LINKS", 2)
+    monkeypatch.setattr(EmulatedCamera, "max_links", 2)
     async with await TcpClient.open(emulator) as second, await TcpClient.open(emulator) as third:
         await second.expect_end()
         await session.expect_nothing_but(wire.QUERY, wire.ACTIVE_1)
@@ -362,7 +361,7 @@ async def test_tcp_client_always_gets_in(
     async with contextlib.AsyncExitStack() as stack:
         idle = [
             await stack.enter_async_context(await TcpClient.open(emulator))
-            for _ in range(3 * links.MAX_LINKS)
+            for _ in range(3 * EmulatedCamera.max_links)
         ]
         for client in idle[::2]:
             client.send(wire.QUERY, wire.MAGIC)  # what it says without a session does not count
@@ -372,17 +371,17 @@ async def test_tcp_client_always_gets_in(
             await wire.greet(newcomer)
         assert "32 others are open, it was without a session for longest" in caplog.text
         await session.expect_end()
-        for client in idle[: 2 * links.MAX_LINKS]:
+        for client in idle[: 2 * EmulatedCamera.max_links]:
             await client.expect_end()
-        assert len(emulator.links) <= links.MAX_LINKS
-        assert emulator.crowded_out == 2 * links.MAX_LINKS + 2
+        assert len(emulator.links) <= EmulatedCamera.max_links
+        assert emulator.crowded_out == 2 * EmulatedCamera.max_links + 2
         assert [one.ended_by for one in emulator.visits] == ["camera"] * len(emulator.visits)
 
 
 async def test_tcp_client_that_had_a_session_makes_room_after_those_that_had_none(
     emulator: EmulatedCamera, session: TcpClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(links, "MAX_LINKS", 3)
+    monkeypatch.setattr(EmulatedCamera, "max_links", 3)
     async with await TcpClient.open(emulator) as first, await TcpClient.open(emulator) as second:
         first.send(wire.QUERY)
         second.send(wire.QUERY)
@@ -405,10 +404,10 @@ async def test_tcp_client_without_a_session_holds_one_frame_at_most(
     client.send(bomb, bytes(3 * MAX_INPUT), half)
     await until(lambda: len(listener.links) == 1)
     (link,) = listener.links
-    await until(lambda: link._machine.buffered == len(half))
+    await until(lambda: link.machine.buffered == len(half))
     client.send(b"!")  # which makes it a whole one
     await emulator.wait_received(0x21)
-    assert link._machine.buffered == 0
+    assert link.machine.buffered == 0
 
 
 # ---------------------------------------------------------------------- the operator

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
-from smartcam.emulator import _links as links
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import UdpClient
@@ -116,7 +115,7 @@ async def test_udp_newcomer_wins_whatever_the_quirk_for_tcp_says(
 async def test_udp_peers_are_bounded_and_the_session_is_kept(
     emulator: EmulatedCamera, session: UdpClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(links, "MAX_LINKS", 2)
+    monkeypatch.setattr(EmulatedCamera, "max_links", 2)
     async with UdpClient(emulator) as second, UdpClient(emulator) as third:
         second.send(wire.QUERY)
         await emulator.wait_received(m.Query)
@@ -161,7 +160,7 @@ async def test_udp_datagrams_for_a_network_that_is_too_slow_are_dropped(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(links, "WRITE_LIMIT", -1)
+    monkeypatch.setattr(EmulatedCamera, "write_limit", -1)
     with caplog.at_level(logging.WARNING, logger="smartcam.emulator"):
         emulator.device.start()
     assert "datagram dropped: the network is too slow" in caplog.text

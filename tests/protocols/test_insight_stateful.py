@@ -20,7 +20,7 @@ from smartcam.exceptions import LocalProtocolError
 from smartcam.protocols import messages as m
 from smartcam.protocols._framed.machine import Event, State
 from smartcam.protocols._insight.machine import ONLINE, Command, Reply
-from smartcam.protocols._insight.words import LineReader
+from smartcam.protocols._insight.words import command_reader
 from tests.protocols.insight_lines import LOGIN, Talk, with_cells
 
 REQUESTS: list[m.Message] = [
@@ -60,7 +60,7 @@ class Wires(RuleBasedStateMachine):
         jobs = [{**job, "file": file} for file in ("7bolts.job", "12nuts.job", "spare.job")]
         self.device = InSightDevice(jobs, online=True)
         self.commands = InSightCommands(self.device)
-        self.heard = LineReader(nul_ends=True)
+        self.heard = command_reader()
         self.busy = self.going = False
         self.to_camera, self.to_client = bytearray(), bytearray(LOGIN)
         self.talk = Talk(with_cells("A1"))

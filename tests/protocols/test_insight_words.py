@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from smartcam.exceptions import ConfigurationError, FrameError
 from smartcam.protocols._insight import words
 from smartcam.protocols._insight.answers import MAX_IMAGE, AnswerReader, CommandAnswer
-from smartcam.protocols._insight.words import AnswerForm, Cell, LineReader, StatusCode, hex_lines
+from smartcam.protocols._insight.words import AnswerForm, Cell, StatusCode, hex_lines
+from smartcam.protocols._line_reader import LineReader
 from tests.protocols.insight_lines import BITMAP, DIGITS, IMAGE_LINES, crc
 
 # ---------------------------------------------------------------------- cells
@@ -133,6 +134,10 @@ def test_hex_lines_have_eighty_digits_and_a_checksum(
 # ---------------------------------------------------------------------- lines
 
 
+def camera_reader(max_line: int = words.MAX_LINE) -> LineReader:
+    return LineReader(words.ENDS, max_line=max_line, encoding=words.ENCODING)
+
+
 def lines_of(reader: LineReader) -> list[str]:
     found = []
     while (line := reader.next_line()) is not None:
@@ -144,7 +149,8 @@ def lines_of(reader: LineReader) -> list[str]:
 def test_lines_do_not_depend_on_how_bytes_arrive(chunks: list[bytes], nul: bool) -> None:
     alphabet = bytes.maketrans(bytes(range(256)), (b"a\r\n\x00" * 64))
     chunks = [chunk.translate(alphabet) for chunk in chunks]
-    whole, parts = LineReader(nul_ends=nul), LineReader(nul_ends=nul)
+    make = words.command_reader if nul else camera_reader
+    whole, parts = make(), make()
     whole.feed(b"".join(chunks))
     found = []
     for chunk in chunks:
@@ -155,20 +161,20 @@ def test_lines_do_not_depend_on_how_bytes_arrive(chunks: list[bytes], nul: bool)
 
 
 def test_reader_of_the_camera_takes_nul_as_an_end() -> None:
-    reader = LineReader(nul_ends=True)
+    reader = words.command_reader()
     reader.feed(b"GO\r\nGJ\x00GF\r\x00\xb0\r\nrest")
     assert lines_of(reader) == ["GO", "GJ", "GF", "\xb0"]
     assert len(reader) == 4
 
 
 def test_reader_of_the_client_keeps_nul_and_single_ends() -> None:
-    reader = LineReader()
+    reader = camera_reader()
     reader.feed(b"a\x00b\rc\nd\r\n")
     assert lines_of(reader) == ["a\x00b\rc\nd"]
 
 
 def test_line_of_the_greatest_length_passes_and_a_longer_one_raises() -> None:
-    reader = LineReader(max_line=4)
+    reader = camera_reader(max_line=4)
     reader.feed(b"1234\r")
     assert reader.next_line() is None
     reader.feed(b"\n12345\r\n")
@@ -179,14 +185,14 @@ def test_line_of_the_greatest_length_passes_and_a_longer_one_raises() -> None:
 
 
 def test_line_without_an_end_raises_when_it_is_too_long() -> None:
-    reader = LineReader(max_line=4)
+    reader = camera_reader(max_line=4)
     reader.feed(b"123456")
     with pytest.raises(FrameError, match="a line of more than 4 bytes came"):
         reader.next_line()
 
 
 def test_prompts_and_counted_bytes_are_taken_between_lines() -> None:
-    reader = LineReader()
+    reader = camera_reader()
     reader.feed(b"Welcome\r\nUse")
     assert reader.next_line() == "Welcome"
     assert not reader.take_prompt(words.USER_PROMPT)

@@ -198,7 +198,7 @@ def test_plan_application_id_nobody_can_have_is_refused(tmp_path: Path) -> None:
         ),
         (
             [Connected(camera="left", at=at(0), url="insight://h:23?dialect=native")],
-            "camera 'left' speaks insight; only cameras that speak bvs can be replayed",
+            "camera 'left' speaks insight, not bvs; smartcam.recording.replay.. plays it where",
         ),
         ([Connected(camera="left", at=at(0), url=URL)], "no answer of camera 'left' is in it"),
     ],

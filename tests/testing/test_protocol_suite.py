@@ -6,7 +6,6 @@ The bytes of conversations in frames come from the dialect's table, which golden
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 from typing import TYPE_CHECKING
 
@@ -19,8 +18,9 @@ from smartcam.protocols._insight.dialect import INSIGHT
 from smartcam.protocols._insight.machine import ONLINE
 from smartcam.testing import WireSuite
 from smartcam.testing._suites.protocols.conversations import Came, Conversation, Sent, Step
+from tests import ROOT
 from tests.protocols.insight_lines import BITMAP, GREETING, IMAGE_LINES
-from tests.testing.acme_page import MODULE, TESTS, acme
+from tests.testing.acme_page import MODULE, TESTS, acme_is_known
 
 if TYPE_CHECKING:
     import pytest
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from smartcam.protocols._framed.dialect import FramedDialect
 
 pytest_plugins = ["pytester"]
+
+__all__ = ["acme_is_known"]
+
+EXAMPLE = ROOT / "examples" / "smartcam-acme"
 
 RUNNING = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 CLOCK = {"year": 2016, "month": 6, "day": 25, "hour": 10, "minute": 11, "second": 12}
@@ -180,18 +184,23 @@ class TestInSight(WireSuite):
 OPTIONS = ("-p", "no:cacheprovider", "-rs", "-o", "asyncio_default_fixture_loop_scope=function")
 
 
-def test_page_shows_a_camera_that_the_client_can_use() -> None:
-    with acme.installed():
-        asyncio.run(acme.main())
+def test_page_shows_the_example_word_by_word() -> None:
+    assert (EXAMPLE / "acme_camera.py").read_text(encoding="utf-8") == MODULE
+    assert (EXAMPLE / "tests" / "test_acme.py").read_text(encoding="utf-8") == TESTS
+
+
+def test_camera_of_the_page_takes_about_forty_lines() -> None:
+    lines = [line for line in MODULE.splitlines() if line.strip()]
+    assert len(lines) < 50
 
 
 def test_page_shows_tests_that_pass(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(acme_camera=MODULE, test_acme=TESTS)
     pytester.syspathinsert()
     result = pytester.runpytest_inprocess(*OPTIONS, "-o", "asyncio_mode=auto")
-    result.assert_outcomes(passed=75, skipped=10)
+    result.assert_outcomes(passed=77, skipped=10)
     result.stdout.fnmatch_lines(
-        ["*Acme has no application 3", "*AcmeCamera cannot restart the camera"]
+        ["*Acme has no application 3", "*LiveAcme cannot restart the camera"]
     )
 
 

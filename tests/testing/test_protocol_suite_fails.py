@@ -6,7 +6,6 @@ What is right is the Acme camera of ``docs/adding-a-camera.md``; each mistake is
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,17 @@ from smartcam.protocols._bvs import HANDBOOK
 from smartcam.protocols._framed.dialect import FramedDialect
 from smartcam.protocols._framed.framing import Frame
 from smartcam.protocols._framed.machine import State
+from smartcam.protocols._lines import LineDialect as Dialect
+from smartcam.protocols._lines import LineMachine as Machine
+from smartcam.protocols._lines import _AskedLine
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 from smartcam.testing._suites.protocols.words import ABILITIES
-from tests.testing.acme_page import AcmeMachine as Machine
-from tests.testing.acme_page import acme
+from tests.testing.acme_page import acme, acme_is_known
+
+__all__ = ["acme_is_known"]
 
 ACME: Protocol = acme.ACME
-LINES = ACME.dialects["lines"]
-Dialect: Any = acme.AcmeDialect
+LINES: Dialect = acme.LINES
 
 CELLS = (m.CellValue("0", "12.5"), m.CellValue("1", "bolt"))
 CONNECT = (Sent(m.Connect(), b"HELLO\n"), Came(b"ACME\n", (m.ConnectAnswer(version=1),)))
@@ -48,12 +50,6 @@ TALK = Conversation(
 NONSENSE = Conversation(
     name="nonsense", dialect="lines", steps=(*CONNECT, Came(b"what?\n", (FrameError,)))
 )
-
-
-@pytest.fixture(autouse=True)
-def _installed() -> Iterator[None]:
-    with acme.installed():
-        yield
 
 
 def fails(check: str, protocol: Protocol, **arguments: Any) -> str:
@@ -78,7 +74,7 @@ def changed(**changes: Any) -> Protocol:
 
 def bad_dialect(**changes: Any) -> Any:
     kind = type("BadDialect", (Dialect,), changes)
-    return kind(name="lines", about="lines of text", source="this page")
+    return kind(name="lines", about="lines of text", source="this page", rows=LINES.rows)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +233,7 @@ class Talkative(Machine):
 
 
 class Nonsense(Machine):
-    def _read(self, line: str) -> object:
+    def _read(self, line: str) -> m.Message:
         try:
             return super()._read(line)
         except FrameError:
@@ -245,7 +241,7 @@ class Nonsense(Machine):
 
 
 class Verbose(Machine):
-    def _read(self, line: str) -> object:
+    def _read(self, line: str) -> m.Message:
         try:
             return super()._read(line)
         except FrameError:
@@ -266,7 +262,7 @@ class Unbounded(Machine):
         if b"\n" in data:
             super().receive_data(data)
         else:
-            self._buffer += data
+            self._reader.feed(data)
 
 
 class Hoarding(Unbounded):
@@ -279,7 +275,7 @@ class KeepsFailed(Machine):
     def receive_data(self, data: bytes) -> None:
         super().receive_data(data)
         if self.state is State.FAILED:
-            self._buffer += data
+            self._reader.feed(data)
 
 
 class Willing(Machine):
@@ -288,7 +284,9 @@ class Willing(Machine):
     def send(self, message: m.Message, *, answered: bool | None = None) -> None:
         if isinstance(message, m.Query):
             self._outbox.append(b"PROGRAM\n")
-            self._asked.append(m.Query)
+            row = self.dialect.row(m.Query)
+            assert row is not None
+            self._asked.append(_AskedLine(row, row.line))
         else:
             super().send(message, answered=answered)
 
@@ -320,7 +318,7 @@ class Impatient(Machine):
 class Credulous(Machine):
     """Knows an answer by its looks."""
 
-    def _read(self, line: str) -> object:
+    def _read(self, line: str) -> m.Message:
         if line.isdecimal() and not self._asked:
             return m.QueryAnswer(application=int(line))
         return super()._read(line)
@@ -344,13 +342,9 @@ class Answering(Machine):
 
 
 class Kinless(Machine):
-    @property
-    def kin(self) -> tuple[Any, ...]:
-        return (HANDBOOK,)
-
-    @kin.setter
-    def kin(self, _: Any) -> None:
-        pass
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.kin = (HANDBOOK,)
 
 
 class Sharing(Machine):

@@ -69,9 +69,16 @@ def test_web_json_has_name_and_page_of_a_camera_and_the_token_is_that_of_the_env
         assert emulator.wait().code == 0
 
 
+def test_web_shows_a_camera_of_another_make() -> None:
+    options = ("--web", "--protocol", "insight")
+    with Process("smartcam-emulator", *options, fresh=True) as emulator:
+        page, url = page_of(emulator), emulator.read_until(b"\n").strip()
+        (camera,) = get(f"{page}api/cameras")["cameras"]
+        assert (camera["url"], camera["mode"]) == (url, "running")
+
+
 def test_web_that_cannot_be_is_refused_in_one_line() -> None:
     assert refused("--web-port", "8080") == "Error: --web-port needs --web"
-    assert refused("--web", "--protocol", "insight") == "Error: --protocol insight takes no --web"
     assert refused("--web", "--web-token", "short").startswith(
         "smartcam-emulator: error: web: a token has 16 letters"
     )

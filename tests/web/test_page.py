@@ -11,9 +11,10 @@ import pytest
 import pytest_asyncio
 
 import smartcam
-from smartcam.emulator import EmulatedCamera, ManualClock
+from smartcam.emulator import EmulatedCamera, EmulatedInSight, ManualClock, Scenario
 from smartcam.emulator._scene import PIECES
 from smartcam.emulator.faults import FAULTS
+from smartcam.exceptions import ConnectionLostError
 from smartcam.models import Status
 from smartcam.web import EmulatorSite
 from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from playwright.async_api import Page, ViewportSize
+
+    from smartcam.emulator import WireCamera
 
 pytestmark = BROWSER_MARKS
 
@@ -34,12 +37,18 @@ class View(NamedTuple):
     """A page, the cameras it shows and their site."""
 
     page: Page
-    cameras: dict[str, EmulatedCamera]
+    cameras: dict[str, WireCamera]
     site: EmulatorSite
 
     @property
     def emulator(self) -> EmulatedCamera:
-        return next(iter(self.cameras.values()))
+        emulator = next(iter(self.cameras.values()))
+        assert isinstance(emulator, EmulatedCamera)
+        return emulator
+
+    @property
+    def url(self) -> str:
+        return next(iter(self.cameras.values())).url
 
     async def see(self, selector: str, text: str = "") -> None:
         """Wait until something is to be seen, with a text."""
@@ -61,7 +70,7 @@ async def page() -> AsyncIterator[Page]:
 
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page, *cameras: EmulatedCamera, token: str | None = None, at: str | None = None
+    page: Page, *cameras: WireCamera, token: str | None = None, at: str | None = None
 ) -> AsyncIterator[View]:
     """Show cameras; what the browser finds wrong with the page fails the test."""
     async with contextlib.AsyncExitStack() as stack:
@@ -110,6 +119,44 @@ async def test_trigger_button_brings_the_client_a_result(page: Page) -> None:
         await view.see("#mode", "stopped")
         await page.click("#trigger")
         await view.see("#told", "not taken: the camera is stopped")
+
+
+async def test_trigger_that_nobody_hears_says_so_and_shows_what_was_seen(page: Page) -> None:
+    async with opened(page, EmulatedCamera(active=7, running=True)) as view:
+        await page.click("#trigger")
+        await view.see("#told", "No client listens, so nobody gets the result.")
+        await view.see("#part-seen", "Application 7 reported 7 parts")
+        assert await page.locator("[data-reported] polygon").count() == 7
+        await page.select_option("#application", "21")
+        await page.click("#switch button")
+        await view.see("#part-seen", "does not look at the table; 7 tangram does")
+        await page.locator("[data-reported]").first.wait_for(state="hidden")
+
+
+async def test_page_of_another_make_shows_what_that_camera_has(page: Page) -> None:
+    plan = Scenario(protocol="insight", name="line 2", active=7, running=True)
+    async with opened(page, EmulatedInSight.from_scenario(plan)) as view:
+        assert not await page.is_visible("#picture, #reboot, #endian, [data-condition]")
+        await view.see("#facts", "7Counter.job, triggered")
+        async with smartcam.connect(f"{view.url}?cells=A1") as camera:
+            await camera.trigger()
+            await view.see("#log tr.out", "code 1")
+            await view.see("#latency-last", "in 1")
+            await page.click("text=Lost link")
+            with pytest.raises(ConnectionLostError):
+                await camera.trigger()
+        await view.see("#fired", "reset")
+        await page.click("#stop")
+        await view.see("#mode", "stopped")
+
+
+async def test_search_for_the_dialect_is_no_error(page: Page) -> None:
+    async with (
+        opened(page, greeting(dialect="thesis")) as view,
+        smartcam.connect(view.url.partition("?")[0]),
+    ):
+        await view.see("#log tr:not(.marked)", "tried dialect handbook; this camera speaks")
+        assert await page.locator("#log tr.marked").count() == 0
 
 
 async def test_buttons_change_what_the_client_sees(page: Page) -> None:
@@ -315,7 +362,7 @@ async def test_part_form_puts_takes_off_and_puts_back(page: Page) -> None:
         await page.click("#part-remove")
         await until(lambda: "bolt" not in pieces)
         pieces.clear()
-        await page.locator("#picture .piece").first.wait_for(state="detached")
+        await page.locator("#picture .piece").first.wait_for(state="hidden")
         await page.click("#scene-reset")
         await until(lambda: pieces == PIECES)
 

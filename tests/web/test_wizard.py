@@ -107,6 +107,10 @@ async def test_wizard_over_http_makes_a_calibration_that_transforms(tmp_path: Pa
         assert loaded == {"name": "table", "model": "rigid", "robot_frame": "base"}
         pose = (await world.post("/transform", x=0.1, y=0.05))["pose"]
         assert (pose["header"]["frame_id"], pose["position"]["x"]) == ("base", pytest.approx(0.05))
+        listed = (await world.call("GET", "/listing"))[1]["listing"]
+        assert [(one["name"], one["kind"], one["checked_at"]) for one in listed] == [
+            ("table", "plane", None)
+        ]
         exported = await world.post("/export", name="table", target="out.yaml")
     assert exported == {"file": "exports/out.yaml"}
     assert (tmp_path / "exports/out.yaml").read_text().startswith("%YAML 1.1\n")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -12,14 +14,17 @@ import pytest_asyncio
 from smartcam.calibration._files.directory import Folder
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._optional_imports import load
 from smartcam.calibration._sheet.calibration import SheetCalibration
-from smartcam.calibration._targets import Checkerboard
+from smartcam.calibration._targets import Checkerboard, target_to_data
 from smartcam.calibration.simulation._images import render
 from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
+from smartcam.calibration.wizards._pictures import PictureFolder
 from smartcam.calibration.wizards._services import CalibrationService
 from smartcam.calibration.wizards._sheet import sheet_wizard
 from smartcam.exceptions import NotRunningError
 from smartcam.web._wizard import WizardSite
+from tests.processes import printed_by
 from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong
 from tests.web.sitekit import TOKEN
 from tests.web.test_wizard import MARKS, World, run_through, served
@@ -55,14 +60,7 @@ class View(NamedTuple):
 
     async def answer(self, title: str, **answers: Any) -> None:
         """Answer the step of that title."""
-        await self.see("#title", title)
-        for name, value in answers.items():
-            field = self.page.locator(f"#form [name={name}]")
-            if await field.first.get_attribute("type") == "radio":
-                await self.page.locator(f"#form [name={name}][value='{value}']").check()
-            else:
-                await field.fill(str(value))
-        await self.page.click("#go")
+        await answer(self.page, title, **answers)
 
     async def how_many(self, selector: str) -> int:
         return await self.page.locator(selector).count()
@@ -78,13 +76,14 @@ async def opened(page: Page, folder: Path, token: str | None = None) -> AsyncIte
             await page.goto("about:blank")
 
 
-async def begin(view: View) -> None:
-    """Start, and go on to the touches."""
+async def begin(view: View, *, chosen: bool = True) -> None:
+    """Start, and go on to the touches; or only until marks are chosen."""
     await view.page.fill("#name", "table")
     await view.page.click("#start-form button")
     await view.answer("Camera, robot and tool", unit="m", side="+z", touch_sigma="0,2")
     await view.answer("Marks in the camera's field")
-    await view.answer("Which ones will be touched?")
+    if chosen:
+        await view.answer("Which ones will be touched?")
 
 
 async def test_page_drives_the_wizard_to_a_calibration(page: Page, tmp_path: Path) -> None:
@@ -109,9 +108,80 @@ async def test_page_drives_the_wizard_to_a_calibration(page: Page, tmp_path: Pat
         await view.answer("What came out", next="accept")
         await view.answer("Save table")
         await view.see("#title", "Done")
-        await view.see("#result", "table.json")
-        await view.page.click("#again")
-        await view.see("#names li", "table")
+        await view.see("#verdict.good", "Good for 0.")
+        await view.see("#result", str(tmp_path / "table.json"))
+        await view.see("#result", "held-out error")
+        assert await view.how_many("#plot .touched") == 4
+        assert str(tmp_path) in await page.inner_text("#use-command")
+        python = await page.inner_text("#use-python")
+        assert (await asyncio.to_thread(printed_by, python)).startswith("[[")
+        await page.locator("#use button").last.click()
+        await view.see("#use button", "Copied")
+        await page.click("#again")
+        await view.see("#names td", "table")
+
+
+async def test_page_says_what_is_wrong_in_words_and_chooses_what_mends_it(
+    page: Page, tmp_path: Path
+) -> None:
+    async with opened(page, tmp_path) as view:
+        await begin(view)
+        for number, (x, y, z) in enumerate(TOUCHES):
+            await view.answer("Touch mark", x=y, y=x + 0.003 * (number == 2), z=z)
+        await view.see("#verdict.poor", "Not good enough: touch point 3 again")
+        await view.see("#notes .warning b", "Warning")
+        await view.see("#notes .warning code")
+        assert await page.is_checked("#form [name=next][value=redo]")
+        await view.answer("What came out")
+        await view.answer("Touch point 3 again", x=TOUCHES[2][1], y=TOUCHES[2][0], z=0.0)
+        await view.see("#verdict.good", "Good for 0.")
+        assert await page.is_checked("#form [name=next][value=accept]")
+
+
+async def test_page_s_marks_are_chosen_by_a_click(page: Page, tmp_path: Path) -> None:
+    async with opened(page, tmp_path) as view:
+        await begin(view, chosen=False)
+        await view.see("#title", "Which ones will be touched?")
+        await view.see("#form label", "2: mark at x 200.0 mm, y 0.0 mm")
+        assert await view.how_many("#plot .choice.chosen") == 4
+        for number in (2, 3, 2):
+            await page.locator("#plot .choice").nth(number).click()
+        ticked = [await page.is_checked(f"#form [name=mark_{n}]") for n in (1, 2, 3, 4)]
+        assert ticked == [True, True, True, False]
+        assert await view.how_many("#plot .choice.chosen") == 3
+        await page.check("#form [name=mark_4]")
+        assert await view.how_many("#plot .choice.chosen") == 4
+        await page.locator("#plot .choice").nth(0).click()
+        await view.answer("Which ones will be touched?")
+        await view.see("#title", "Touch mark 1 of 3")
+        for x, y, _ in TOUCHES[1:]:
+            await view.answer("Touch mark", x=y, y=x, z=0.0)
+        await view.see("#title", "What came out")
+        await page.locator("#plot .choice").nth(2).click()
+        assert await page.input_value("#input-point") == "3"
+
+
+async def test_page_lists_calibrations_with_date_error_and_last_check(
+    page: Page, tmp_path: Path
+) -> None:
+    async with opened(page, tmp_path) as view:
+        await run_through(view.world, await view.world.post("/start", name="table"))
+        step = await view.world.post("/start", name="table", wizard="drift")
+        touches = [{"x": y + 0.002, "y": x, "z": 0.0} for x, y in MARKS]
+        for answers in ({"unit": "m"}, {}, {}, *touches, {}):
+            step = await view.world.post("/step", token=step["token"], answers=answers)
+        (tmp_path / "broken.json").write_text("{")
+        await page.reload()
+        await page.click("#again")
+        await view.see("#names td.problem", "Cannot be read: ")
+        cells = await page.locator("#names tbody tr").nth(1).locator("td").all_inner_texts()
+        assert cells[:2] == ["table", "plane"]
+        assert str(datetime.now(UTC).year) in cells[2]
+        assert cells[3] == "0.00 mm"
+        assert cells[4].startswith("\u2717 stale, ")
+        await page.fill("#name", "")
+        await page.locator("#names button", has_text="table").click()
+        assert await page.input_value("#name") == "table"
 
 
 async def test_page_shows_what_is_left_out_as_crosses(page: Page, tmp_path: Path) -> None:
@@ -210,6 +280,43 @@ async def test_page_fits_its_width(page: Page, tmp_path: Path, width: int) -> No
         await page.set_viewport_size({"width": 1200, "height": 900})
 
 
+async def in_sight(page: Page) -> None:
+    """See that what goes on stands where nobody must scroll, and nothing beside the screen."""
+    box = await page.locator("button.primary:visible").bounding_box()
+    size = page.viewport_size
+    assert box is not None
+    assert size is not None
+    title = await page.inner_text("#title")
+    assert box["y"] >= 0, title
+    assert box["y"] + box["height"] <= size["height"], title
+    assert await page.evaluate("document.documentElement.scrollWidth") <= size["width"], title
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)])
+async def test_page_s_button_is_in_sight_in_every_step(
+    page: Page, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    async with opened(page, tmp_path) as view:
+        await page.set_viewport_size({"width": size[0], "height": size[1]})
+        await page.wait_for_selector("#start:not([hidden])")
+        await in_sight(page)
+        await page.click("#start-form button.primary")
+        touches = [{"x": y, "y": x + 0.003 * (x > 0), "z": 0.0} for x, y in MARKS]
+        about = {"unit": "m", "side": "+z", "touch_sigma": "0.2"}
+        steps: list[dict[str, Any]] = [about, {}, {}, *touches, {"next": "accept"}, {}]
+        for answers in steps:
+            await view.see("#go")
+            await in_sight(page)
+            title = await page.inner_text("#title")
+            await view.answer(title, **answers)
+            await page.wait_for_function(
+                "old => document.getElementById('title').textContent !== old", arg=title
+            )
+        await view.see("#use-python")
+        assert await page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        await page.set_viewport_size({"width": 1200, "height": 900})
+
+
 # ---------------------------------------------------------------------- steps that look at pictures
 
 
@@ -246,6 +353,8 @@ async def site(tmp_path: Path) -> AsyncIterator[WizardSite]:
 async def answer(page: Page, title: str, **answers: Any) -> None:
     """Answer the step of that title."""
     await page.locator("#title").filter(has_text=title).wait_for()
+    # or it is the step before, whose answer is under way
+    await page.locator("#go:enabled").wait_for()
     for name, value in answers.items():
         field = page.locator(f"#form [name={name}]")
         if await field.first.get_attribute("type") == "radio":
@@ -283,8 +392,14 @@ async def test_page_shows_the_sheet_in_the_cameras_picture(page: Page, site: Wiz
     await answer(page, "The sheet in the camera's field")
     await page.locator("#base").filter(has_text="9 x 6").wait_for()
     await answer(page, "The sheet in the camera's field")
+    await page.locator("#title").filter(has_text="Touch point 1").wait_for()
+    assert await page.locator("#camera-choices .choice.chosen").count() == 1
+    await page.locator("#camera-choices .choice").nth(9 * 2 + 4).click()
+    assert [await page.input_value(f"#input-{one}") for one in ("column", "row")] == ["5", "3"]
+    await page.locator("#camera-choices .choice").first.click()
     for number in range(1, 5):
         await page.locator("#title").filter(has_text=f"Touch point {number}").wait_for()
+        await in_sight(page)
         assert await picture_size(page) == [940, 775]
         column = int(await page.input_value("#input-column"))
         row = int(await page.input_value("#input-row"))
@@ -298,6 +413,33 @@ async def test_page_shows_the_sheet_in_the_cameras_picture(page: Page, site: Wiz
     await page.locator("#result").filter(has_text="table.json").wait_for()
     found = SheetCalibration.load(site.service.folder.calibration("table"))
     assert found.view.size == (640, 480)
+
+
+async def test_page_says_which_file_it_waits_for(page: Page, tmp_path: Path) -> None:
+    inbox, folder = tmp_path / "ftp", Folder(tmp_path / "kept")
+    inbox.mkdir()
+    pictures = PictureFolder(inbox, deadline=60.0)
+    wizard = sheet_wizard(
+        take_picture=pictures.take,
+        save_to=folder.calibration,
+        suggested=TARGET,
+        awaited=pictures.awaited,
+    )
+    service = CalibrationService(folder, [wizard])
+    async with WizardSite(service) as site:
+        service.start("table", "sheet", {"target": target_to_data(TARGET)})
+        await page.goto(site.url)
+        await answer(page, "Camera, robot and tool")
+        await answer(page, "Was the sheet printed true to size?")
+        await page.locator("#notes li").filter(has_text="picture 1 of 1").wait_for()
+        await answer(page, "The sheet in the camera's field")
+        said = f"Waiting: the next file that comes into {inbox} counts"
+        await page.locator("#waiting").filter(has_text=said).wait_for()
+        data = load("cv2").imencode(".png", render(TARGET, CAMERA, SEEN))[1].tobytes()
+        (inbox / "shot.png").write_bytes(data)
+        await page.locator("#title").filter(has_text="Touch point 1").wait_for()
+        assert await page.inner_text("#waiting") == ""
+        service.close()
 
 
 async def test_page_shows_the_view_that_was_taken_last(page: Page, site: WizardSite) -> None:

@@ -22,12 +22,14 @@ from smartcam.calibration._hand_eye.closed_forms import LEAST_POSES
 from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
-from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT
+from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT, how_to_take
 from smartcam.calibration.wizards._points import Calibrated, ask_to_save, review_step
 from smartcam.calibration.wizards._sequence import Wizard, ask
 from smartcam.calibration.wizards._steps import Number, Option, Step, pick
 from smartcam.calibration.wizards._target_drawing import draw
 from smartcam.calibration.wizards._target_steps import ask_target
+from smartcam.calibration.wizards._usage import usage
+from smartcam.calibration.wizards._verdict import VIEW_CURES, Judgement, judge, refused
 from smartcam.calibration.wizards._view_suggestions import LOOKS, outline
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Pose
@@ -71,15 +73,17 @@ def hand_eye_wizard(
     suggested: Target | None = None,
     read_robot: ReadFlange | None = None,
     camera: CameraModel | None = None,
+    awaited: str = "",
 ) -> Wizard:
     """Return the wizard.
 
     Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
     first step ``setup`` and ``robot`` (in whose convention poses are typed, a key of
-    :data:`~smartcam.calibration.formats._robots.ROBOTS`).
+    :data:`~smartcam.calibration.formats._robots.ROBOTS`); ``target``: a description of what is on
+    the sheet, which is not asked then.
 
-    Its result: ``name, file, method, views, held_out_mm, mean_mm, translation_error_mm,
-    rotation_error_deg, remarks``.
+    Its result: ``name, file, path, good_for_mm, method, views, held_out_mm, mean_mm,
+    translation_error_mm, rotation_error_deg, remarks``, and lines that ``use`` it.
 
     Args:
         take_picture: takes a picture; the robot stands still.
@@ -88,6 +92,8 @@ def hand_eye_wizard(
         suggested: the default of what is asked.
         read_robot: reads the pose of the flange; None: it is typed.
         camera: its lens; None: calibrated from the same views.
+        awaited: which picture ``take_picture`` waits for, for people: what
+            :attr:`PictureFolder.awaited` says; empty: it takes one.
 
     Cancellation: a picture or a pose under way is given up; a calculation ends in its thread, and
     what it finds is dropped.
@@ -95,11 +101,14 @@ def hand_eye_wizard(
 
     async def script(parameters: Mapping[str, Any]) -> Any:
         setup, robot = await _ask_setup(parameters, typed=read_robot is None)
-        there = await ask_target(suggested) if target is None else target
-        views = _Views(there, setup, take_picture, read_robot or robot, camera)
+        there = target
+        if there is None:
+            there = await ask_target(suggested, known=parameters.get("target"))
+        views = _Views(there, setup, take_picture, read_robot or robot, camera, awaited)
         calibration = await views.run()
         name = str(parameters.get("name", KIND))
-        return await ask_to_save(name, save_to, KIND, _outcome(calibration))
+        result = await ask_to_save(name, save_to, KIND, _outcome(calibration), views.preview())
+        return {**result, "use": usage(KIND, save_to(name))}
 
     return Wizard(name=KIND, version=1, script=script)
 
@@ -140,6 +149,7 @@ class _Views:
     _take_picture: TakePicture
     _robot: ReadFlange | str
     _camera: CameraModel | None
+    _awaited: str
     _samples: list[dict[str, Any]] = field(default_factory=list)
 
     async def run(self) -> HandEyeCalibration:
@@ -148,8 +158,8 @@ class _Views:
         while True:
             while more and await self._take_view():
                 pass
-            calibration, notes = await self._calculate()
-            answers = await ask(self._review(calibration, notes))
+            calibration, notes, judgement = await self._calculate()
+            answers = await ask(self._review(calibration, notes, judgement))
             if answers["next"] == "accept" and calibration is not None:
                 return calibration
             more = answers["next"] == "more"
@@ -179,17 +189,27 @@ class _Views:
             id=f"view-{count + 1}",
             title=f"View {count + 1}",
             description=f"{_MOVES[self._setup]}: {look}. The whole sheet must be in the image, and "
-            f"the robot must stand still.{typed}",
+            f"the robot must stand still.{typed}{how_to_take(self._awaited)}",
             button="Take a picture" if count < LEAST_POSES else "Go on",
             inputs=inputs,
-            notes=(f"{count} views so far",) if count else (),
-            preview=self._preview(),
+            notes=(self._progress(count),),
+            preview=self.preview(),
+            waiting=f"Waiting: {self._awaited}" if self._awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
         sample = (await ask(step, self._sample)).outcome
         if sample:
             self._samples.append(sample)
         return bool(sample)
+
+    def _progress(self, count: int) -> str:
+        """Return how many views there are, how many are good, and how to end."""
+        end = (
+            "to end, choose to calculate"
+            if count >= LEAST_POSES
+            else f"with {LEAST_POSES} it can be calculated; to end before, abort"
+        )
+        return f"{count} of {ADVISED_VIEWS} views, {MOST_VIEWS} at most; {end}"
 
     async def _sample(self, answers: Answers) -> dict[str, Any]:
         """Take a picture and read the robot, if that is wanted."""
@@ -230,11 +250,12 @@ class _Views:
         )
         return view, svg if len(svg) <= MAX_PREVIEW else ""
 
-    def _preview(self) -> dict[str, Any] | None:
+    def preview(self) -> dict[str, Any] | None:
+        """Return the picture of the last view; None where there is none."""
         svg = self._samples[-1].get("preview") if self._samples else None
         return {"svg": svg} if svg else None
 
-    async def _calculate(self) -> tuple[HandEyeCalibration | None, tuple[str, ...]]:
+    async def _calculate(self) -> tuple[HandEyeCalibration | None, tuple[str, ...], Judgement]:
         step = Step(
             id="calculate",
             title="Calculate",
@@ -245,10 +266,13 @@ class _Views:
         )
         found = (await ask(step, self._solve)).outcome
         if "code" in found:
-            return None, (f"{found['code']}: {found['text']}",)
+            worst, code = len(self._samples), Code(found["code"])
+            judgement = refused(code, found["text"], worst=worst, cures=VIEW_CURES)
+            return None, (f"{code}: {found['text']}",), judgement
         views = [one["view"] for one in self._samples]
         calibration = HandEyeCalibration.from_data({**found, "views": views})
-        return calibration, _outcome(calibration).notes
+        _, _, notes, judgement = _outcome(calibration)
+        return calibration, notes, judgement
 
     async def _solve(self, _answers: Answers) -> dict[str, Any]:
         """Return the calibration without the samples' views, or why there is none."""
@@ -261,7 +285,12 @@ class _Views:
             return {"code": str(exc.code), "text": str(exc)}
         return {**calibration.to_data(), "views": []}
 
-    def _review(self, calibration: HandEyeCalibration | None, notes: tuple[str, ...]) -> Step:
+    def _review(
+        self,
+        calibration: HandEyeCalibration | None,
+        notes: tuple[str, ...],
+        judgement: Judgement,
+    ) -> Step:
         options = {
             "accept": "accept it",
             "more": "take another view",
@@ -273,7 +302,8 @@ class _Views:
         else:
             worst = 1 + calibration.worst
         label = "View to remove; the worst one stands there"
-        return review_step(options, pick("view", label, len(self._samples), worst), notes)
+        view = pick("view", label, len(self._samples), worst)
+        return review_step(options, view, notes, judgement, self.preview())
 
 
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
@@ -305,7 +335,9 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
 def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     held_out = calibration.held_out_error
     remarks = [f"{one.code}: {one.text}" for one in calibration.warnings]
+    judgement = _judged(calibration)
     figures = {
+        **judgement.figures,
         "method": calibration.method,
         "views": len(calibration.views),
         "held_out_mm": None if held_out is None else 1e3 * held_out,
@@ -327,7 +359,22 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
             f"the camera's place is known to {figures['translation_error_mm']:.2g} mm, its "
             f"orientation to {figures['rotation_error_deg']:.2g} deg"
         )
-    return Calibrated(calibration, figures, (*notes, *remarks))
+    return Calibrated(calibration, figures, (*notes, *remarks), judgement)
+
+
+def _judged(calibration: HandEyeCalibration) -> Judgement:
+    """Return what a calibration is worth; of few views the error cannot be relied on."""
+    held_out, codes = calibration.held_out_error, {one.code for one in calibration.warnings}
+    left_out = [str(number) for number, used in enumerate(calibration.used, 1) if not used]
+    relied_on = held_out is not None and Code.TOO_FEW not in codes
+    return judge(
+        1e3 * held_out if held_out is not None and relied_on else None,
+        [one for one in calibration.warnings if not (left_out and one.code == Code.BAD_VIEW)],
+        worst=1 + calibration.worst,
+        cures=VIEW_CURES,
+        more="take more views",
+        where=f" without view{'s' * (len(left_out) > 1)} {', '.join(left_out)}" if left_out else "",
+    )
 
 
 def _known(factor: float, value: float) -> float | None:

@@ -13,7 +13,7 @@ from smartcam.exceptions import CalibrationError
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from smartcam.calibration.wizards._steps import Answers
 
@@ -39,9 +39,11 @@ class Mark:
         """Return the mark of a row that :meth:`MarkCamera.picture` gave."""
         return cls(row["feature_id"], row["x"], row["y"], row["theta"])
 
-    def __str__(self) -> str:
+    def text(self, unit: str) -> str:
+        """Return it for people; ``unit`` of its place, metres are shown as millimetres."""
         name = self.feature if self.feature.isprintable() else repr(self.feature)
-        return f"{name or 'mark'} at x {self.x:.6g}, y {self.y:.6g}"
+        factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
+        return f"{name or 'mark'} at x {factor * self.x:.1f} {unit}, y {factor * self.y:.1f} {unit}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,13 +107,28 @@ class MarkCamera:
             )
 
 
-async def choose(marks: list[Mark]) -> list[Mark]:
-    """Ask which marks will be touched, where there are several."""
+def clickable(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, Any]:
+    """Return a preview of marks, each of which stands for answers if it is clicked."""
+    choices = [
+        {"at": [mark.x, mark.y], "label": str(number), "answers": answer}
+        for number, (mark, answer) in enumerate(zip(marks, answers, strict=True), 1)
+    ]
+    return {"points": [], "marks": [one["at"] for one in choices], "choices": choices}
+
+
+async def choose(marks: list[Mark], unit: str) -> list[Mark]:
+    """Ask which marks will be touched, where there are several; ``unit`` of their places."""
     if len(marks) == 1:
         return marks
     flags = tuple(
-        Flag(name=f"mark_{number}", label=f"{number}: {mark}", default=True)
+        Flag(name=f"mark_{number}", label=f"{number}: {mark.text(unit)}", default=True)
         for number, mark in enumerate(marks, 1)
     )
-    answer = await ask(Step(id="which", title="Which ones will be touched?", inputs=flags))
+    step = Step(
+        id="which",
+        title="Which ones will be touched?",
+        inputs=flags,
+        preview=clickable(marks, [{flag.name: True} for flag in flags]),
+    )
+    answer = await ask(step)
     return [mark for flag, mark in zip(flags, marks, strict=True) if answer[flag.name]]

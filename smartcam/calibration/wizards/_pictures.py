@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -69,6 +71,13 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     return picture
 
 
+def how_to_take(awaited: str) -> str:
+    """Return how a picture that is waited for comes, behind a step's description."""
+    if not awaited:
+        return ""
+    return f" Go on here first, then have the camera take its picture: {awaited}."
+
+
 class PictureFolder:
     """A folder that a camera, or somebody, puts pictures into.
 
@@ -89,6 +98,15 @@ class PictureFolder:
         self.deadline: float = deadline
         self._look()
 
+    @property
+    def awaited(self) -> str:
+        """Which picture :meth:`take` waits for, for people."""
+        return (
+            f"the next file that comes into {self.path} counts, one that ends in "
+            f"{', '.join(sorted(SUFFIXES))}; what is there already does not. It is waited for "
+            f"{self.deadline:g} s"
+        )
+
     async def take(self) -> NDArray[Any]:
         """Wait for the next picture and return it, (H, W).
 
@@ -101,7 +119,7 @@ class PictureFolder:
 
         Cancellation: safe; no file is changed.
         """
-        before = self._look()
+        before, others = self._look(), self._names()
         last: dict[str, tuple[int, int]] = before
         try:
             async with asyncio.timeout(self.deadline):
@@ -119,11 +137,28 @@ class PictureFolder:
                     last = now
         except TimeoutError as exc:
             raise CalibrationError(
-                f"no picture came into {self.path} within {self.deadline:g} s; expected a file "
-                f"that ends in one of {', '.join(sorted(SUFFIXES))}, written after the button",
+                f"no picture came into {self.path} within {self.deadline:g} s"
+                f"{self._others(before, others)}; expected a file that ends in one of "
+                f"{', '.join(sorted(SUFFIXES))}, written after the button",
                 code=Code.NO_PICTURE,
                 expected=sorted(SUFFIXES),
             ) from exc
+
+    def _names(self) -> set[str]:
+        """Return the names of what is in the folder and no picture."""
+        with contextlib.suppress(OSError):
+            found = [one.name for one in itertools.islice(self.path.iterdir(), MAX_FILES)]
+            return {one for one in found if Path(one).suffix.lower() not in SUFFIXES}
+        return set()
+
+    def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
+        """Say what came instead of a picture, and how many were there before."""
+        said = [f"there before: {len(before)}"] if before else []
+        came = sorted(self._names() - others)
+        if came:
+            more = f" and {len(came) - 3} more" if len(came) > 3 else ""
+            said.insert(0, f"came, but no picture: {', '.join(came[:3])}{more}")
+        return f" ({'; '.join(said)})" if said else ""
 
     def _look(self) -> dict[str, tuple[int, int]]:
         """Return when each picture was written, ns, and how many bytes it has."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration._plane.calibration import KIND, fit_plane
 from smartcam.calibration._printing.page_layout import RULER
-from smartcam.calibration.wizards._marks import Mark, MarkCamera
+from smartcam.calibration.wizards._marks import Mark, MarkCamera, clickable
 from smartcam.calibration.wizards._points import (
     MAX_POINTS,
     PointSource,
@@ -40,6 +40,7 @@ def plane_wizard(
     save_to: Callable[[str], Path],
     read_robot: ReadRobot | None = None,
     y_down: bool | None = None,
+    connect: Mapping[str, Any] | None = None,
 ) -> Wizard:
     """Return the wizard.
 
@@ -49,7 +50,9 @@ def plane_wizard(
     count.
 
     Its result: ``name, file, model, points, left_out`` (numbers of points, from 1)``, residual_mm,
-    held_out_mm, predicted_mm, remarks``. Points left out count in none of the errors.
+    held_out_mm, predicted_mm, remarks``, ``path`` of the file, ``good_for_mm`` (95 of 100 new
+    points lie within it; None: not known, or not good), and lines that ``use`` it, ``command`` and
+    ``python``. Points left out count in none of the errors.
 
     Args:
         localize: takes a picture.
@@ -57,6 +60,8 @@ def plane_wizard(
         read_robot: reads the robot's pose; None: it is typed.
         y_down: whether ``localize`` turns the camera's y axis, which points down, up; None: not
             known. It is kept with the calibration, and the same for all of its pictures.
+        connect: what :func:`smartcam.connect` takes for the camera, ``url`` among it, for the lines
+            that use the result; None: it cannot be asked.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
@@ -80,6 +85,7 @@ def plane_wizard(
         )
         about = await ask(step)
         source = _MarkSource(about, read_robot, camera)
+        source.connect = connect
         return await source.run(str(parameters.get("name", KIND)), save_to)
 
     return Wizard(name=KIND, version=1, script=script)
@@ -115,7 +121,7 @@ class _MarkSource(PointSource):
     async def redo(self, index: int) -> None:
         mark = self.touches[index].mark
         title = f"Touch point {index + 1} again"
-        self.touches[index] = await self.touch("redo", title, str(mark), mark)
+        self.touches[index] = await self.touch("redo", title, mark.text(self.camera_unit), mark)
 
     async def ray_origin(self) -> tuple[Mark, float]:
         scale = await self._nominal_scale()
@@ -129,9 +135,14 @@ class _MarkSource(PointSource):
         marks = [Mark.of(row) for row in await self._seen(step)]
         if len(marks) == 1:
             return marks[0], scale
-        options = {str(number): f"{mark}" for number, mark in enumerate(marks, 1)}
-        inputs = (Option(name="mark", label="The origin mark", options=options),)
-        step = Step(id="which", title="Which one is the origin?", inputs=inputs)
+        unit = self.camera_unit
+        options = {str(number): mark.text(unit) for number, mark in enumerate(marks, 1)}
+        step = Step(
+            id="which",
+            title="Which one is the origin?",
+            inputs=(Option(name="mark", label="The origin mark", options=options),),
+            preview=clickable(marks, [{"mark": number} for number in options]),
+        )
         return marks[int((await ask(step))["mark"]) - 1], scale
 
     async def _nominal_scale(self) -> float:
@@ -178,6 +189,10 @@ class _MarkSource(PointSource):
         mark = touch.mark
         camera = [mark.x, mark.y, mark.theta]
         return {"touched": touch.what, "feature_id": mark.feature, "camera": camera}
+
+    def example(self) -> tuple[float, float]:
+        mark = self.touches[0].mark
+        return mark.x, mark.y
 
     def outcome(self, plane: PlaneCalibration) -> Calibrated:
         return calibrated_plane(plane)

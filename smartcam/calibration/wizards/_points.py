@@ -9,6 +9,7 @@ Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -23,11 +24,13 @@ from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, pick
 from smartcam.calibration.wizards._touch_previews import compared, plain
 from smartcam.calibration.wizards._touches import SIDE, SIGMA, UNIT, Touch, Touches
+from smartcam.calibration.wizards._usage import usage
+from smartcam.calibration.wizards._verdict import Judgement, judge, refused
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from smartcam.calibration._files.load import AnyCalibration
@@ -52,6 +55,7 @@ class Calibrated(NamedTuple):
     calibration: AnyCalibration | HandEyeCalibration
     figures: dict[str, Any]  # what the wizard's result says of it, JSON-able
     notes: tuple[str, ...]  # what people should know of it, a line each
+    judgement: Judgement
 
 
 class PointSource(Touches, ABC):
@@ -61,7 +65,7 @@ class PointSource(Touches, ABC):
         :func:`about_step`.
 
     Attributes:
-        camera_unit: unit of the camera's positions.
+        connect: what :func:`smartcam.connect` takes for the camera; None: it is not known.
         camera_frame: name of the only frame that localizations may come in; None: any.
         y_down: whether the camera's y axis was turned up; None: not known.
     """
@@ -79,7 +83,7 @@ class PointSource(Touches, ABC):
     SHOWN: ClassVar[Mapping[str, str]] = {}
     """Further entries of a calibration's preview."""
 
-    camera_unit: str
+    connect: Mapping[str, Any] | None = None
     camera_frame: str | None = None
     y_down: bool | None = None
 
@@ -102,6 +106,10 @@ class PointSource(Touches, ABC):
     @abstractmethod
     def sample(self, touch: Touch) -> dict[str, Any]:
         """Return the entries of a touch in a file's samples, JSON-able."""
+
+    @abstractmethod
+    def example(self) -> tuple[float, float]:
+        """Return a point that the camera saw, in its unit."""
 
     @abstractmethod
     def outcome(self, plane: PlaneCalibration) -> Calibrated:
@@ -127,7 +135,11 @@ class PointSource(Touches, ABC):
             ],
         }
         preview = self._preview(plane)
-        return await ask_to_save(name, save_to, self.KIND, outcome, preview, context)
+        result = await ask_to_save(name, save_to, self.KIND, outcome, preview, context)
+        frame = {} if self.camera_frame is None else {"name": self.camera_frame}
+        connect = None if self.connect is None else {**self.connect, **frame}
+        use = usage(self.KIND, save_to(name), connect, self.example())
+        return {**result, "use": use}
 
     async def _touch_rays(self) -> PlaneCalibration:
         origin, scale = await self.ray_origin()
@@ -150,6 +162,7 @@ class PointSource(Touches, ABC):
             camera_frame=self.camera_frame,
             y_down=self.y_down,
         )
+        outcome = self.outcome(plane)
         await ask(
             Step(
                 id="review",
@@ -157,7 +170,8 @@ class PointSource(Touches, ABC):
                 description="Three touches fit any plane: nothing tells how good they were. To "
                 f"know, touch {self.POINTS} instead.",
                 button="Accept",
-                notes=self.outcome(plane).notes,
+                notes=outcome.notes,
+                verdict=outcome.judgement.verdict,
                 preview=self._preview(plane),
             )
         )
@@ -169,8 +183,8 @@ class PointSource(Touches, ABC):
             while len(self.touches) < wanted:
                 await self.add()
             wanted = LEAST
-            plane, notes = self._try_fit(robust=robust)
-            choice = await ask(self._review(plane, notes, robust=robust))
+            plane, notes, judgement = self._try_fit(robust=robust)
+            choice = await ask(self._review(plane, notes, judgement, robust=robust))
             index = choice["point"] - 1
             match choice["next"]:
                 case "accept" if plane is not None:
@@ -184,15 +198,31 @@ class PointSource(Touches, ABC):
                 case _:
                     robust = choice["next"] == "robust"
 
-    def _try_fit(self, *, robust: bool) -> tuple[PlaneCalibration | None, tuple[str, ...]]:
+    def _try_fit(
+        self, *, robust: bool
+    ) -> tuple[PlaneCalibration | None, tuple[str, ...], Judgement]:
         try:
             plane = self.fit(robust=robust and len(self.touches) >= LEAST_POINTS)
         except CalibrationError as exc:
-            return None, (f"{exc.code}: {exc}",)
-        return plane, self.outcome(plane).notes
+            return None, (f"{exc.code}: {exc}",), self._blamed(exc)
+        _, _, notes, judgement = self.outcome(plane)
+        return plane, notes, judgement
+
+    def _blamed(self, error: CalibrationError) -> Judgement:
+        """Return what to do: one touch that is far off can look like another scale."""
+        if len(self.touches) >= LEAST_POINTS:
+            with contextlib.suppress(CalibrationError):
+                for index in self.fit(robust=True).outliers:
+                    return refused(Code.OUTLIER, f"point {1 + index}")
+        return refused(error.code or "", str(error))
 
     def _review(
-        self, plane: PlaneCalibration | None, notes: tuple[str, ...], *, robust: bool
+        self,
+        plane: PlaneCalibration | None,
+        notes: tuple[str, ...],
+        judgement: Judgement,
+        *,
+        robust: bool,
     ) -> Step:
         options = {
             "accept": "accept it",
@@ -211,13 +241,15 @@ class PointSource(Touches, ABC):
         elif len(self.touches) >= LEAST_POINTS and doubtful:
             options["robust"] = "leave out the points that do not agree with the others"
         label = "Point, to touch again or to remove; the worst one stands there"
-        point = pick("point", label, len(self.touches), worst)
-        return review_step(options, point, notes, self._preview(plane))
+        named = judgement.number or worst
+        count = len(self.touches)
+        point = pick("point", label, count, named if named <= count else worst)
+        return review_step(options, point, notes, judgement, self._preview(plane))
 
     def _preview(self, plane: PlaneCalibration | None) -> dict[str, Any]:
         """Return the data from which a picture of the touches is drawn."""
         if plane is None:
-            return plain(self.touches)
+            return {**plain(self.touches), "choices": self._choices()}
         found = compared(
             plane,
             self.touches,
@@ -227,7 +259,15 @@ class PointSource(Touches, ABC):
             worst=plane.worst,
             left_out=plane.outliers,
         )
-        return {**found, **self.SHOWN}
+        return {**found, **self.SHOWN, "choices": self._choices(found["points"])}
+
+    def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
+        """Return the touches as choices of a point, where they are drawn."""
+        places = [one["at"][:2] for one in points] or [[t.mark.x, t.mark.y] for t in self.touches]
+        return [
+            {"at": place, "label": str(number), "answers": {"point": number}}
+            for number, place in enumerate(places, 1)
+        ]
 
 
 def about_step(
@@ -269,11 +309,19 @@ def review_step(
     options: Mapping[str, str],
     number: Input,
     notes: tuple[str, ...],
+    judgement: Judgement,
     preview: Mapping[str, Any] | None = None,
 ) -> Step:
     """Return the step that shows what came out, and asks what ``next``, with which ``number``."""
-    inputs = (Option(name="next", label="What next", options=options), number)
-    return Step(id="review", title="What came out", notes=notes, inputs=inputs, preview=preview)
+    default = judgement.chosen(options)
+    return Step(
+        id="review",
+        title="What came out",
+        notes=notes,
+        verdict=judgement.verdict,
+        inputs=(Option(name="next", label="What next", options=options, default=default), number),
+        preview=preview,
+    )
 
 
 async def ask_to_save(
@@ -297,10 +345,11 @@ async def ask_to_save(
         description="A calibration of that name is kept beside it as a backup.",
         button="Save",
         notes=outcome.notes,
+        verdict=outcome.judgement.verdict,
         preview=preview,
     )
     await ask(step, save)
-    return {"name": name, "file": file.name, **outcome.figures}
+    return {"name": name, "file": file.name, "path": str(file), **outcome.figures}
 
 
 def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
@@ -325,7 +374,9 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
     if predicted is not None:
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
     notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
+    judgement = judge_plane(calibration, predicted)
     found = {
+        **judgement.figures,
         "model": calibration.model,
         "points": points,
         "left_out": left_out,
@@ -334,4 +385,19 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
         "predicted_mm": predicted,
         "remarks": [[one.code.value, one.text] for one in calibration.warnings],
     }
-    return Calibrated(calibration, found, tuple(notes))
+    return Calibrated(calibration, found, tuple(notes), judgement)
+
+
+def judge_plane(
+    calibration: PlaneCalibration, predicted: float | None, where: str = ""
+) -> Judgement:
+    """Return what a plane's calibration is worth, given its predicted error in mm."""
+    held_out, out = calibration.held_out_error, [1 + index for index in calibration.outliers]
+    without = f" without point{'s' * (len(out) > 1)} {', '.join(map(str, out))}" if out else ""
+    return judge(
+        None if held_out is None else 1e3 * held_out,
+        [one for one in calibration.warnings if not (out and one.code == Code.OUTLIER)],
+        worst=1 + calibration.worst,
+        predicted=predicted,
+        where=f"{where}{without}",
+    )

@@ -30,7 +30,7 @@ import hashlib
 import json
 import secrets
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -119,6 +119,7 @@ class _ScriptRun:
     ) -> None:
         self._coroutine = wizard.script(copy.deepcopy(dict(parameters)))
         self.request: PendingStep | None = None
+        self.last: Step | None = None  # the step that was answered last
         self.result: Any = None
         self._send(None)
         for number, entry in enumerate(entries, 1):
@@ -137,6 +138,7 @@ class _ScriptRun:
         self._send(StepAnswer(copy.deepcopy(entry["answers"]), copy.deepcopy(entry["outcome"])))
 
     def _send(self, answer: StepAnswer | None) -> None:
+        self.last = None if self.request is None else self.request.step
         try:
             request = self._coroutine.send(answer)
         except StopIteration as stop:
@@ -297,10 +299,11 @@ class WizardSession:
 
         Returns:
             ``flow, wizard, token, type, number`` (of the step, from 1)``, step`` (its id)``,
-            title, description, button, notes, preview, schema, defaults, errors`` (a text by input,
-            ``base`` for all else)``, can`` (of ``undo, repeat, abort``)``, result``. ``type`` is
-            ``form`` (with inputs), ``confirm`` (without), ``progress`` (its action is under way),
-            ``result`` or ``abort``.
+            title, description, button, notes, verdict`` (``level, text``)``, preview, waiting,
+            schema, defaults, errors`` (a text by input, ``base`` for all else)``, can`` (of ``undo,
+            repeat, abort``)``, result``. ``type`` is ``form`` (with inputs), ``confirm`` (without),
+            ``progress`` (its action is under way), ``result`` (with the verdict and the preview of
+            the last step) or ``abort``.
         """
         view: dict[str, Any] = {
             "flow": self.flow,
@@ -314,7 +317,8 @@ class WizardSession:
         }
         step = self.step
         if step is None:
-            return view
+            last = self._run.last if self.state == "ended" else None
+            return view if last is None else {**view, **_shown_of(last)}
         if self._scope is not None:
             view["type"] = "progress"
         elif step.inputs:
@@ -326,7 +330,8 @@ class WizardSession:
             "description": step.description,
             "button": step.button,
             "notes": list(step.notes),
-            "preview": None if step.preview is None else dict(step.preview),
+            **_shown_of(step),
+            "waiting": step.waiting,
             "schema": step.schema(),
             "defaults": self._defaults(step),
         }
@@ -540,6 +545,14 @@ class WizardSession:
             if isinstance(exc, CalibrationError) and exc.code == Code.WRONG_ANSWERS:
                 errors = exc.got
             self._errors = errors
+
+
+def _shown_of(step: Step) -> dict[str, Any]:
+    """Return what stands beside the texts of a step."""
+    return {
+        "verdict": None if step.verdict is None else asdict(step.verdict),
+        "preview": None if step.preview is None else dict(step.preview),
+    }
 
 
 def _named(header: Mapping[str, Any]) -> str:

@@ -18,6 +18,7 @@ from smartcam.calibration._files.load import of_document
 from smartcam.calibration._files.store import keep_backup, read_document, replace_file
 from smartcam.calibration._plane.calibration import KIND, PlaneCalibration
 from smartcam.calibration.wizards._journal import Journal
+from smartcam.calibration.wizards._listing import listing
 from smartcam.calibration.wizards._sequence import WizardSession
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
@@ -68,6 +69,15 @@ class CalibrationService:
     def names(self) -> list[str]:
         """Names of the calibrations in the folder, sorted."""
         return self.folder.names()
+
+    @property
+    def listing(self) -> list[dict[str, Any]]:
+        """A row for each calibration, JSON-able.
+
+        ``name, kind, written_at, held_out_mm, checked_at, stale, problem``, None where something is
+        not known; a file that cannot be read has a ``problem``.
+        """
+        return listing(self.folder)
 
     @property
     def wizards(self) -> list[str]:

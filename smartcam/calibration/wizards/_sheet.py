@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
+from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._sheet.calibration import KIND, calibrate_sheet, fit_corners
@@ -23,18 +24,20 @@ from smartcam.calibration._sheet.plane import look_at_sheet
 from smartcam.calibration._targets import Charuco
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.wizards._marks import Mark
-from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT
+from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT, how_to_take
 from smartcam.calibration.wizards._points import (
     MAX_POINTS,
     Calibrated,
     PointSource,
     about_step,
     calibrated_plane,
+    judge_plane,
 )
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Step, pick
-from smartcam.calibration.wizards._target_drawing import draw_sheet, with_ring
+from smartcam.calibration.wizards._steps import Step, StepVerdict, pick
+from smartcam.calibration.wizards._target_drawing import draw_sheet, place_in, with_ring
 from smartcam.calibration.wizards._target_steps import ask_target
+from smartcam.calibration.wizards._verdict import Judgement
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -58,12 +61,15 @@ def sheet_wizard(
     read_robot: ReadRobot | None = None,
     suggested: Target | None = None,
     camera: CameraModel | None = None,
+    connect: Mapping[str, Any] | None = None,
+    awaited: str = "",
 ) -> Wizard:
     """Return the wizard.
 
     Its parameters: ``name`` (of the calibration; what ``save_to`` gets), and as defaults of the
     first step ``method`` (corners, rays), ``camera_frame``, ``robot_frame``, ``tool``, ``unit``
-    (mm, m), ``side``, ``touch_sigma`` (mm).
+    (mm, m), ``side``, ``touch_sigma`` (mm); ``target``: a description of what is on the sheet,
+    which is not asked then.
 
     Its result: as the plane's, and ``seen`` (points of the target in the picture)``, rms_px``
     (of them about their plane); ``predicted_mm`` is at the points that were seen.
@@ -74,6 +80,10 @@ def sheet_wizard(
         read_robot: reads the robot's pose; None: it is typed.
         suggested: the target that lies there, as the default of what is asked.
         camera: the lens, kept with each picture; None: a homography of what is seen.
+        connect: what :func:`smartcam.connect` takes for the camera, ``url`` among it, for the lines
+            that use the result; None: it cannot be asked.
+        awaited: which picture ``take_picture`` waits for, for people: what
+            :attr:`PictureFolder.awaited` says; empty: it takes one.
 
     Cancellation: a picture under way is given up; what looks for the target in it ends in its
     thread, and what that finds is dropped.
@@ -92,9 +102,11 @@ def sheet_wizard(
             typed=read_robot is None,
         )
         about = await ask(step)
-        target = await ask_target(suggested)
+        target = await ask_target(suggested, known=parameters.get("target"))
         source = _SheetSource(about, read_robot, target)
-        await source.ask_picture(take_picture, camera)
+        # pixels count down, positions that are mapped count up
+        source.connect = None if connect is None else {**connect, "y_down": True}
+        await source.ask_picture(take_picture, camera, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
 
     return Wizard(name=KIND, version=1, script=script)
@@ -109,16 +121,18 @@ class _SheetSource(PointSource):
     ORIGIN = "the origin, the filled point in the picture"
     MORE = "touch another point"
     SHOWN: ClassVar[Mapping[str, str]] = {"of": "sheet"}
-    camera_unit = "px"
 
     def __init__(self, about: StepAnswer, read_robot: ReadRobot | None, target: Target) -> None:
         super().__init__(about, read_robot)
+        self.camera_unit = "px"
         self._target = target
         self._view: TargetView
         self._camera: CameraModel | None = None
         self._svg = ""
 
-    async def ask_picture(self, take_picture: TakePicture, lens: CameraModel | None) -> None:
+    async def ask_picture(
+        self, take_picture: TakePicture, lens: CameraModel | None, awaited: str
+    ) -> None:
         """Ask for the picture, and keep what was found in it."""
 
         async def look(_answers: Answers) -> dict[str, Any]:
@@ -129,8 +143,10 @@ class _SheetSource(PointSource):
             id="picture",
             title="The sheet in the camera's field",
             description="Lay the sheet flat into the camera's field and fix it. The robot must not "
-            "hide it, and nothing must move until all is touched.",
-            button="Take a picture",
+            f"hide it, and nothing must move until all is touched.{how_to_take(awaited)}",
+            button="Wait for the picture" if awaited else "Take a picture",
+            notes=("picture 1 of 1; to end without it, abort",) if awaited else (),
+            waiting=f"Waiting: {awaited}" if awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
         found = (await ask(step, look)).outcome
@@ -149,7 +165,18 @@ class _SheetSource(PointSource):
         svg, seen = self._svg, np.flatnonzero(view.ids == mark.number)
         if svg and len(seen):
             svg = with_ring(svg, view.size, view.points[seen[0]])
-        return {"notes": tuple(notes), "preview": {"svg": svg} if svg else None}
+        preview = {"svg": svg, "choices": self._corners()} if svg else None
+        return {"notes": tuple(notes), "preview": preview}
+
+    def _corners(self) -> list[dict[str, Any]]:
+        """Return the points that were seen as choices, where the picture shows them."""
+        columns, view = _shape(self._target)[0], self._view
+        places = np.round(place_in(view.size, view.points), 1).tolist()
+        return [
+            {"at": at, "label": f"{1 + column}, {1 + row}", "answers": _answers(column, row)}
+            for at, number in zip(places, view.ids.tolist(), strict=True)
+            for row, column in [divmod(number, columns)]
+        ]
 
     async def ray_origin(self) -> tuple[Mark, float]:
         return Mark("", 0.0, 0.0, 0.0, number=0), 1.0
@@ -175,8 +202,8 @@ class _SheetSource(PointSource):
             title=title,
             description=f"Move the tip of the tool onto point {column + 1} of row {row + 1}, which "
             "has a ring in the picture, with the tool held as at every touch; or onto another one, "
-            "and say which. The origin is point 1 of row 1, points count along ray A, rows along "
-            "ray B.",
+            "and say which. The origin is point 1 of row 1, points count along ray A, "
+            "rows along ray B.",
             inputs=(
                 pick("column", "Point of its row, counted along ray A", columns, column + 1),
                 pick("row", "Row, counted along ray B", rows, row + 1),
@@ -229,7 +256,7 @@ class _SheetSource(PointSource):
     def outcome(self, plane: PlaneCalibration) -> Calibrated:
         frame = self.about["camera_frame"] or None
         found = calibrate_sheet(self._view, plane, camera=self._camera, camera_frame=frame)
-        _, figures, lines = calibrated_plane(plane)
+        _, figures, lines, _ = calibrated_plane(plane)
         seen, predicted = len(self._view.ids), None
         notes = [*lines, f"{seen} points seen, {found.rms:.2g} px beside their plane"]
         if plane.touch_sigma is not None:
@@ -242,8 +269,19 @@ class _SheetSource(PointSource):
             )
         notes += [f"{one.code}: {one.text}" for one in found.remarks]
         remarks = [[one.code.value, one.text] for one in found.warnings]
+        judgement = judge_plane(plane, predicted, " where the sheet lay")
+        if any(one.code == Code.POOR_FIT for one in found.remarks):
+            lens = "another lens" if found.camera else "a lens: --lens"
+            said = StepVerdict(
+                "poor", f"Not good enough: the picture wants {lens}, or a flat sheet"
+            )
+            judgement = Judgement(said, option="more")
         more = {"predicted_mm": predicted, "seen": seen, "rms_px": found.rms, "remarks": remarks}
-        return Calibrated(found, figures | more, tuple(notes))
+        return Calibrated(found, figures | more | judgement.figures, tuple(notes), judgement)
+
+    def example(self) -> tuple[float, float]:
+        u, v = self._view.points[0].tolist()
+        return u, v
 
 
 def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
@@ -255,6 +293,10 @@ def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, An
         "camera": None if lens is None else lens.to_data(),
         "preview": preview if len(preview) <= MAX_PREVIEW else "",
     }
+
+
+def _answers(column: int, row: int) -> Answers:
+    return {"column": 1 + column, "row": 1 + row}
 
 
 def _shape(target: Target) -> tuple[int, int]:

@@ -14,7 +14,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from smartcam.calibration._codes import Code
 from smartcam.exceptions import CalibrationError
@@ -188,6 +188,19 @@ def pick(name: str, label: str, count: int, default: int) -> Number:
     return Number(name=name, label=label, integer=True, minimum=1, maximum=count, default=default)
 
 
+@dataclass(frozen=True, slots=True)
+class StepVerdict:
+    """What something is worth, on top of a step that shows it.
+
+    Attributes:
+        level: ``good``, ``poor`` (not good enough), or ``unknown``.
+        text: the same in words, and what to do about it.
+    """
+
+    level: Literal["good", "poor", "unknown"]
+    text: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
     """A page of a wizard: texts to show, and inputs to ask for.
@@ -198,8 +211,11 @@ class Step:
         description: what to do now.
         button: what stands on the button that goes on.
         inputs: what is asked for; none: only that the button is pressed.
-        notes: what came out so far, a line each.
-        preview: JSON-able, for a picture; None for none.
+        notes: what came out so far, a line each; a warning begins with its code and a colon.
+        verdict: what came out is worth; None where nothing did.
+        preview: JSON-able, for a picture; None for none. ``choices`` in it are places that may be
+            clicked: ``at`` (in the picture), ``label``, and the ``answers`` that it stands for.
+        waiting: what is waited for while its action is under way.
         timeout: seconds that the action behind the button may take.
     """
 
@@ -209,7 +225,9 @@ class Step:
     button: str = "Next"
     inputs: tuple[Input, ...] = ()
     notes: tuple[str, ...] = ()
+    verdict: StepVerdict | None = None
     preview: Mapping[str, Any] | None = field(default=None, compare=False)
+    waiting: str = ""
     timeout: float = 30.0
 
     def schema(self) -> dict[str, Any]:

@@ -148,6 +148,14 @@ def draw_sheet(image: Any, view: TargetView, plane: SheetPlane) -> str:
     return _with(draw(image, view=view, title="The sheet, its origin and rays"), parts)
 
 
+def place_in(size: tuple[int, int], pixels: Array) -> Array:
+    """Return where a picture of :func:`draw` shows pixels (N, 2), in the SVG's own units.
+
+    ``size``: width and height of the camera's image, pixels.
+    """
+    return _Canvas(*size).place(pixels)
+
+
 def with_ring(svg: str, size: tuple[int, int], pixel: Array) -> str:
     """Return a picture of :func:`draw_sheet` with a ring around a pixel (2,), v down.
 

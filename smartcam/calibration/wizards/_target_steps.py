@@ -68,12 +68,27 @@ def ruler(name: str, along: str = "") -> Number:
     )
 
 
-async def ask_target(suggested: Target | None = None) -> Target:
+async def ask_target(suggested: Target | None = None, *, known: object = None) -> Target:
     """Ask what is on the sheet, and how large it was printed: lengths are those on paper.
 
+    ``suggested``: the default of what is asked. ``known``: a description of the target, which is
+    not asked then; None: there is none.
     Refused as a step shows it: what is no description of a target, or rulers that
     :func:`~smartcam.calibration.scaled` refuses.
     """
+    target = await _which_target(suggested) if known is None else target_from_data(_checked(known))
+    step = Step(
+        id="rulers",
+        title="Was the sheet printed true to size?",
+        description=f"Printers scale. Measure both rulers; leave {RULER:g} mm where the lengths "
+        "that were given are already those of the paper.",
+        inputs=tuple(ruler(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
+    )
+    measured = await ask(step)
+    return scaled(target, (measured["ruler_x"], measured["ruler_y"]))
+
+
+async def _which_target(suggested: Target | None) -> Target:
     kinds = Option(
         name="kind",
         label="What is printed on the sheet",
@@ -93,37 +108,26 @@ async def ask_target(suggested: Target | None = None) -> Target:
     )
     step = Step(id="sheet", title="Which sheet lies there?", inputs=(kinds, description))
     answer = await ask(step)
-    if answer["kind"] == "described":
-        target = _described(answer["description"])
-    else:
-        kind = answer["kind"]
-        step = Step(id="target", title="What is on it", inputs=_INPUTS[kind])
-        given = await ask(step)
-        lengths = {one.name for one in _INPUTS[kind] if isinstance(one, Number) and one.unit}
-        values = {
-            name: 1e-3 * value if name in lengths and value is not None else value
-            for name, value in given.items()
-        }
-        target = target_from_data({"kind": kind, **values})
-    step = Step(
-        id="rulers",
-        title="Was the sheet printed true to size?",
-        description=f"Printers scale. Measure both rulers; leave {RULER:g} mm where the lengths "
-        "that were given are already those of the paper.",
-        inputs=tuple(ruler(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
-    )
-    measured = await ask(step)
-    return scaled(target, (measured["ruler_x"], measured["ruler_y"]))
+    kind = answer["kind"]
+    if kind == "described":
+        try:
+            data: object = json.loads(answer["description"])
+        except (ValueError, RecursionError):
+            data = None
+        return target_from_data(_checked(data))
+    given = await ask(Step(id="target", title="What is on it", inputs=_INPUTS[kind]))
+    lengths = {one.name for one in _INPUTS[kind] if isinstance(one, Number) and one.unit}
+    values = {
+        name: 1e-3 * value if name in lengths and value is not None else value
+        for name, value in given.items()
+    }
+    return target_from_data({"kind": kind, **values})
 
 
-def _described(text: str) -> Target:
-    try:
-        data: object = json.loads(text)
-    except (ValueError, RecursionError):
-        data = None
+def _checked(data: object) -> dict[str, Any]:
     if not isinstance(data, dict):
         wrong = "expected the description of a target, such as "
         wrong += '{"kind": "checkerboard", "columns": 9, "rows": 6, "square": 0.025}'
         raise CalibrationError(wrong, code=Code.WRONG_ANSWERS, got={"description": wrong})
     found: dict[str, Any] = data
-    return target_from_data(found)
+    return found

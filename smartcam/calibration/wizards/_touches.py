@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -87,10 +87,12 @@ class Touches:
         about: answers of the first step: ``touch_sigma``, and where the robot's pose is typed
             ``unit`` and ``side``, if they were asked for.
         marks: those of the last picture.
+        camera_unit: unit of the camera's positions.
     """
 
     about: StepAnswer
     _read_robot: ReadRobot | None  # None: the robot's pose is typed
+    camera_unit: str = field(default="m", init=False)
 
     def __post_init__(self) -> None:
         self.touches: list[Touch] = []
@@ -130,12 +132,13 @@ class Touches:
         ``rows``: of :meth:`~smartcam.calibration.wizards._marks.MarkCamera.picture`. ``most``:
         touches of a run (SHAPE: more). ``noun``: what they are called.
         """
-        marks = await choose([Mark.of(row) for row in rows])
+        marks = await choose([Mark.of(row) for row in rows], self.camera_unit)
         self.check_count(len(marks), most, noun)
         self.marks = marks
         for number, mark in enumerate(marks, 1):
             title = f"Touch mark {number} of {len(marks)}"
-            self.touches.append(await self.touch(f"touch-{number}", title, str(mark), mark))
+            place = mark.text(self.camera_unit)
+            self.touches.append(await self.touch(f"touch-{number}", title, place, mark))
 
     async def touch(
         self, step_id: str, title: str, place: str, mark: Mark, what: str = "mark"

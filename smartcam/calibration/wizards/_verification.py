@@ -21,7 +21,7 @@ from smartcam.calibration._plane.calibration import STALE_LEVEL, PlaneCalibratio
 from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._marks import MarkCamera
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Option, Step
+from smartcam.calibration.wizards._steps import Option, Step, StepVerdict
 from smartcam.calibration.wizards._touch_previews import compared
 from smartcam.calibration.wizards._touches import SIGMA, UNIT, Touches
 from smartcam.exceptions import CalibrationError
@@ -167,6 +167,7 @@ async def _loaded(
         "data": calibration.to_data(),
         "written_at": document.written_at,
         "tool": str(document.context.get("tool", "")),
+        "camera_unit": str(document.context.get("camera_unit", "m")),
     }
 
 
@@ -183,6 +184,7 @@ class _DriftCheck(Touches):
     ) -> None:
         super().__init__(about, read_robot)
         self.name = name
+        self.camera_unit = about.outcome.get("camera_unit", "m")
         self._camera = camera
         self._record_to = record_to
         found = PlaneCalibration.from_data(about.outcome["data"])
@@ -247,6 +249,9 @@ class _DriftCheck(Touches):
             if stale
             else "",
             notes=tuple(_notes(figures)),
+            verdict=StepVerdict("poor", f"Stale: {figures['rms_mm']:.1f} mm rms off")
+            if stale
+            else StepVerdict("good", f"Still true: {figures['rms_mm']:.1f} mm rms off"),
             button="Go on",
             inputs=(
                 Option(

@@ -8,7 +8,6 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
-from smartcam._client.handshake import load_protocol
 from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import MAX_TRAIL, EndedError, RawClient
 from smartcam.conformance.camera._results import Differs, NotObserved
@@ -16,6 +15,7 @@ from smartcam.conformance.camera._wire import RawDialect
 from smartcam.doctor import _probing as probing
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
+from smartcam.protocols._base import load_protocol
 from smartcam.protocols._bvs import MessageId
 from smartcam.settings import parse_address
 

@@ -89,6 +89,14 @@ class _Inspection(NamedTuple):
     change: RunChange
 
 
+class LastReport(NamedTuple):
+    """What a run reported, whether anybody heard it or not."""
+
+    time: float  # seconds
+    byte_order: ByteOrder
+    result: m.ResultContainer
+
+
 class Device:
     """One camera.
 
@@ -137,6 +145,7 @@ class Device:
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
         self._session = False
         self._owes_switch = False  # the session's
+        self.last_report: LastReport | None = None
         self._output: list[m.Message] = []
         self._reported: tuple[int, int] | None = None
         self._conditions = 0
@@ -710,6 +719,7 @@ class Device:
         if self.quirks.waiting_before_result:
             self._report()
         if result is not None and not run.change.silent:
+            self.last_report = LastReport(self.time, self._byte_order, result)
             for _ in range(1 + run.change.extra):
                 self._say(result)
         self._report()

@@ -10,55 +10,42 @@ What it answers, and what is known of that, stands in ``docs/insight.md``.
 
 from __future__ import annotations
 
-import asyncio
-import logging
-import socket
 from collections import deque
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from smartcam._accepting import Acceptor
-from smartcam._server import Server
-from smartcam.emulator._clock import Clock, OneTimer, RealClock, nanoseconds
+from smartcam.emulator._camera import SHOWN
+from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._insight.commands import InSightCommands, InSightQuirks
-from smartcam.emulator._insight.connection import MAX_LOGGED, MAX_SESSIONS, TelnetConnection
+from smartcam.emulator._insight.connection import MAX_SESSIONS, ROWS, WRITE_LIMIT, TelnetClient
 from smartcam.emulator._insight.device import InSightDevice
+from smartcam.emulator._insight.job import BUILTIN_JOBS
+from smartcam.emulator._line_camera import LineCamera
+from smartcam.emulator._line_codec import LineCodec
+from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._tally import Tally
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
+from smartcam.models import Status
 from smartcam.protocols._insight import words
+from smartcam.protocols._insight.dialect import INSIGHT
+from smartcam.protocols._insight.machine import ONLINE
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Iterable, Mapping
+    from typing import Self
 
     import numpy as np
     from numpy.typing import NDArray
 
+    from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._insight.job import Job
-
-_log = logging.getLogger("smartcam.emulator")
-
-MAX_ENTRIES = 10_000
-"""Entries of the log; the oldest go first."""
+    from smartcam.emulator._line_camera import LineClient
+    from smartcam.emulator._line_codec import LineServer, SaidLine
+    from smartcam.emulator._scenario.scenario import Scenario
+    from smartcam.protocols._base import Protocol
 
 MAX_ORDERED = 1000
 """Answers that may be ordered in advance."""
-
-
-class InSightLogEntry(NamedTuple):
-    """What was heard or said.
-
-    Attributes:
-        time: of the emulator's clock, seconds.
-        direction: ``in`` a line from a client, ``out`` bytes to it.
-        peer: address and port of the client.
-        text: the line without its end; the bytes with theirs, cut after 200. Passwords are not
-            shown.
-    """
-
-    time: float
-    direction: Literal["in", "out"]
-    peer: str
-    text: str
 
 
 class _Ordered(NamedTuple):
@@ -68,7 +55,7 @@ class _Ordered(NamedTuple):
     command: str | None
 
 
-class EmulatedInSight(Server):
+class EmulatedInSight(LineCamera):
     """An In-Sight camera made of software, on a real port.
 
     Several clients may be logged in at a time: that a camera has several users at once is
@@ -76,28 +63,20 @@ class EmulatedInSight(Server):
 
     Args:
         jobs: those on it: :class:`Job` or mappings of its fields.
-        host: address to listen on; nothing but this.
-        port: port to listen on, 0 for a free one.
         users: password of each user; published is that a new camera has ``admin`` without one.
         model: named in the first line it says.
-        active: file of the job that is loaded at first; default the first of the jobs, without any
-            an empty one that was never saved.
+        active: file, or id, of the job that is loaded at first; default the first of the jobs,
+            without any an empty one that was never saved.
         online: whether it is online at first.
         image: what it sees: an 8 bit grey image; default a pattern.
         evaluations: answers to ``EV``: expression to the text that is sent; others fail.
         info: what ``GI`` tells, instead of the emulator's own.
         quirks: what is not known of real cameras: :class:`InSightQuirks` or a mapping.
-        clock: its time; a :class:`~smartcam.emulator.ManualClock` in tests. Default: real.
-        name: for logs.
+        options: those of :class:`~smartcam.emulator.LineCamera`.
 
     Attributes:
-        host: as given.
-        name: as given.
-        clock: its clock.
         device: the camera behind the wire, for looking; to make it do something, use the methods
             of the emulator.
-        log: what was heard and said, the last 10,000.
-        crowded_out: clients that were sent away because too many were connected.
         refuse_login: refuse every user.
         silent: hear commands and do them, but say nothing.
 
@@ -105,29 +84,30 @@ class EmulatedInSight(Server):
         ConfigurationError: something given is wrong.
     """
 
+    protocol: Protocol = INSIGHT
+    device: InSightDevice
+    states: ClassVar[frozenset[DeviceState]] = LineCamera.states | {
+        DeviceState.RUNNING,
+        DeviceState.STOPPED,
+    }
+    max_links: int = MAX_SESSIONS
+    write_limit: int = WRITE_LIMIT
+
     def __init__(
         self,
         jobs: Iterable[Job | Mapping[str, Any]] = (),
         *,
-        host: str = "127.0.0.1",
-        port: int = 0,
         users: Mapping[str, str] | None = None,
         model: str = "8502P",
-        active: str | None = None,
+        active: str | int | None = None,
         online: bool = False,
         image: Any = None,
         evaluations: Mapping[str, str] | None = None,
         info: Mapping[str, str] | None = None,
         quirks: InSightQuirks | Mapping[str, Any] | None = None,
-        clock: Clock | None = None,
-        name: str = "insight",
+        **options: Any,
     ) -> None:
-        self.host: str = host
-        self.name: str = name
-        self.clock: Clock = RealClock() if clock is None else clock
-        self.device: InSightDevice = InSightDevice(jobs, active=active, online=online, image=image)
-        self.log: deque[InSightLogEntry] = deque(maxlen=MAX_ENTRIES)
-        self.crowded_out: int = 0
+        self.device = InSightDevice(jobs, active=active, online=online, image=image)
         self.refuse_login: bool = False
         self.silent: bool = False
         self._users = {"admin": ""} if users is None else dict(users)
@@ -138,30 +118,70 @@ class EmulatedInSight(Server):
             info=info,
             quirks=validated(InSightQuirks, quirks or {}, "quirks"),
         )
-        self._port = port
-        self._socket: socket.socket | None = None
-        self._acceptor = Acceptor(lambda: TelnetConnection(self), _log, name="smartcam.insight")
-        self._connections: dict[TelnetConnection, None] = {}  # the oldest stands first
         self._ordered: deque[_Ordered] = deque()
         self._heard: Tally[str] = Tally()
-        self._timer = OneTimer(self.clock, lambda: self._act(lambda: None))
         self._offset = 0  # nanoseconds from the device's time, which stands still while stopped
+        self._was_online = online
+        super().__init__(**options)
+        self.device.around = self.step
+
+    @classmethod
+    def from_scenario(cls, plan: Scenario, **given: Any) -> Self:
+        """Return a camera of a scenario; without jobs it has the built-in ones."""
+        options = {"jobs": BUILTIN_JOBS, **plan.options}
+        return super().from_scenario(plan.model_copy(update={"options": options}), **given)
+
+    @classmethod
+    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
+        """Return the options with which a job is active, and online, from the beginning."""
+        return {"active": active, "online": running}
+
+    def make_codec(self) -> LineCodec:
+        """Return the lines it speaks."""
+        return LineCodec(
+            next(iter(INSIGHT.dialects)),
+            ROWS,
+            line_end=words.LINE_END,
+            ends=words.COMMAND_ENDS,
+            max_line=words.MAX_LINE,
+            encoding=words.ENCODING,
+        )
 
     # ------------------------------------------------------------------ what it is
 
     @property
-    def port(self) -> int:
-        """The port it listens on; the one given until it is started."""
-        return self._port
+    def application_ids(self) -> list[int]:
+        """Ids of the jobs on it that have one."""
+        return [job.id for job in self.device.jobs.values() if job.id is not None]
 
-    @property
-    def url(self) -> str:
-        """Its address."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"insight://{host}:{self.port}"
-
-    def __repr__(self) -> str:
-        return f"<EmulatedInSight {self.url}>"
+    def shown(self) -> dict[str, Any]:
+        """Return what its page shows of its state."""
+        device, job = self.device, self.device.job
+        jobs = [one for one in device.jobs.values() if one.id is not None]
+        return {
+            **super().shown(),
+            "mode": device.mode,
+            "status": ONLINE if device.online else Status(0),
+            "active_application": None if job is None else job.id,
+            "running": device.online,
+            "processing": device.busy,
+            "next_number": device.runs + 1,
+            "run_ends": "TriggerAnswer",
+            "applications": [
+                {
+                    **dict.fromkeys(SHOWN),
+                    "id": one.id,
+                    "name": one.file,
+                    "rate": one.rate,
+                    "load_time": one.load_time,
+                    "processing_time": one.processing_time,
+                }
+                for one in jobs
+            ],
+            "cells": dict(device.cells),
+            "quirks": self.quirks,
+            "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),
+        }
 
     @property
     def online(self) -> bool:
@@ -192,7 +212,7 @@ class EmulatedInSight(Server):
 
     def set_online(self, online: bool) -> None:
         """Go online, or be held offline by hand or an input: then ``SO1`` is answered with -5."""
-        self._act(lambda: self.device.set_online(online))
+        self.device.set_online(online)
 
     def set_image(self, image: NDArray[np.uint8]) -> None:
         """Have it see another image.
@@ -204,9 +224,7 @@ class EmulatedInSight(Server):
 
     def trigger(self) -> bool:
         """Trigger by the input; False if the camera does not take it."""
-        taken: list[bool] = []
-        self._act(lambda: taken.append(self.device.trigger()))
-        return taken[0]
+        return self.device.trigger()
 
     def load(self, job: str | int) -> None:
         """Load a job by hand, at once and in either mode; a run under way ends without a result.
@@ -217,7 +235,7 @@ class EmulatedInSight(Server):
         Raises:
             ConfigurationError: there is none, or another one is being loaded.
         """
-        self._act(lambda: self.device.load(job))
+        self.device.load(job)
 
     def answer_next(self, code: int, *, command: str | None = None) -> None:
         """Answer a command with a status code instead of doing it; the oldest order goes first.
@@ -235,7 +253,7 @@ class EmulatedInSight(Server):
 
     def drop_connections(self) -> None:
         """End every connection at once, as a broken network does. What is under way goes on."""
-        for one in list(self._connections):
+        for one in self._by_number():
             one.close("dropped")
 
     async def wait_heard(self, command: str, *, count: int = 1, timeout: float = 5.0) -> None:
@@ -265,73 +283,42 @@ class EmulatedInSight(Server):
 
     # ------------------------------------------------------------------ life
 
-    async def start(self) -> None:
-        """Open the port; does nothing if it is started already.
-
-        Raises:
-            ConfigurationError: it cannot listen there.
-
-        Cancellation: leaves it stopped.
-        """
-        if self._socket is not None:
-            return
-        loop = asyncio.get_running_loop()
-        try:
-            found = await loop.getaddrinfo(self.host, self._port, type=socket.SOCK_STREAM)
-            family, address = found[0][0], found[0][4]
-            listener = socket.create_server(
-                (str(address[0]), self._port), family=family, backlog=MAX_SESSIONS
-            )
-        except (OSError, ValueError, OverflowError) as exc:
-            raise ConfigurationError(
-                f"emulator: cannot listen on {self.host}:{self._port}: {exc}"
-            ) from exc
-        listener.setblocking(False)
-        self._socket = listener
-        self._port = listener.getsockname()[1]
-        self._acceptor.open(listener)
-        self._offset = self._clock_time() - self.device.now
-        self._act(lambda: None)
-        _log.info("= %s: listening on %s", self.name, self.url)
-
     async def stop(self) -> None:
         """Close the port and every connection; the camera stands still. Nothing if stopped.
 
         Cancellation: everything is closed nevertheless.
         """
-        if self._socket is None:
-            return
-        self._act(lambda: None)  # what was due happens
-        listener, self._socket = self._socket, None
-        self._acceptor.close()
-        listener.close()
-        self._timer.set(None)
-        for one in list(self._connections):
-            one.close("the emulator stops")
-        await self._acceptor.wait_closed()
-        await asyncio.sleep(0)  # transports that were aborted let go of their sockets now
-        _log.info("= %s: stopped", self.name)
+        with self.step():
+            pass  # what was due happens
+        await super().stop()
 
-    # ------------------------------------------------------------------ for connections
+    # ------------------------------------------------------------------ clients
 
-    def enter(self, connection: TelnetConnection) -> int | None:
-        """Take a connection; return its number, None if there are too many or it is too late."""
-        if self._socket is None:
-            return None
-        if len(self._connections) >= MAX_SESSIONS:
-            self.crowded_out += 1
-            waiting = next((one for one in self._connections if not one.logged_in), None)
-            if waiting is None:
-                return None
-            waiting.close(f"{MAX_SESSIONS} others are open, it waited for its login for longest")
-        taken = {one.number for one in self._connections}
-        number = next(one for one in range(MAX_SESSIONS) if one not in taken)
-        self._connections[connection] = None
-        return number
+    def make_client(self, link: ClientLink, server: LineServer) -> TelnetClient:
+        """Return a new client."""
+        taken = {one.number for one in self._by_number()}
+        number = next(one for one in range(MAX_SESSIONS + 1) if one not in taken)
+        return TelnetClient(self, link, server, number)
 
-    def leave(self, connection: TelnetConnection) -> None:
-        """Forget a connection that is gone; harmless when done twice."""
-        self._connections.pop(connection, None)
+    def greet(self, client: LineClient) -> None:
+        """Say the greeting and ask for the user."""
+        if isinstance(client, TelnetClient):
+            client.say_bytes(self.greeting(client.number))
+
+    def hear(self, client: LineClient, line: str) -> None:
+        """Do what a line says."""
+        if isinstance(client, TelnetClient):
+            client.take(line)
+
+    def serves(self, link: ClientLink) -> bool:
+        """Whether the client on it is logged in."""
+        client = self._clients.get(link)
+        return isinstance(client, TelnetClient) and client.logged_in
+
+    def say(self, link: ClientLink, message: SaidLine) -> None:
+        """Say something to a link, unless it is silent."""
+        if not self.silent:
+            super().say(link, message)
 
     def greeting(self, number: int) -> bytes:
         """Return a new connection's greeting; two spaces before the model (clients, derived)."""
@@ -343,19 +330,15 @@ class EmulatedInSight(Server):
         known = self._users.get(user)
         return known is not None and known == password and not self.refuse_login
 
-    def execute(self, connection: TelnetConnection, line: str) -> None:
+    def execute(self, client: TelnetClient, line: str) -> None:
         """Do what a line of a logged-in client says."""
         mnemonic = line[:2].upper()
         code = self._take_ordered(mnemonic)
         if code is not None:
-            connection.answer(str(code).encode("ascii") + words.LINE_END)
+            client.respond(str(code).encode("ascii") + words.LINE_END)
         else:
-            self._act(lambda: self._commands.execute(line, connection.answer))
+            self._commands.execute(line, client.respond)
         self._heard.add(mnemonic if mnemonic in words.COMMANDS else "")
-
-    def note(self, direction: Literal["in", "out"], peer: str, text: str) -> None:
-        """Put an entry into the log."""
-        self.log.append(InSightLogEntry(self.clock.now, direction, peer, text[:MAX_LOGGED]))
 
     # ------------------------------------------------------------------ inside
 
@@ -366,19 +349,24 @@ class EmulatedInSight(Server):
                 return ordered.code
         return None
 
-    def _by_number(self) -> list[TelnetConnection]:
-        return sorted(self._connections, key=lambda one: one.number)
+    def _by_number(self) -> list[TelnetClient]:
+        clients = [one for one in self._clients.values() if isinstance(one, TelnetClient)]
+        return sorted(clients, key=lambda one: one.number)
 
-    def _act(self, action: Callable[[], object]) -> None:
-        """Do something to the device, its time brought up, and see to what follows by itself."""
-        if self._socket is not None:
-            self.device.advance_to(self._clock_time() - self._offset)
-        try:
-            action()
-        finally:
-            if self._socket is not None:
-                due = self.device.due
-                self._timer.set(None if due is None else due + self._offset)
+    def _began(self) -> None:
+        self._offset = nanoseconds(self.clock.now) - self.device.now
 
-    def _clock_time(self) -> int:
-        return nanoseconds(self.clock.now)
+    def _move(self) -> None:
+        self.device.advance_to(nanoseconds(self.clock.now) - self._offset)
+        super()._move()
+
+    def _settle(self) -> None:
+        if self.device.online != self._was_online:
+            self._was_online = self.device.online
+            self._timeline.entered(DeviceState.RUNNING if self._was_online else DeviceState.STOPPED)
+        super()._settle()
+
+    def _due(self) -> int | None:
+        due, later = self.device.due, super()._due()
+        mine = None if due is None else due + self._offset
+        return min((one for one in (mine, later) if one is not None), default=None)

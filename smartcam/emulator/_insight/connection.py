@@ -1,33 +1,68 @@
-"""Connections of the emulated In-Sight camera: lines in, bytes out."""
+"""Clients of the emulated In-Sight camera: they log in, then their commands are done."""
 
 from __future__ import annotations
 
-import asyncio
 import enum
-import logging
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-from smartcam.exceptions import FrameError
+from smartcam.emulator._line_camera import LineClient
+from smartcam.models import Status
+from smartcam.protocols import messages as m
 from smartcam.protocols._insight import words
+from smartcam.protocols._insight.machine import ONLINE
+from smartcam.protocols._lines import LineRow
 
 if TYPE_CHECKING:
+    from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._insight.camera import EmulatedInSight
-
-_log = logging.getLogger("smartcam.emulator")
+    from smartcam.emulator._line_codec import LineServer
 
 MAX_SESSIONS = 16
 """Connections at a time. For a newcomer the one makes room that waits for its login for longest;
 where all are logged in, it is closed at once. The real camera's bound is not published."""
 
-MAX_WAITING = 1 << 16
-"""Bytes of commands that wait behind one under way; more are left to the network."""
-
 WRITE_LIMIT = 1 << 25
 """Bytes kept for a client that does not read; more end its connection. An image of 8 megapixels
 makes 17 million."""
 
-MAX_LOGGED = 200
-"""Characters of a line or an answer that the log shows."""
+
+def _code(line: str) -> int:
+    """Return the status code of an answer; ValueError: it has none."""
+    return int(line.partition("\r\n")[0])
+
+
+def _value(line: str) -> int:
+    """Return the number behind the status code, or that of no job."""
+    code, _, value = line.partition("\r\n")
+    return int(value) if int(code) == words.StatusCode.DONE else m.UNNAMED_APPLICATION
+
+
+def _status(line: str) -> m.StatusReport:
+    """Return the mode; LookupError: it is none."""
+    return m.StatusReport(status={"0": Status(0), "1": ONLINE}[line])
+
+
+ROWS = (
+    LineRow(m.GetStatus, "GO", m.StatusReport, _status),
+    LineRow(m.Query, "GJ", m.QueryAnswer, lambda line: m.QueryAnswer(application=_value(line))),
+    LineRow(
+        m.SwitchApplication,
+        "SJ{application}",
+        m.SwitchAnswer,
+        lambda line: m.SwitchAnswer(code=_code(line), application=m.UNNAMED_APPLICATION),
+    ),
+    LineRow(
+        m.LoadFile,
+        "LF{name}",
+        m.SwitchAnswer,
+        lambda line: m.SwitchAnswer(code=_code(line), application=m.UNNAMED_APPLICATION),
+    ),
+    LineRow(m.Start, "SO1", m.StartAnswer, lambda line: m.StartAnswer(code=_code(line))),
+    LineRow(m.Stop, "SO0", m.StopAnswer, lambda line: m.StopAnswer(code=_code(line))),
+    LineRow(m.Trigger, "SW8", m.TriggerAnswer, lambda line: m.TriggerAnswer(code=_code(line))),
+    LineRow(m.ReadImage, "RI", m.Image, lambda line: m.Image(code=_code(line), data=b"")),
+)
+"""The commands that are the library's requests, by whose names faults call them."""
 
 
 class _LoginState(enum.Enum):
@@ -38,113 +73,45 @@ class _LoginState(enum.Enum):
     COMMANDS = "commands"
 
 
-class TelnetConnection(asyncio.Protocol):
-    """One client: it logs in, then its commands are done one after the other (decided)."""
+class TelnetClient(LineClient):
+    """One client: it logs in, then its commands are done one after the other (decided).
 
-    _transport: asyncio.Transport
+    Attributes:
+        number: of the session, from 0.
+    """
 
-    def __init__(self, emulator: EmulatedInSight) -> None:
-        self.peer: str = "?"  # address and port of the client
-        self.number: int = -1  # of the session, from 0
+    def __init__(
+        self, emulator: EmulatedInSight, link: ClientLink, server: LineServer, number: int
+    ) -> None:
+        super().__init__(emulator, link, server)
+        self.number: int = number
         self._emulator = emulator
-        self._reader = words.LineReader(nul_ends=True)
         self._state = _LoginState.USER
         self._user = ""
-        self._busy = False  # a command is under way
-        self._closed = False
-        self._going = False  # lines are taken
 
     @property
     def logged_in(self) -> bool:
         """Whether its commands are done."""
         return self._state is _LoginState.COMMANDS
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Greet the client, or send it away."""
-        self._transport = cast("asyncio.Transport", transport)
-        address = transport.get_extra_info("peername")
-        self.peer = f"{address[0]}:{address[1]}" if address else "?"
-        number = self._emulator.enter(self)
-        if number is None:
-            self.close("no place is free")
-            return
-        self.number = number
-        self._say(self._emulator.greeting(number))
-
-    def data_received(self, data: bytes) -> None:
-        """Take what the client says."""
-        self._reader.feed(data)
-        self._go_on()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the client; what it asked for goes on."""
-        self._closed = True
-        self._emulator.leave(self)
-
-    def answer(self, data: bytes, *, more: bool = False) -> None:
-        """Answer the command under way; without ``more`` it is done."""
-        self._say(data)
-        if not more:
-            self._busy = False
-            self._go_on()
-
-    def close(self, reason: str) -> None:
-        """End the connection at once."""
-        if not self._closed:
-            self._closed = True
-            _log.info("= %s: connection closed: %s", self.peer, reason)
-        self._emulator.leave(self)
-        self._transport.abort()
-
-    def _go_on(self) -> None:
-        if self._going:
-            return  # answered at once: the loop below goes on
-        self._going = True
-        try:
-            while not self._busy and not self._closed:
-                line = self._reader.next_line()
-                if line is None:
-                    break
-                self._hear(line)
-        except FrameError as exc:
-            self.close(str(exc))
-        finally:
-            self._going = False
-        if self._closed:
-            return
-        if len(self._reader) > MAX_WAITING:
-            self._transport.pause_reading()
-        else:
-            self._transport.resume_reading()
-
-    def _hear(self, line: str) -> None:
-        shown = "***" if self._state is _LoginState.PASSWORD else line
-        self._emulator.note("in", self.peer, shown)
-        if self._state is _LoginState.USER:
+    def take(self, line: str) -> None:
+        """Take a line."""
+        if self._state is _LoginState.COMMANDS:
+            self._emulator.execute(self, line)
+        elif self._state is _LoginState.USER:
             self._user = line
             self._state = _LoginState.PASSWORD
-            self._say(words.PASSWORD_PROMPT)
-        elif self._state is _LoginState.PASSWORD:
-            self._log_in(line)
-        else:
-            self._busy = True
-            self._emulator.execute(self, line)
-
-    def _log_in(self, password: str) -> None:
-        if self._emulator.admits(self._user, password):
+            self.hide_next()
+            self.respond(words.PASSWORD_PROMPT)
+        elif self._emulator.admits(self._user, line):
             self._state = _LoginState.COMMANDS
-            self._say(words.LOGGED_IN.encode("ascii") + words.LINE_END)
-            return
-        self._say(words.INVALID_PASSWORD.encode("ascii") + words.LINE_END)
-        _log.info("= %s: connection closed: the login was refused", self.peer)
-        self._closed = True
-        self._transport.close()
+            self.respond(words.LOGGED_IN.encode("ascii") + words.LINE_END)
+        else:
+            self.say_bytes(words.INVALID_PASSWORD.encode("ascii") + words.LINE_END)
+            self.end("the login was refused")
 
-    def _say(self, data: bytes) -> None:
-        if self._closed or self._emulator.silent:
-            return
-        if self._transport.get_write_buffer_size() + len(data) > WRITE_LIMIT:
-            self.close(f"it does not read: more than {WRITE_LIMIT} bytes wait for it")
-            return
-        self._emulator.note("out", self.peer, data[:MAX_LOGGED].decode(words.ENCODING))
-        self._transport.write(data)
+    def respond(self, data: bytes, *, more: bool = False) -> None:
+        """Answer the line under way; without ``more`` it is done."""
+        self.say_bytes(data)
+        if not more:
+            self.go_on()

@@ -9,7 +9,8 @@ from __future__ import annotations
 import heapq
 import itertools
 import logging
-from typing import TYPE_CHECKING, Any, TypeAlias
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._insight.image import check_image, grey_pattern
@@ -19,6 +20,7 @@ from smartcam.protocols._insight.words import TRIGGER_EVENT, StatusCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
+    from contextlib import AbstractContextManager
 
     import numpy as np
     from numpy.typing import NDArray
@@ -62,13 +64,15 @@ class InSightDevice:
         self,
         jobs: Iterable[Job | Mapping[str, Any]] = (),
         *,
-        active: str | None = None,
+        active: str | int | None = None,
         online: bool = False,
         image: Any = None,
     ) -> None:
         self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])  # by file name
         # the active one, None for one that was never saved
         self.job: Job | None = next(iter(self.jobs.values()), None)
+        # a context around what an operator does, where something is to follow
+        self.around: Callable[[], AbstractContextManager[object]] = nullcontext
         self.runs: int = 0  # acquisitions with a result since it was made
         self._image: NDArray[np.uint8] = grey_pattern() if image is None else check_image(image)
         self._now = 0
@@ -91,6 +95,13 @@ class InSightDevice:
     def online(self) -> bool:
         """Whether it is online: wanted by clients, and not held offline (manual, published)."""
         return self._wanted_online and self._allowed_online
+
+    @property
+    def mode(self) -> Literal["running", "stopped", "switching"]:
+        """How it stands, in the words of other cameras: online, offline, or a job is loaded."""
+        if self._loading:
+            return "switching"
+        return "running" if self.online else "stopped"
 
     @property
     def busy(self) -> bool:
@@ -158,11 +169,21 @@ class InSightDevice:
 
     def set_online(self, online: bool) -> None:
         """Go online, or be held offline by hand or an input: ``SO1`` alone does not undo that."""
-        self._switch(wanted=self._wanted_online or online, allowed=online)
+        with self.around():
+            self._switch(wanted=self._wanted_online or online, allowed=online)
+
+    def start(self) -> None:
+        """Go online by hand."""
+        self.set_online(True)
+
+    def stop(self) -> None:
+        """Be held offline by hand."""
+        self.set_online(False)
 
     def trigger(self) -> bool:
         """Trigger by the input; False if the camera does not take it, as for ``SE8``."""
-        return self._begin_run(TRIGGER_EVENT, None, at_image=False)
+        with self.around():
+            return self._begin_run(TRIGGER_EVENT, None, at_image=False)
 
     def load(self, job: str | int) -> None:
         """Load a job by hand, at once and in either mode; a run under way ends without a result.
@@ -173,9 +194,23 @@ class InSightDevice:
         found = self.find(job)
         if self._loading:
             raise ConfigurationError(f"job {job!r}: another one is being loaded")
-        self._break_run()
-        self.job = found
-        self._begin_job()
+        with self.around():
+            self._break_run()
+            self.job = found
+            self._begin_job()
+
+    def switch_application(self, application: int, *, running: bool = False) -> bool:
+        """Load the job of an id by hand, and go online or not; False while one is loaded.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        if self._loading:
+            return False
+        with self.around():
+            self.load(application)
+            self.set_online(running)
+        return True
 
     # ------------------------------------------------------------------ what clients ask for
 

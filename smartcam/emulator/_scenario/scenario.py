@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from smartcam.emulator._application import BUILTIN_APPLICATIONS, Application
 from smartcam.emulator._bvs.quirks import Quirks
 from smartcam.emulator._data import EmulatorData
 from smartcam.emulator._scenario.timeline import Cue
-from smartcam.emulator.faults._matching import misfit
-from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._bvs import BVS
+from smartcam.exceptions import ConfigurationError, UnsupportedError
+from smartcam.protocols._base import load_protocol
+from smartcam.protocols._bvs import BVS, HANDBOOK
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -23,14 +23,21 @@ MAX_CUES = 1000
 
 T = TypeVar("T")
 
-_SHOWN = 20  # ids that an error names
+Mistake: TypeAlias = tuple[tuple[str | int, ...], str]
+"""The place of a mistake in a scenario, and what is wrong."""
 
 
 class Scenario(EmulatorData):
     """One camera: its applications, how it stands at first, its quirks, and what happens to it."""
 
     name: str = Field(default="camera", min_length=1, max_length=200, description="for logs")
-    dialect: str = Field(default="handbook", description="name of the wire dialect")
+    protocol: str = Field(
+        default=BVS.name, description="name of the protocol; others than bvs take options"
+    )
+    dialect: str = Field(
+        default=HANDBOOK.name,
+        description="name of the wire dialect; default handbook, of another protocol its first",
+    )
     transport: Literal["tcp", "udp"] = Field(default="tcp", description="tcp or udp")
     port: int = Field(default=0, ge=0, le=65_535, description="port; 0 takes a free one")
     applications: tuple[Application, ...] = Field(
@@ -52,11 +59,20 @@ class Scenario(EmulatorData):
         default=(), max_length=MAX_CUES, description="what happens to it by itself, and when"
     )
 
+    options: dict[str, Any] = Field(
+        default_factory=dict[str, Any],
+        description="of another protocol than bvs: what its emulated camera is made of",
+    )
+
     @field_validator("dialect")
     @classmethod
-    def _check_dialect(cls, value: str) -> str:
-        if value not in BVS.dialects:
-            raise ValueError(f"unknown; known are {', '.join(BVS.dialects)}")
+    def _check_dialect(cls, value: str, info: ValidationInfo) -> str:
+        try:
+            known = load_protocol(info.data.get("protocol", BVS.name)).dialects
+        except ConfigurationError:
+            return value  # the protocol is what is wrong
+        if value not in known:
+            raise ValueError(f"unknown; known are {', '.join(known)}")
         return value
 
     @model_validator(mode="after")
@@ -84,33 +100,24 @@ class Scenario(EmulatorData):
         """Whether chance has a part in the timeline."""
         return any(cue.is_random for cue in self.timeline)
 
-    def mistake(self) -> tuple[tuple[str | int, ...], str] | None:
+    def mistake(self) -> Mistake | None:
         """Return the place in it of what the camera cannot do, and why; None where all is well."""
-        dialect = BVS.dialects[self.dialect]
-        known = [application.id for application in self.all_applications]
-        for number, application in enumerate(self.applications):
-            ids = dialect.application_ids
-            if application.id not in ids:
-                text = (
-                    f"application id {application.id} does not fit dialect {dialect.name}: "
-                    f"{ids.start} to {ids.stop - 1}"
-                )
-                return ("applications", number, "id"), text
-        if self.active is not None and self.active not in known:
-            there = ", ".join(str(number) for number in known[:_SHOWN])
-            more = ", ..." if len(known) > _SHOWN else ""
-            asked = f"the id {self.active}" if self.active.bit_length() < 64 else "such an id"
-            return ("active",), f"no application has {asked}; there are {there}{more}"
+        from smartcam.emulator._makes import emulated_class  # stands on this module
+
         try:
-            spoken = dialect.with_quirks(self.quirks.of_the_wire)
-        except ConfigurationError as exc:
-            return ("quirks",), str(exc)
-        for number, cue in enumerate(self.timeline):
-            for place, fault in enumerate(cue.do):
-                found = misfit(fault, spoken, known)
-                if found is not None:
-                    return ("timeline", number, "do", place, found[0]), found[1]
-        return None
+            kind = emulated_class(self.protocol)
+        except (ConfigurationError, UnsupportedError) as exc:
+            return ("protocol",), str(exc)
+        return kind.mistake(self)
+
+    def changed(self) -> set[str]:
+        """Return the names of the fields that are not as they are by default."""
+        fields = type(self).model_fields
+        return {
+            name
+            for name, field in fields.items()
+            if getattr(self, name) != field.get_default(call_default_factory=True)
+        }
 
 
 class ScenarioFile(Scenario):
@@ -158,6 +165,7 @@ class ScenarioFile(Scenario):
                 *(app for app in self.applications if app.id not in ids),
             ),
             "quirks": self.quirks.model_copy(update=quirks),
+            "options": {**self.options, **camera.options},
             "timeline": (*self.timeline, *camera.timeline),
         }
         return Scenario(**merged)

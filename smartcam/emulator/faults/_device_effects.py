@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.emulator import faults as f
 from smartcam.emulator._scene import TablePose
+from smartcam.emulator.faults._base import DeviceFault
 from smartcam.models import Status
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from smartcam.emulator._bvs.device import Device
-    from smartcam.emulator.faults._base import DeviceFault
 
 _CONDITIONS = {"system_error": Status.SYSTEM_ERROR, "overheat": Status.OVERHEAT}
 
@@ -22,7 +21,7 @@ _CONDITIONS = {"system_error": Status.SYSTEM_ERROR, "overheat": Status.OVERHEAT}
 class Stage:
     """What faults act on."""
 
-    device: Device
+    device: Any
     refuse: Callable[[float], None]  # closes the port for so many seconds
     let_second_client_in: Callable[[], None]  # lets another client connect
     clear: Callable[[], None]  # forgets the faults that wait, and ends those that last
@@ -59,6 +58,37 @@ _ACTIONS: Mapping[type[DeviceFault], Callable[[Stage, Any], object]] = {
     f.RemovePart: lambda stage, fault: stage.device.scene.pieces.pop(fault.part, None),
     f.ClearFaults: lambda stage, _: stage.clear(),
 }
+
+
+_NEEDS: Mapping[type[DeviceFault], str] = {
+    f.BusyForEver: "hold_busy",
+    f.Overtrigger: "drop_triggers",
+    f.SecondClient: "disconnect",
+    f.PowerCycle: "reboot",
+    f.OperatorSwitch: "switch_application",
+    f.OperatorStop: "stop",
+    f.OperatorStart: "start",
+    f.Condition: "set_condition",
+    f.LateResult: "change_run",
+    f.NoResult: "change_run",
+    f.ExtraResult: "change_run",
+    f.DigitalInput: "trigger",
+    f.ChangeByteOrder: "set_endian",
+    f.MovePart: "scene",
+    f.RemovePart: "scene",
+}
+"""What a device must have for a fault; those that are not here are done without it."""
+
+
+def kinds_of(device: object) -> frozenset[str]:
+    """Return the kinds of faults that a camera with such a device can do."""
+    return frozenset(
+        kind
+        for kind, fault in f.FAULTS.items()
+        if not issubclass(fault, DeviceFault)
+        or fault not in _NEEDS
+        or hasattr(device, _NEEDS[fault])
+    )
 
 
 def act(stage: Stage, fault: DeviceFault) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from smartcam.emulator.faults import (
+    FAULTS,
     MAX_FAULTS,
     MAX_FIRED,
     FiredFault,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._clock import Clock
     from smartcam.emulator.faults import Fault
     from smartcam.emulator.faults._base import BaseFault
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.emulator.faults._wire_effects import WireCodec
     from smartcam.protocols._framed.framing import Frame
 
 _log = logging.getLogger("smartcam.emulator")
@@ -61,9 +62,10 @@ class FaultQueue:
     The lists of rows are always the same objects, so that it costs little to see that one is empty.
     """
 
-    _dialect: FramedDialect
+    _dialect: WireCodec
     _clock: Clock  # whose time the record tells
     _applications: Container[int] = ()  # ids of those that the camera has
+    _kinds: frozenset[str] = frozenset(FAULTS)  # those that it can do
 
     def __post_init__(self) -> None:
         self.said: list[Row] = []  # wire faults on messages of the camera
@@ -109,7 +111,9 @@ class FaultQueue:
 
     def by_message(self, rows: list[Row], message: m.Message) -> list[Fault]:
         """Return the faults among ``rows`` that a message brings about, as :meth:`by_frame`."""
-        return self._take(rows, type(message).__name__, self._dialect.message_id(message), message)
+        number = self._dialect.message_id(message)
+        name = self._dialect.message_type(message.sender, number).__name__
+        return self._take(rows, name, number, message)
 
     def at_once(self) -> list[Fault]:
         """Return the faults that wait for no message, in order."""
@@ -147,16 +151,22 @@ class FaultQueue:
 
     def _check(self, number: int, fault: Fault) -> None:
         """Refuse what this camera cannot do."""
-        wrong = misfit(fault, self._dialect, self._applications)
+        wrong = misfit(fault, self._dialect, self._applications, self._kinds)
         if wrong is not None:
             field, text = wrong
             raise ConfigurationError(f"fault {number}: {fault.kind}.{field}: {text}")
 
 
 def misfit(
-    fault: Fault, dialect: FramedDialect, applications: Container[int]
+    fault: Fault,
+    dialect: WireCodec,
+    applications: Container[int],
+    kinds: Container[str] = FAULTS,
 ) -> tuple[str, str] | None:
     """Return the field of a fault that a camera cannot do and why, None where it can do all."""
+    if fault.kind not in kinds:
+        able = ", ".join(kind for kind in FAULTS if kind in kinds)
+        return "kind", f"dialect {dialect.label}: its camera has no such fault; it has {able}"
     if isinstance(fault.on, str) and not dialect.has(MESSAGE_NAMES[fault.on]):
         return "on", f"dialect {dialect.label} has no {fault.on}"
     if isinstance(fault, Insert) and fault.word is not None:

@@ -4,17 +4,90 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from smartcam.emulator import faults as f
 from smartcam.emulator.faults._delay_line import Ending, Transmission
 from smartcam.exceptions import FrameError
-from smartcam.protocols._framed.framing import Frame, Framer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import messages as m
+    from smartcam.protocols._framed.dialect import MessageRow
+    from smartcam.protocols._framed.framing import Frame
+
+
+class WireFramer(Protocol):
+    """Cuts what came into frames."""
+
+    @property
+    def pending(self) -> bytes:
+        """What is unfinished."""
+        ...
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes."""
+
+    def next_frame(self) -> Frame | None:
+        """Return the next frame, None if it is not whole yet; FrameError: no frame begins there."""
+        ...
+
+    def resync(self) -> int:
+        """Go on where a frame may begin; return how many bytes are left out."""
+        ...
+
+
+class WireCodec(Protocol):
+    """The words on a wire, as links, faults and the log know them; a framed dialect is one."""
+
+    @property
+    def label(self) -> str:
+        """Its name, for people."""
+        ...
+
+    @property
+    def table(self) -> tuple[MessageRow, ...]:
+        """The messages that have ids."""
+        ...
+
+    def __hash__(self) -> int: ...
+
+    def framer(self, max_length: int) -> WireFramer:
+        """Return what cuts a client's bytes."""
+        ...
+
+    def has(self, message_type: type[m.Message], /) -> bool:
+        """Return whether there is such a message."""
+        ...
+
+    def message_id(self, message: m.Message, /) -> int:
+        """Return a message's id."""
+        ...
+
+    def message_type(self, sender: m.Sender, message_id: int) -> type[m.Message]:
+        """Return the message of an id."""
+        ...
+
+    def encode(self, message: m.Message) -> bytes:
+        """Return a message's bytes; UnsupportedError, LocalProtocolError: it has none."""
+        ...
+
+    def encode_frame(self, frame: Frame) -> bytes:
+        """Return a frame's bytes."""
+        ...
+
+    def to_frame(self, message: m.Message) -> Frame:
+        """Return a message as a frame."""
+        ...
+
+    def decode(self, sender: m.Sender, frame: Frame) -> m.Message:
+        """Return a frame's message; MessageError: it has none."""
+        ...
+
+    def surplus(self, sender: m.Sender, frame: Frame) -> int:
+        """Return by how many bytes a frame is too long."""
+        ...
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -119,7 +192,7 @@ _CHANGES: Mapping[type[object], Callable[[Any, WireMessage], None]] = {
 _Sent: TypeAlias = "list[WireMessage]"
 
 
-def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: FramedDialect) -> _Sent:
+def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: WireCodec) -> _Sent:
     result: _Sent = []
     for one in sent:
         result.append(one)
@@ -129,7 +202,7 @@ def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: FramedDialect) -> _Sent
     return result
 
 
-def _insert(fault: f.Insert, sent: _Sent, dialect: FramedDialect) -> _Sent:
+def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
     places = [number for number, one in enumerate(sent) if one.changeable]
     if not places:
         return sent
@@ -146,7 +219,7 @@ def _insert(fault: f.Insert, sent: _Sent, dialect: FramedDialect) -> _Sent:
     return [*sent[:place], new, *sent[place:]]
 
 
-def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: FramedDialect) -> _Sent:
+def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: WireCodec) -> _Sent:
     seconds = fault.seconds if isinstance(fault, f.HalfOpen) else None
     if fault.when == "before":
         for one in sent:
@@ -157,7 +230,7 @@ def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: FramedDial
     return sent
 
 
-_REBUILDS: Mapping[type[object], Callable[[Any, _Sent, FramedDialect], _Sent]] = {
+_REBUILDS: Mapping[type[object], Callable[[Any, _Sent, WireCodec], _Sent]] = {
     f.Duplicate: _duplicate,
     f.Insert: _insert,
     f.HalfOpen: _end,
@@ -167,7 +240,7 @@ _REBUILDS: Mapping[type[object], Callable[[Any, _Sent, FramedDialect], _Sent]] =
 """Faults that act on all transmissions of a message together."""
 
 
-def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: FramedDialect) -> _Sent:
+def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireCodec) -> _Sent:
     """Apply wire faults one after the other; return the messages that pass, in order."""
     sent = [message]
     for fault in faults:
@@ -182,7 +255,7 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: Frame
     return sent
 
 
-def cut(data: bytes, framer: Framer, dialect: FramedDialect) -> list[WireMessage]:
+def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage]:
     """Return the messages that are whole with these bytes: frames, and bytes between them.
 
     The framer keeps what is unfinished.
@@ -202,8 +275,8 @@ def cut(data: bytes, framer: Framer, dialect: FramedDialect) -> list[WireMessage
         messages.append(WireMessage.of(frame, dialect.encode_frame(frame)))
 
 
-def cut_datagram(data: bytes, dialect: FramedDialect) -> WireMessage:
+def cut_datagram(data: bytes, dialect: WireCodec) -> WireMessage:
     """Return a datagram as a message, with its frame if it is exactly one."""
-    messages = cut(data, Framer(dialect.header, len(data)), dialect)
+    messages = cut(data, dialect.framer(len(data)), dialect)
     whole = [one.original for one in messages] == [data]
     return messages[0] if whole else WireMessage.of(data, data)

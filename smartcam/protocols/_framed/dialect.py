@@ -30,7 +30,7 @@ from smartcam.protocols._base import (
     Spelled,
     Verdict,
 )
-from smartcam.protocols._framed.framing import Buffer, Frame, HeaderLayout
+from smartcam.protocols._framed.framing import Buffer, Frame, Framer, HeaderLayout
 from smartcam.protocols.messages import (
     Acknowledgement,
     ConnectAnswer,
@@ -498,6 +498,10 @@ class FramedDialect(Dialect):
         An unknown request is expected to be answered under its own id.
         """
         return self._answers.get(request_id, request_id)
+
+    def framer(self, max_length: int) -> Framer:
+        """Return what cuts frames of this dialect; a longer payload breaks the protocol."""
+        return Framer(self.header, max_length)
 
     def encode_frame(self, frame: Frame) -> bytes:
         """Return a frame's bytes.

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 from smartcam.exceptions import FrameError
 from smartcam.protocols._insight.words import (
     ENCODING,
+    ENDS,
     INFO_LINES,
+    MAX_LINE,
     AnswerForm,
-    LineReader,
     StatusCode,
     checksum,
 )
+from smartcam.protocols._line_reader import LineReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -49,7 +51,7 @@ class AnswerReader(LineReader):
     """
 
     def __init__(self, *, max_length: int, on_piece: Callable[[str, bool], None]) -> None:
-        super().__init__()
+        super().__init__(ENDS, max_line=MAX_LINE, encoding=ENCODING)
         self._max_length = max_length
         self._on_piece = on_piece
         self._reading: Generator[None, None, CommandAnswer] | None = None

@@ -245,5 +245,6 @@ INSIGHT = Protocol(
         "cells": "cells that are a result's values, such as B2,C2,D4:F6",
         "counter": "a cell that counts runs: values of several runs are told by it",
     },
+    emulator="smartcam.emulator._insight.camera:EmulatedInSight",
 )
 """What the entry point ``insight`` gives."""

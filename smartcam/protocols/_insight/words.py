@@ -15,7 +15,8 @@ import enum
 import re
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.exceptions import ConfigurationError, FrameError
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols._line_reader import LineReader
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -414,67 +415,14 @@ def hex_lines(data: bytes) -> tuple[int, bytes]:
 
 # ---------------------------------------------------------------------- lines
 
+ENDS = re.compile(rb"\r\n")
+"""What ends a line of the camera."""
 
-class LineReader:
-    r"""Cuts lines, prompts and counted text from a stream of bytes.
+COMMAND_ENDS = re.compile(rb"\r\n|\r?\x00")
+r"""What ends a line of a client: a byte NUL does as CR LF does (manual, published); a CR right
+before it is dropped, since ``\r\0`` is telnet's bare CR."""
 
-    Args:
-        max_line: bytes of a line, its end not counted.
-        nul_ends: a byte NUL ends a line as CR LF does, which is what the camera hears (manual,
-            published); a CR right before it is dropped, since ``\r\0`` is telnet's bare CR.
-    """
 
-    def __init__(self, *, max_line: int = MAX_LINE, nul_ends: bool = False) -> None:
-        self._max_line = max_line
-        self._end = re.compile(rb"\r\n|\r?\x00" if nul_ends else rb"\r\n")
-        self._buffer = bytearray()
-        self._searched = 0  # no end begins before this
-
-    def __len__(self) -> int:
-        """Return the number of bytes that wait."""
-        return len(self._buffer)
-
-    @property
-    def pending(self) -> bytes:
-        """Copy of those bytes."""
-        return bytes(self._buffer)
-
-    def feed(self, data: bytes) -> None:
-        """Take what came. Whoever feeds it bounds what waits, by :func:`len`."""
-        self._buffer += data
-
-    def next_line(self) -> str | None:
-        """Return the next line without its end, None if no whole one is there.
-
-        Raises FrameError: it is too long; the stream cannot be read on.
-        """
-        found = self._end.search(self._buffer, self._searched)
-        size = found.start() if found is not None else len(self._buffer)
-        # a CR at the end may be half of a line end
-        if size > self._max_line + (found is None):
-            raise FrameError(
-                f"a line of more than {self._max_line} bytes came", data=self._buffer[:64]
-            )
-        if found is None:
-            self._searched = max(0, size - 1)
-            return None
-        line = self._buffer[:size].decode(ENCODING)
-        del self._buffer[: found.end()]
-        self._searched = 0
-        return line
-
-    def take(self, size: int) -> bytes | None:
-        """Return the next ``size`` bytes, None if they are not all there yet."""
-        if len(self._buffer) < size:
-            return None
-        data = bytes(self._buffer[:size])
-        del self._buffer[:size]
-        self._searched = 0
-        return data
-
-    def take_prompt(self, prompt: bytes) -> bool:
-        """Take a prompt, which has no line end, if it is what comes next and all of it is there."""
-        if not self._buffer.startswith(prompt):
-            return False
-        self.take(len(prompt))
-        return True
+def command_reader() -> LineReader:
+    """Return what cuts a client's lines."""
+    return LineReader(COMMAND_ENDS, max_line=MAX_LINE, encoding=ENCODING)

@@ -131,7 +131,6 @@ async function begin(wanted) {
     kinds = answer.kinds;
     $("gate").hidden = true;
     $("main").hidden = false;
-    showKinds();
     showCameras(cameras);
     const names = cameras.map((one) => one.name);
     if (names.length) choose(names.includes(wanted) ? wanted : names[0]);
@@ -187,6 +186,7 @@ function choose(name) {
   moved.clear();
   for (const id of ["part-name", "part-x", "part-y", "part-theta"]) $(id).value = "";
   log.reset();
+  latency.reset();
   writeAddress();
   for (const one of $("cameras").children) one.setAttribute("aria-current", String(one.textContent === name));
   document.title = `${name} · smartcam emulator`;
@@ -278,10 +278,13 @@ const TAKE = {
   camera: takeState,
   scene: takeScene,
   faults: showFaults,
-  log: (value) => log.take(value),
+  log: (value) => {
+    log.take(value);
+    latency.take(value.entries);
+  },
   clock: (value) => {
     setText("fact-time", `${seconds(value.time, 1)} s`);
-    setText("fact-clock", value.clock_time.slice(0, 19).replace("T", " "));
+    setText("fact-clock", value.clock_time?.slice(0, 19).replace("T", " ") ?? "");
   },
 };
 
@@ -294,6 +297,7 @@ function setText(id, text) {
 
 function takeState(value) {
   if (value.name !== camera) return;
+  const switched = state.active_application !== value.active_application;
   state = value;
   setText("camera-title", state.name);
   setText("mode", state.mode);
@@ -301,10 +305,22 @@ function takeState(value) {
   const link = linkOf(camera);
   if (link) link.dataset.mode = state.mode;
   setText("url", state.url);
+  showAbilities();
   showStatus();
   showFacts();
   showControls();
   log.hint(state);
+  if (switched) showScene();
+}
+
+// What a camera of this make cannot do is not there.
+function showAbilities() {
+  for (const element of document.querySelectorAll("[data-needs]")) {
+    element.hidden = !element.dataset.needs.split(" ").some((one) => state.abilities.includes(one));
+  }
+  if (!state.applications.length) $("switch").hidden = true;
+  $("main").classList.toggle("no-scene", !state.abilities.includes("scene"));
+  if ($("kind").dataset.kinds !== String(state.fault_kinds)) showKinds();
 }
 
 function showStatus() {
@@ -319,15 +335,14 @@ function showStatus() {
 
 function showFacts() {
   const application = state.applications.find((one) => one.id === state.active_application);
-  const rate = application.rate === null ? "triggered" : `${application.rate} per second`;
   const facts = {
-    Application: `${application.id}${application.name ? ` ${application.name}` : ""}, ${rate}`,
-    Layout: application.layout ?? "sends nothing",
+    ...(application && applicationFacts(application)),
     Client: state.session ?? "none has the session",
     Connections: state.links.filter((one) => one !== state.session).join(", ") || (state.session ? "no other" : "none"),
     Speaks: `${state.dialect} over ${state.transport.toUpperCase()}`,
-    "Next number": state.next_number,
-    "Inputs queued": state.queued_inputs,
+    ...(state.next_number !== null && { "Next number": state.next_number }),
+    ...(state.queued_inputs !== null && { "Inputs queued": state.queued_inputs }),
+    ...state.cells,
   };
   const quirks = Object.entries(state.quirks_chosen);
   if (quirks.length) facts.Quirks = quirks.map(([name, value]) => `${name} ${value}`).join(", ");
@@ -335,9 +350,16 @@ function showFacts() {
   const before = { time: $("fact-time")?.textContent ?? "", clock: $("fact-clock")?.textContent ?? "" };
   list.replaceChildren(
     ...Object.entries(facts).flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", { textContent: String(value), title: String(value) })]),
-    make("dt", { textContent: "Its clock" }), make("dd", { id: "fact-clock", textContent: before.clock }),
+    ...(state.abilities.includes("clock") ? [make("dt", { textContent: "Its clock" }), make("dd", { id: "fact-clock", textContent: before.clock })] : []),
     make("dt", { textContent: "Log time" }), make("dd", { id: "fact-time", textContent: before.time }),
   );
+}
+
+function applicationFacts({ id, name, rate, layout }) {
+  return {
+    Application: `${id}${name ? ` ${name}` : ""}, ${rate === null ? "triggered" : `${rate} per second`}`,
+    Layout: layout ?? (Object.keys(state.cells).length ? "cells" : "sends nothing"),
+  };
 }
 
 function showControls() {
@@ -366,12 +388,12 @@ function showControls() {
 }
 
 $("trigger").addEventListener("click", () =>
-  act((answer) => (answer.taken ? "Triggered: an inspection began." : `The trigger was not taken: ${whyNot(answer.camera)}.`), "POST", path("trigger")));
+  act((answer) => (answer.taken ? `Triggered: an inspection began.${answer.camera.session ? "" : " No client listens, so nobody gets the result."}` : `The trigger was not taken: ${whyNot(answer.camera)}.`), "POST", path("trigger")));
 
 function whyNot(camera) {
   const application = camera.applications.find((one) => one.id === camera.active_application);
   if (camera.mode !== "running") return `the camera is ${camera.mode}`;
-  if (application.rate !== null) return "the application runs freely";
+  if (application && application.rate !== null) return "the application runs freely";
   if (camera.conditions.system_error) return "there is a system error";
   return camera.processing ? "an inspection is under way" : "a fault drops it";
 }
@@ -434,6 +456,8 @@ function showScene() {
   if (!scene) return;
   const width = scene.table.width * MM;
   const depth = scene.table.depth * MM;
+  const looking = scene.lookers.includes(state.active_application);
+  $("picture").classList.toggle("away", !looking);
   const view = scene.field_of_view;
   const xs = [0, width, ...view.map((one) => one.x * MM)];
   const ys = [0, depth, ...view.map((one) => one.y * MM)];
@@ -614,10 +638,13 @@ function showPart() {
   const part = scene.parts.find((one) => one.name === selected);
   const seen = scene.reported?.parts.find((one) => one.name === selected);
   let text = "";
-  if (!selected) {
+  if (!scene.lookers.includes(state.active_application)) {
+    const names = scene.lookers.map((id) => `${id} ${state.applications.find((one) => one.id === id)?.name ?? ""}`.trim());
+    text = `The active application does not look at the table${names.length ? `; ${names.join(", ")} does: load it to see parts reported` : ""}.`;
+  } else if (!selected) {
     text = scene.reported
       ? `Application ${scene.reported.application} reported ${scene.reported.parts.length} parts at ${seconds(scene.reported.time, 1)} s. Drag a part to move it.`
-      : "Drag a part to move it. What the camera reports appears here after a trigger of the tangram application.";
+      : "Drag a part to move it. What the camera reports appears here after a trigger.";
   } else if (!part) text = `${selected} is not on the table.`;
   else if (!seen) text = `${selected} was not reported yet.`;
   else {
@@ -630,16 +657,27 @@ function showPart() {
 
 // ---------------------------------------------------------------------- faults
 
+const PRESETS = [ // label, fault, what is told
+  ["Late result", { kind: "late_result", seconds: 10 }, "The next result comes 10 s late."],
+  ["Lost link", { kind: "reset" }, "With its next message the camera resets the connection."],
+  ["Camera stops", { kind: "stop" }, "An operator stops the application."],
+];
 const MESSAGE_FIELDS = ["on", "when", "nth", "times", "sender"];
 const LABELS = { on: "message", when: "before or after it", nth: "from the nth", times: "how often", sender: "sender" };
 
 function showKinds() {
+  const able = kinds.filter((one) => state.fault_kinds?.includes(one.kind));
+  $("kind").dataset.kinds = String(state.fault_kinds);
+  $("presets").replaceChildren(...PRESETS.filter(([, fault]) => able.some((one) => one.kind === fault.kind)).map(([label, fault, about]) => {
+    const button = make("button", { type: "button", textContent: label, title: about });
+    button.addEventListener("click", () => act(about, "POST", path("faults"), fault));
+    return button;
+  }));
   const groups = { wire: make("optgroup", { label: "On the wire" }), device: make("optgroup", { label: "Of the device" }) };
-  for (const one of kinds) groups[one.of].append(make("option", { value: one.kind, textContent: one.kind.replaceAll("_", " ") }));
+  for (const one of able) groups[one.of].append(make("option", { value: one.kind, textContent: one.kind.replaceAll("_", " ") }));
   const before = $("kind").value;
   $("kind").replaceChildren(...Object.values(groups));
-  if (before) $("kind").value = before;
-  else $("kind").value = "no_result";
+  for (const wanted of ["no_result", before]) if (able.some((one) => one.kind === wanted)) $("kind").value = wanted;
   showKind();
 }
 
@@ -758,6 +796,47 @@ function showFaults({ waiting, waiting_count: count, fired }) {
   $("fired").replaceChildren(...last, ...(last.length ? [] : [none("None has happened.")]));
 }
 
+// ---------------------------------------------------------------------- latency
+
+const MAX_POINTS = 100;
+
+// From a client's Trigger, or where there was none from the fall of Waiting for Trigger, to the result.
+const latency = {
+  begun: null,
+  points: [], // milliseconds
+
+  reset() {
+    this.begun = null;
+    this.points = [];
+    this.show();
+  },
+
+  take(entries) {
+    const before = this.points.length;
+    for (const one of entries) {
+      const fell = one.message === "StatusReport" && !one.fields.status.includes("WAITING_FOR_TRIGGER");
+      if (one.message === "Trigger" || (fell && this.begun === null)) this.begun = one.time;
+      else if (one.message === state.run_ends && this.begun !== null) {
+        this.points.push((one.time - this.begun) * MM);
+        this.begun = null;
+      }
+    }
+    this.points.splice(0, this.points.length - MAX_POINTS);
+    if (this.points.length !== before || before === MAX_POINTS) this.show();
+  },
+
+  show() {
+    const { points } = this;
+    $("latency-empty").hidden = points.length > 0;
+    const text = (value) => `${value.toFixed(value < 100 ? 1 : 0)} ms`;
+    const [low, high] = [Math.min(...points), Math.max(...points)];
+    setText("latency-last", points.length ? `last ${text(points.at(-1))}, ${text(low)} to ${text(high)} in ${points.length}` : "");
+    const step = 300 / (MAX_POINTS - 1);
+    const bars = points.map((value, index) => draw("rect", { x: index * step, width: step * 0.7, y: 70 - (66 * value) / high, height: (66 * value) / high }));
+    $("latency").replaceChildren(...bars);
+  },
+};
+
 // ---------------------------------------------------------------------- the log
 
 const log = {
@@ -810,7 +889,7 @@ const log = {
     const direction = $("log-direction").value;
     const text = $("log-filter").value.trim().toLowerCase();
     if (direction && entry.direction !== direction) return false;
-    if ($("log-marked").checked && !entry.error && !entry.fault) return false;
+    if ($("log-marked").checked && !isMarked(entry)) return false;
     return !text || searchable(entry).includes(text);
   },
 
@@ -830,6 +909,9 @@ const log = {
   },
 };
 
+// a client that searches for the dialect does nothing wrong
+const isMarked = (entry) => Boolean(entry.fault || (entry.error && !entry.search));
+
 const searchable = (entry) => [entry.message ?? "", entry.peer, entry.hex, entry.error ?? "", entry.fault ?? "", JSON.stringify(entry.fields), JSON.stringify(entry.values)].join(" ").toLowerCase();
 
 function short(value) {
@@ -844,6 +926,7 @@ function short(value) {
 }
 
 function says(entry) {
+  if (entry.search) return `a client searches: it tried dialect ${entry.search}; this camera speaks ${state.dialect}`;
   if (entry.error) return entry.error;
   const fields = Object.entries(entry.fields).map(([key, value]) => `${key} ${short(value)}`).join(", ");
   const values = entry.values === null ? "" : short(entry.values);
@@ -851,13 +934,13 @@ function says(entry) {
 }
 
 function makeRow(entry) {
-  const name = entry.message ?? (entry.message_id === null ? "bytes" : `id 0x${entry.message_id.toString(16).padStart(2, "0")}`);
+  const name = entry.search ? "search" : entry.message ?? entry.text ?? (entry.message_id === null ? "bytes" : `id 0x${entry.message_id.toString(16).padStart(2, "0")}`);
   const opener = make("button", { type: "button", className: "opener", "aria-expanded": "false", textContent: name });
   const what = make("td", { title: says(entry) });
   if (entry.fault) what.append(make("span", { className: "mark", textContent: `${entry.fault} ` }));
   what.append(says(entry));
   return make(
-    "tr", { className: `entry ${entry.direction}${entry.fault || entry.error ? " marked" : ""}`, "data-serial": entry.serial },
+    "tr", { className: `entry ${entry.direction}${isMarked(entry) ? " marked" : ""}`, "data-serial": entry.serial },
     make("td", { className: "time", textContent: seconds(entry.time, 3) }),
     make("td", { className: "who", textContent: entry.direction === "in" ? "client" : "camera", title: entry.peer }),
     make("td", {}, opener), what,

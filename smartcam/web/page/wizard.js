@@ -89,6 +89,58 @@ function answers() {
   return found;
 }
 
+// a line of what came out; a warning begins with its code
+function note(text) {
+  const [, code, rest] = /^([A-Z][A-Z_]+): (.*)$/s.exec(text) ?? [];
+  return code ? make("li", { class: "warning" }, make("b", {}, "Warning"), ` ${rest} `, make("code", {}, code)) : make("li", {}, text);
+}
+
+const MARKS = { good: "\u2713", poor: "\u2717", unknown: "?" };
+
+function showVerdict(verdict) {
+  $("verdict").hidden = !verdict;
+  $("verdict").className = verdict?.level ?? "";
+  $("verdict").textContent = verdict ? `${MARKS[verdict.level]} ${verdict.text}` : "";
+}
+
+const UNITS = { mm: "mm", px: "px", deg: "\u00b0" };
+const WORDS = { path: "saved in", good_for_mm: "good for", held_out_mm: "held-out error", left_out: "left out", seen: "points seen", expected_mm: "noise explains", needed: "touches that notice a knock", needed_at: "of the mark of touch" };
+const USES = { command: "On the command line", python: "In Python" };
+
+function shown(value, unit) {
+  if (Array.isArray(value)) return value.map((one) => shown(one, unit)).join(", ") || "none";
+  if (value === null) return "not known";
+  if (typeof value === "boolean") return value ? "yes" : "no";
+  const text = typeof value !== "number" || Number.isInteger(value) && !unit ? `${value}` : `${Number(value.toFixed(3))}`;
+  return unit ? `${text} ${unit}` : text;
+}
+
+// what a wizard ends with: figures with the unit that stands in their names, warnings, lines to copy
+function showResult({ remarks = [], use = {}, file, ...figures }) {
+  $("result").replaceChildren(...Object.entries({ ...(figures.path ? {} : file && { file }), ...figures }).flatMap(([name, value]) => {
+    const [, words, unit] = /^(.*?)(?:_(mm|px|deg))?$/.exec(name);
+    return [make("dt", {}, WORDS[name] ?? words.replaceAll("_", " ")), make("dd", {}, shown(value, UNITS[unit]))];
+  }));
+  $("remarks").replaceChildren(...remarks.map((one) => note(Array.isArray(one) ? one.join(": ") : one)));
+  $("use").replaceChildren(...Object.entries(use).map(([name, text]) => {
+    const copy = make("button", { type: "button" }, "Copy");
+    const lines = make("pre", { tabindex: 0 }, make("code", { id: `use-${name}` }, text));
+    copy.addEventListener("click", () => copyText(text, copy, lines));
+    return make("div", {}, make("h3", {}, USES[name] ?? name, copy), lines);
+  }));
+}
+
+// a page of another machine may not write to the clipboard: then the lines are marked, to be copied
+async function copyText(text, button, lines) {
+  try {
+    await navigator.clipboard.writeText(text);
+    button.textContent = "Copied";
+  } catch {
+    getSelection().selectAllChildren(lines);
+    button.textContent = "Marked: press Ctrl+C";
+  }
+}
+
 function show(next, given) {
   const moved = !view || view.token !== next.token;
   view = next;
@@ -101,10 +153,10 @@ function show(next, given) {
   $("title").textContent = asking ? view.title : view.type === "result" ? "Done" : "Aborted";
   $("description").textContent = asking ? view.description
     : view.type === "abort" ? "What was measured stands in the journal." : "";
-  $("notes").replaceChildren(...(view.notes ?? []).map((note) => make("li", {}, note)));
+  showVerdict(view.verdict);
+  $("notes").replaceChildren(...(view.notes ?? []).map(note));
   $("base").textContent = view.errors.base ?? "";
-  $("result").replaceChildren(...Object.entries(view.result ?? {}).flatMap(([name, value]) =>
-    [make("dt", {}, name), make("dd", {}, typeof value === "string" ? value : JSON.stringify(value))]));
+  showResult(view.result ?? {});
   if (asking) {
     const values = moved ? view.defaults : { ...view.defaults, ...given };
     $("inputs").replaceChildren(...Object.entries(view.schema.properties).map(([name, schema]) =>
@@ -112,6 +164,7 @@ function show(next, given) {
     $("go").textContent = view.button;
     for (const what of ["undo", "repeat", "abort"]) $(what).hidden = !view.can.includes(what);
   }
+  if (view.type === "progress") $("waiting").textContent = view.waiting;
   draw(view.preview);
   if (view.type === "progress") setTimeout(watch, 500, view.token);
   if (moved) ($("inputs").querySelector("input") ?? $("title")).focus();
@@ -122,6 +175,7 @@ async function act(path, body, given) {
   for (const button of buttons) button.disabled = true;
   $("base").textContent = "";
   $("number").textContent = `Step ${view.number}: under way ...`;
+  $("waiting").textContent = path === "/step" ? view.waiting ?? "" : "";
   try {
     show(await call("POST", path, body), given);
   } catch (error) {
@@ -129,6 +183,7 @@ async function act(path, body, given) {
     $("base").textContent = error.message;
     $("number").textContent = `Step ${view.number}`;
   } finally {
+    $("waiting").textContent = "";
     for (const button of buttons) button.disabled = false;
   }
 }
@@ -147,11 +202,27 @@ async function current() {
   return start(state);
 }
 
-function start(state) {
+const day = (at) => new Date(at).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+
+// a calibration: its name, which is clicked to do something with it, when, how good, what a check said
+function row(one) {
+  const name = make("button", { type: "button" }, one.name);
+  name.addEventListener("click", () => { $("name").value = one.name; $("name").focus(); });
+  if (one.problem !== null) return make("tr", {}, make("td", {}, name), make("td", { colspan: 4, class: "problem" }, `Cannot be read: ${one.problem}`));
+  const check = one.checked_at === null ? "none" : `${one.stale ? "\u2717 stale" : "\u2713 still true"}, ${day(one.checked_at)}`;
+  return make("tr", {}, make("td", {}, name), make("td", {}, one.kind), make("td", {}, day(one.written_at)),
+    make("td", {}, one.held_out_mm === null ? "not known" : `${one.held_out_mm.toFixed(2)} mm`),
+    make("td", { class: one.checked_at === null ? "" : `${one.stale ? "stale" : "true"}` }, check));
+}
+
+async function start(state) {
   view = null;
+  const { listing } = await call("GET", "/listing");
   $("step").hidden = $("picture").hidden = $("camera").hidden = true;
   $("start").hidden = false;
-  $("names").replaceChildren(...state.calibrations.map((name) => make("li", {}, name)));
+  $("names").hidden = listing.length === 0;
+  $("none").hidden = listing.length > 0;
+  $("names").tBodies[0].replaceChildren(...listing.map(row));
   $("wizards").hidden = state.wizards.length < 2;
   $("wizards").replaceChildren(make("legend", {}, "What to do"), ...state.wizards.map((name, index) => make("label", { class: "check" },
     make("input", { type: "radio", name: "wizard", value: name, checked: index === 0 }), WIZARDS[name] ?? name)));
@@ -212,26 +283,68 @@ function spread(rows) {
   return [Math.min(...errors), Math.max(...errors)];
 }
 
+// ---------------------------------------------------------------------- choices
+
+const fields = (name) => [...document.querySelectorAll("#form [name]")].filter((one) => one.name === name);
+
+// whether the form says what a choice stands for
+function isChosen({ answers }) {
+  return Object.entries(answers).every(([name, value]) => fields(name).some((one) =>
+    one.type === "checkbox" ? one.checked === value : one.value === `${value}` && (one.type !== "radio" || one.checked)));
+}
+
+// a click answers as the inputs do: a box is ticked or not, all else is set
+function choose({ answers }) {
+  for (const [name, value] of Object.entries(answers)) {
+    for (const one of fields(name)) {
+      if (one.type === "checkbox") one.checked = !one.checked;
+      else if (one.type === "radio") one.checked = one.value === `${value}`;
+      else one.value = value;
+    }
+  }
+  showChosen();
+}
+
+function choice(one, [x, y], r) {
+  const spot = shape("g", { class: "choice" });
+  const name = shape("title", {}, one.label);
+  spot.append(name, shape("circle", { cx: x, cy: y, r }));
+  spot.addEventListener("click", () => choose(one));
+  spot.choice = one;
+  return spot;
+}
+
+function showChosen() {
+  for (const spot of document.querySelectorAll(".choice")) spot.classList.toggle("chosen", isChosen(spot.choice));
+}
+
 // the camera's picture, as an image: whatever stands in it, nothing of it runs here
-function drawPicture(svg) {
+function drawPicture(svg, choices) {
   $("camera").hidden = !svg;
+  const [, box] = /viewBox="([-\d. ]+)"/.exec(svg ?? "") ?? [];
+  $("camera-choices").setAttribute("viewBox", box ?? "0 0 1 1");
+  $("camera-choices").replaceChildren(...(box ? choices : []).map((one) => choice(one, one.at, 16)));
+  $("camera-legend").textContent = box && choices.length ? "Click a point to choose it; the ring is the one that is suggested." : "";
   if (svg) $("camera-picture").src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(svg)}`;
   else $("camera-picture").removeAttribute("src");
+  showChosen();
 }
 
 function draw(preview) {
-  drawPicture(preview?.svg);
+  const choices = view?.type === "form" ? preview?.choices ?? [] : [];
+  drawPicture(preview?.svg, choices);
   const points = preview?.points ?? [];
   const next = preview?.next;
-  const empty = points.length === 0 && !next;
+  const marked = preview?.marks ?? [];
+  const empty = points.length === 0 && marked.length === 0;
   $("picture").hidden = empty;
   if (empty) return;
   const fitted = points.length > 0 && points.every((one) => one.at);
   const places = points.map((one) => (fitted ? one.at : one.camera));
   const origin = preview.camera_origin;
   const of = preview.of ?? "camera"; // what the points' own frame is: a sheet's, where one was looked at
-  const marks = fitted ? [] : preview.marks ?? [];
-  const box = fitted ? preview.view : around(next ? [...places, ...marks, next] : places);
+  const marks = fitted ? [] : marked;
+  const box = fitted ? preview.view : around(next ? [...places, ...marks, next] : [...places, ...marks]);
   const [[left, bottom], [right, top]] = box;
   const size = Math.max(right - left, top - bottom) / 1.5;
   const margin = 0.25 * size;
@@ -293,14 +406,22 @@ function draw(preview) {
     parts.push(shape("circle", { class: "next", cx: next[0], cy: -next[1], r: 2.5 * dot, "stroke-width": dot / 2 }));
     label(next[0], next[1], "next");
   }
+  for (const one of choices) {
+    if (points.length === 0) label(one.at[0] + 2 * dot, one.at[1] + 2 * dot, one.label);
+    parts.push(choice(one, [one.at[0], -one.at[1]], 3 * dot));
+  }
   plot.replaceChildren(...parts);
+  showChosen();
   $("legend").textContent = fitted
     ? `Dots: touched, the worst in red. Rings: where the ${of} says. Lines: residuals, dashes: predicted error of the mapped point (95 %), both ${factor} times as large.${points.some((one) => one.left_out) ? " Crosses: left out." : ""} The robot's axes stand in the corner, the ${of}'s at its origin.${heat ? ` Colour, the stronger the larger: predicted error, ${spread(heat).map((error) => error.toFixed(3)).join(" to ")} mm rms.` : ""}`
+    : choices.length && !points.length ? "Marks in the camera's frame: click those that are meant; filled ones are."
     : "Marks in the camera's frame: rings are seen, dots are touched, the red ring is next.";
+  if (fitted && choices.length) $("legend").textContent += " Click a point to choose it.";
 }
 
 // ---------------------------------------------------------------------- page
 
+$("form").addEventListener("input", showChosen);
 $("form").addEventListener("submit", (event) => {
   event.preventDefault();
   const given = answers();

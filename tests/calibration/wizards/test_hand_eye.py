@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from smartcam.calibration._files.directory import Folder
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
 from smartcam.calibration._lens.model import CameraModel
@@ -15,12 +16,14 @@ from smartcam.calibration.formats._robots import ROBOTS, pose_to
 from smartcam.calibration.simulation._images import render
 from smartcam.calibration.wizards._hand_eye import SUGGESTIONS, hand_eye_wizard
 from smartcam.calibration.wizards._journal import Journal
+from smartcam.calibration.wizards._listing import listing
 from smartcam.calibration.wizards._sequence import WizardSession
 from tests.calibration.scenes import SHEET, scene
 from tests.calibration.wizards.bench import say
+from tests.processes import printed_by
 
 CAMERA = CameraModel(size=(480, 360), matrix=np.array([[450.0, 0, 240], [0, 447, 176], [0, 0, 1]]))
-TRUTH = scene("eye-in-hand", poses=6, seed=7)
+TRUTH = scene("eye-in-hand", poses=8, seed=7)
 
 
 @functools.cache
@@ -65,22 +68,32 @@ def begin(folder: Path, cell: Cell, journal: Path | None = None) -> WizardSessio
 async def test_views_taken_give_a_calibration_in_a_file(tmp_path: Path) -> None:
     session = begin(tmp_path, Cell())
     view = await say(session, {"setup": "eye-in-hand"})
-    for number in range(6):
+    for number in range(8):
         assert view["step"] == f"view-{number + 1}"
         assert SUGGESTIONS[number] in view["description"]
+        assert view["notes"][0].startswith(f"{number} of 10 views, 40 at most; ")
+        end = "to end, choose to calculate" if number > 2 else "to end before, abort"
+        assert view["notes"][0].endswith(end)
         view = await say(session)
     view = await say(session, {"next": "calculate"})
     assert view["step"] == "calculate"
     view = await say(session)
     assert (view["step"], view["defaults"]["next"]) == ("review", "accept")
+    assert (view["verdict"]["level"], view["verdict"]["text"][:9]) == ("good", "Good for ")
     assert any("mm rms on the sheet, at views that were left out" in one for one in view["notes"])
     view = await say(session)
     assert view["step"] == "save"
     view = await say(session)
     assert view["type"] == "result", view
+    assert view["preview"]["svg"].startswith("<svg ")
+    assert view["result"]["good_for_mm"] >= 2 * view["result"]["held_out_mm"]
     found = HandEyeCalibration.load(tmp_path / "gripper.json")
     assert TRUTH.errors(found.camera_pose)[1] < 2e-4
-    assert len(found.views) == 6
+    assert len(found.views) == 8
+    (row,) = listing(Folder(tmp_path))
+    assert (row["kind"], row["held_out_mm"]) == ("hand-eye", view["result"]["held_out_mm"])
+    printed = printed_by(view["result"]["use"]["python"])
+    assert printed.startswith("Transform(")
 
 
 async def test_view_without_a_sheet_is_taken_again(tmp_path: Path) -> None:
@@ -155,8 +168,11 @@ async def test_poses_typed_as_the_robot_writes_them_are_the_same(tmp_path: Path)
     view = await session.submit(session.token, {"next": "view", "x": 1.0})
     assert view["errors"]["a"] == "no answer"
     await say(session, {"next": "calculate"})
-    for _ in range(3):
-        await say(session)
+    view = await say(session)
+    assert view["verdict"]["text"] == "Not known how good: take more views"
+    assert view["defaults"]["next"] == "more"
+    await say(session, {"next": "accept"})
+    await say(session)
     found = HandEyeCalibration.load(tmp_path / "gripper.json")
     assert TRUTH.errors(found.camera_pose)[1] < 2e-4
     assert found.robot_poses[0].source == "flange"

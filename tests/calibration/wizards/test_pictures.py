@@ -100,8 +100,26 @@ async def test_folder_waits_for_a_file_that_grows(
 
 async def test_folder_where_none_comes_says_so_in_time(tmp_path: Path) -> None:
     (tmp_path / "old.png").write_bytes(encoded())
-    with refused("NO_PICTURE", "within 0.3 s; expected a file that ends in one of .bmp, .jpeg"):
+    wanted = "expected a file that ends in one of .bmp, .jpeg"
+    with refused("NO_PICTURE", f"within 0.3 s (there before: 1); {wanted}"):
         await PictureFolder(tmp_path, deadline=0.3).take()
+
+
+async def test_folder_where_other_files_come_names_them(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_bytes(b"here before")
+    folder = PictureFolder(tmp_path, deadline=0.5)
+    waiting = asyncio.create_task(folder.take())
+    await asyncio.sleep(0.1)
+    for name in ("a.raw", "b.raw", "c.raw", "d.raw"):
+        (tmp_path / name).write_bytes(b"no picture")
+    with refused("NO_PICTURE", "(came, but no picture: a.raw, b.raw, c.raw and 1 more); expected"):
+        await waiting
+
+
+def test_folder_says_which_file_it_waits_for(tmp_path: Path) -> None:
+    told = PictureFolder(tmp_path, deadline=5.0).awaited
+    assert f"the next file that comes into {tmp_path} counts, one that ends in .bmp" in told
+    assert told.endswith("It is waited for 5 s")
 
 
 async def test_folder_with_a_picture_that_is_none_names_the_file(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from smartcam.calibration.wizards._marks import MAX_MARKS
 from smartcam.calibration.wizards._plane import plane_wizard
 from smartcam.calibration.wizards._sequence import WizardSession
 from tests.calibration.wizards.bench import GRID, OFFSET, Bench, say, where
+from tests.processes import printed_by
 
 
 def begin(
@@ -44,7 +46,7 @@ async def touch_all(session: WizardSession, bench: Bench) -> dict[str, Any]:
         view = await say(session)
     for x, y in bench.marks:
         assert view["step"].startswith("touch-")
-        assert f"x {x:.6g}, y {y:.6g}" in view["description"]
+        assert f"x {1e3 * x:.1f} mm, y {1e3 * y:.1f} mm" in view["description"]
         view = await say(session, bench.touch_mm(x, y))
     return view
 
@@ -87,8 +89,12 @@ async def test_marks_with_a_robot_that_is_read_need_no_typing(tmp_path: Path) ->
         assert (view["type"], view["button"]) == ("confirm", "It is there")
         bench.touch(*mark)
         view = await say(session)
-    assert view["step"] == "review"
-    await say(session)
+    assert (view["step"], view["verdict"]) == (
+        "review",
+        {"level": "unknown", "text": "Not known how good: touch more points"},
+    )
+    assert view["defaults"]["next"] == "more"
+    await say(session, {"next": "accept"})
     await say(session)
     calibration = PlaneCalibration.load(tmp_path / "table.json")
     assert np.allclose(calibration.origin, OFFSET, atol=1e-12)
@@ -117,9 +123,10 @@ async def test_wrong_touch_is_named_the_worst_and_touched_again(tmp_path: Path) 
     for number, mark in enumerate(GRID, 1):
         answer = bench.touch_mm(*mark)
         view = await say(session, {**answer, "y": answer["y"] + (5.0 if number == 4 else 0.0)})
-    assert view["defaults"]["point"] == 4
+    assert view["defaults"] == {"next": "redo", "point": 4}
+    assert view["verdict"] == {"level": "poor", "text": "Not good enough: touch point 4 again"}
     assert view["preview"]["worst"] == 3
-    view = await say(session, {"next": "redo"})
+    view = await say(session)
     assert view["title"] == "Touch point 4 again"
     view = await say(session, bench.touch_mm(*GRID[3]))
     await say(session, {"next": "accept"})
@@ -223,8 +230,8 @@ async def test_wizard_keeps_y_down_with_the_calibration(
             view = await say(session, bench.touch_mm(*mark))
     else:
         view = await touch_all(session, bench)
-    assert view["step"] == "review"
-    await say(session)
+    assert (view["step"], view["verdict"]["level"]) == ("review", "unknown")
+    await say(session, {} if method == "rays" else {"next": "accept"})
     await say(session)
     assert PlaneCalibration.load(tmp_path / "table.json").y_down is y_down
 
@@ -398,3 +405,63 @@ async def test_wizard_resumed_after_each_step_gives_the_same_calibration(tmp_pat
     assert session.result["points"] == 9
     assert bench.pictures == 1
     session.close()
+
+
+async def test_wrong_touch_that_looks_like_another_scale_is_blamed(tmp_path: Path) -> None:
+    bench = Bench(marks=[GRID[n] for n in (0, 2, 3, 5, 6, 8)])
+    session = begin(tmp_path, bench)
+    await say(session, {"touch_sigma": 0.2})
+    await say(session)
+    view = await say(session)
+    for number, mark in enumerate(bench.marks, 1):
+        answer = bench.touch_mm(*mark)
+        view = await say(session, {**answer, "x": answer["x"] + 20.0 * (number == 2)})
+    assert view["notes"][0].startswith("SCALE_MISMATCH: ")
+    assert view["verdict"]["text"] == "Not good enough: touch point 2 again"
+    assert view["defaults"] == {"next": "redo", "point": 2}
+    session.close()
+
+
+async def test_marks_can_be_chosen_where_the_picture_shows_them(tmp_path: Path) -> None:
+    session = begin(tmp_path, Bench(marks=GRID[:3]))
+    await say(session)
+    view = await say(session)
+    titles = [one["title"] for one in view["schema"]["properties"].values()]
+    assert titles[1] == "2: mark at x 150.0 mm, y 40.0 mm"
+    assert view["preview"]["choices"] == [
+        {"at": list(mark), "label": str(number), "answers": {f"mark_{number}": True}}
+        for number, mark in enumerate(GRID[:3], 1)
+    ]
+    session.close()
+
+
+async def test_origin_mark_of_a_camera_in_pixels_is_shown_in_pixels(tmp_path: Path) -> None:
+    session = begin(tmp_path, Bench(marks=[(320.25, 240.0), (10.0, 7.0)]), method="rays")
+    await say(session, {"camera_unit": "px"})
+    await say(session, {"pixel": 0.5})
+    view = await say(session)
+    (marks,) = [one["oneOf"] for one in view["schema"]["properties"].values()]
+    assert marks[0]["title"] == "mark at x 320.2 px, y 240.0 px"
+    assert [one["answers"] for one in view["preview"]["choices"]] == [{"mark": "1"}, {"mark": "2"}]
+    session.close()
+
+
+async def test_end_has_the_file_the_verdict_the_picture_and_lines_that_work(
+    tmp_path: Path,
+) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    await say(session, {"touch_sigma": 0.2})
+    review = await touch_all(session, bench)
+    await say(session)
+    view = await say(session)
+    result = view["result"]
+    assert result["path"] == str(tmp_path / "table.json")
+    assert view["verdict"] == review["verdict"]
+    assert view["verdict"]["text"].startswith(f"Good for {result['good_for_mm']:g} mm")
+    assert view["preview"] == review["preview"]
+    program, *_, last = shlex.split(result["use"]["command"])
+    assert (program, last) == ("smartcam", str(tmp_path))
+    printed = printed_by(result["use"]["python"])
+    told = [float(one) for one in printed.strip("[]\n").split()]
+    assert told == pytest.approx(where(*GRID[0]), abs=0.001)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -68,6 +69,12 @@ async def test_picture_is_shown_with_the_point_to_touch(tmp_path: Path) -> None:
     assert view["notes"][0] == "54 of 54 points of the target seen"
     assert "told from the others by" in view["notes"][1]
     assert "point 9 of row 6, which has a ring" in view["description"]
+    choices = view["preview"]["choices"]
+    assert [one["answers"] for one in choices[8:10]] == [
+        {"column": 9, "row": 1}, {"column": 1, "row": 2},
+    ]  # fmt: skip
+    circles = re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)" r="5"', svg)
+    assert np.allclose([one["at"] for one in choices], np.array(circles, dtype=float), atol=0.06)
     session.close()
 
 

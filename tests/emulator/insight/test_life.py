@@ -12,7 +12,10 @@ import pytest
 from smartcam.emulator._clock import ManualClock
 from smartcam.emulator._insight.camera import EmulatedInSight
 from smartcam.emulator._insight.commands import InSightQuirks
-from smartcam.emulator._insight.connection import MAX_SESSIONS, MAX_WAITING
+from smartcam.emulator._insight.connection import MAX_SESSIONS
+from smartcam.emulator._line_camera import MAX_WAITING
+from smartcam.emulator._line_codec import MAX_LOGGED
+from smartcam.emulator._links import _TcpLink
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 from tests.emulator.insight import insight_wire as wire
 from tests.emulator.insight.insight_wire import TelnetClient
@@ -58,7 +61,7 @@ async def test_stop_ends_connections_and_what_is_under_way_is_not_answered() -> 
 async def test_port_that_is_taken_is_a_configuration_error() -> None:
     async with EmulatedInSight() as first:
         second = EmulatedInSight(port=first.port)
-        with pytest.raises(ConfigurationError, match="emulator: cannot listen on 127"):
+        with pytest.raises(ConfigurationError, match="emulator: cannot listen on tcp 127"):
             await second.start()
 
 
@@ -209,10 +212,11 @@ async def test_commands_behind_one_under_way_wait_in_a_bounded_buffer() -> None:
         EmulatedInSight([JOB], online=True, clock=clock) as emulator,
         await TelnetClient.log_in(emulator) as client,
     ):
-        (connection,) = emulator._connections
+        (link,) = emulator._clients
+        assert isinstance(link, _TcpLink)
         client.send(b"SW8\r\n" + 500 * line)
-        await wire.until(lambda: not connection._transport.is_reading())
-        assert MAX_WAITING < len(connection._reader) < MAX_WAITING + 2**18 + 1
+        await wire.until(lambda: not link._transport.is_reading())
+        assert MAX_WAITING < link.machine.buffered < MAX_WAITING + 2**18 + 1
         clock.advance(0.2)
         await client.expect(wire.DONE + 500 * wire.INVALID)
 
@@ -232,8 +236,8 @@ async def test_log_is_bounded_and_cuts_what_is_long() -> None:
         client.send(b"RI\r\n")
         await client.expect(b"1\r\n8300\r\n424D")
         assert emulator.log.maxlen == 10_000
-        assert len(emulator.log[-1].text) == 200
-        assert emulator.log[-3]._replace(time=0, peer="") == (0, "in", "", "RI")
+        assert len(emulator.log[-1].text) == MAX_LOGGED
+        assert (emulator.log[-3].direction, emulator.log[-3].text) == ("in", "RI")
 
 
 # ---------------------------------------------------------------------- switches

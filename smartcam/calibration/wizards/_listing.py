@@ -1,0 +1,76 @@
+"""The list of a folder's calibrations: of when each is, how good, and what its last check said."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.calibration._files.load import KINDS
+from smartcam.calibration._files.store import read_document
+from smartcam.calibration._hand_eye.result import HandEyeCalibration
+from smartcam.calibration._sheet.calibration import SheetCalibration
+from smartcam.calibration.wizards._journal import MAX_LINE
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from smartcam.calibration._files.directory import Folder
+
+MOST: Final = 200
+"""Calibrations that are looked into; of more only the first ones, by name."""
+
+
+def listing(folder: Folder) -> list[dict[str, Any]]:
+    """Return a row for each calibration of a folder, by name, JSON-able.
+
+    ``name, kind, written_at`` (UTC, ISO 8601)``, held_out_mm`` (rms; None: not known)``,
+    checked_at`` and ``stale`` of the last check (None: there was none)``, problem`` (None: none).
+    A file that cannot be read has a ``problem`` and nothing else.
+    """
+    return [_row(folder, name) for name in folder.names()[:MOST]]
+
+
+def _row(folder: Folder, name: str) -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(
+        ("name", "kind", "written_at", "held_out_mm", "checked_at", "stale", "problem")
+    )
+    row["name"] = name
+    try:
+        document = read_document(folder.find(name))
+        row |= {"kind": document.kind, "written_at": document.written_at}
+        row["held_out_mm"] = _held_out(document.kind, document.data)
+        check = _last_check(folder.checks(name))
+        if check.get("calibration") == document.written_at:  # one before says nothing of this one
+            row |= {"checked_at": check.get("at"), "stale": check.get("stale")}
+    except (CalibrationError, OSError) as exc:
+        row["problem"] = str(exc)
+    return row
+
+
+def _held_out(kind: str, data: dict[str, Any]) -> float | None:
+    """Return the held-out error of a calibration, mm."""
+    if kind == HandEyeCalibration.kind:
+        found = HandEyeCalibration.from_data(data).held_out_error
+    elif kind in KINDS:
+        read = KINDS[kind].from_data(data)
+        plane = read.plane if isinstance(read, SheetCalibration) else read
+        found = plane.held_out_error
+    else:
+        return None
+    return None if found is None else 1e3 * found
+
+
+def _last_check(path: Path) -> dict[str, Any]:
+    """Return the last whole line of a file of checks, whoever writes it just now."""
+    try:
+        with path.open("rb") as stream:
+            stream.seek(max(0, stream.seek(0, 2) - 2 * MAX_LINE))
+            *whole, _ = stream.read(2 * MAX_LINE).split(b"\n")
+    except FileNotFoundError:
+        return {}
+    try:
+        found = json.loads(whole[-1])
+    except (IndexError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,66 @@
+"""Lines that use a calibration, to copy: for the command line, and for Python."""
+
+from __future__ import annotations
+
+import shlex
+from typing import TYPE_CHECKING, Any
+
+from smartcam.calibration._hand_eye.result import KIND as HAND_EYE
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+_TRIGGERED = """\
+import smartcam.sync
+from smartcam.calibration import load_calibration
+
+calibration = load_calibration({path!r})
+with smartcam.sync.connect(
+    {arguments},
+    calibration=calibration,
+) as camera:
+    for part in camera.trigger().value:
+        print(part.feature_id, part.pose.position)  # of the robot, metres
+"""
+
+_TRANSFORMED = """\
+from smartcam.calibration import load_calibration
+
+calibration = load_calibration({path!r})
+print(calibration.transform([{point!r}]))  # metres
+"""
+
+_LOADED = """\
+from smartcam.calibration import HandEyeCalibration
+
+calibration = HandEyeCalibration.load({path!r})
+print(calibration.camera_pose)  # of the camera, metres
+"""
+
+
+def usage(
+    kind: str,
+    path: Path,
+    connect: Mapping[str, Any] | None = None,
+    point: Sequence[float] = (),
+) -> dict[str, str]:
+    """Return lines that use a calibration: ``command``, of a shell, and ``python``.
+
+    ``path``: of its file. ``connect``: what :func:`smartcam.connect` takes for the camera, ``url``
+    among it; None: there is no camera to be asked. ``point`` (2,): one that the camera saw.
+    """
+    text = str(path)
+    if kind == HAND_EYE or connect is None:
+        listing = ["smartcam", "calibrate", "--list", "--folder", str(path.parent)]
+        form = _LOADED if kind == HAND_EYE else _TRANSFORMED
+        python = form.format(path=text, point=[round(value, 4) for value in point])
+        return {"command": shlex.join(listing), "python": python}
+    given = {name: value for name, value in connect.items() if value not in (None, "", False)}
+    url = str(given.pop("url"))
+    words = ["smartcam", "trigger", url, "--calibration", text]
+    for name, value in given.items():
+        words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
+    arguments = [repr(url), *(f"{name}={value!r}" for name, value in given.items())]
+    python = _TRIGGERED.format(path=text, arguments=",\n    ".join(arguments))
+    return {"command": shlex.join(words), "python": python}

@@ -1,0 +1,389 @@
+"""Emulated cameras that speak in lines of text: the base for those of a plug-in, and In-Sight's."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import logging
+import re
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from smartcam.emulator._clock import nanoseconds
+from smartcam.emulator._line_codec import HeardLine, LineCodec, LineServer, SaidLine
+from smartcam.emulator._makes import check_options
+from smartcam.emulator._scenario.states import DeviceState
+from smartcam.emulator._scenario.timeline import Cue
+from smartcam.emulator._wire_camera import WireCamera
+from smartcam.emulator.faults._matching import misfit
+from smartcam.exceptions import ConfigurationError
+from smartcam.protocols._lines import LineDialect
+from smartcam.settings import validated
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from typing import Self
+
+    from smartcam.emulator._client_link import ClientLink, Trace
+    from smartcam.emulator._clock import Clock
+    from smartcam.emulator._scenario.scenario import Mistake, Scenario
+    from smartcam.emulator.faults._base import BaseFault
+    from smartcam.protocols import messages as m
+    from smartcam.protocols._base import Protocol, Transport
+
+_log = logging.getLogger("smartcam.emulator")
+
+MAX_WAITING = 1 << 16
+"""Bytes of lines that wait behind one under way; more are left to the network."""
+
+MAX_AGENDA = 10_000
+"""What may be put off to a later time at once."""
+
+
+_FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", "cameras"})
+"""Fields of a scenario that say something of such a camera."""
+
+_STATE = frozenset({"active", "running"})
+"""And those of cameras that know programs."""
+
+
+class LineClient:
+    """A client of an emulated camera that speaks in lines.
+
+    Attributes:
+        peer: its address and port.
+        heard: it has said a line.
+    """
+
+    def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
+        self.peer: str = link.peer
+        self.heard: bool = False
+        self._camera = camera
+        self._link = link
+        self._server = server
+        self._row = 0  # of the line under way
+
+    def say(self, text: str) -> None:
+        """Say a line that answers nothing."""
+        self.say_bytes(self._camera.lines.data(text), row=0)
+
+    def answer(self, text: str | None) -> None:
+        """Answer the line under way, None with silence; the next one is heard then."""
+        if text is not None:
+            self.say_bytes(self._camera.lines.data(text))
+        self.go_on()
+
+    def say_bytes(self, data: bytes, *, row: int | None = None) -> None:
+        """Say bytes as they are: a part of an answer, or a prompt."""
+        if not self._link.closed:
+            message = SaidLine(row=self._row if row is None else row, data=data)
+            self._camera.say(self._link, message)
+
+    def go_on(self) -> None:
+        """The line under way is done: hear the next."""
+        self._server.busy = False
+        if not self._server.going and not self._link.closed:
+            with self._camera.step():
+                self._link.feed(b"")
+
+    def hide_next(self) -> None:
+        """Keep the next line out of the log: it is a password."""
+        self._server.secret = True
+
+    def close(self, reason: str) -> None:
+        """End the connection at once."""
+        self._link.close(reason)
+
+    def end(self, reason: str) -> None:
+        """End the connection in order, behind what was said; nothing more is heard."""
+        self._link.flush()
+        self._link.part("close", reason)
+
+    def begin(self, message: HeardLine) -> None:
+        """A line is under way."""
+        self.heard = True
+        self._row, self._server.busy = message.row, True
+
+
+class LineCamera(WireCamera):
+    """An emulated camera that hears lines, from several clients, and answers each with a line.
+
+    Subclass it for a camera of your own, and name the class in ``Protocol(emulator=...)``::
+
+        class AcmeCamera(LineCamera):
+            protocol = ACME
+
+            def answer(self, line: str) -> str | None:
+                return {"HELLO": "ACME", "STATE": "run"}.get(line, "what?")
+
+    A subclass with options of its own takes ``**options`` beside them and hands these on. A client
+    has one line under way; the next ones wait. Everything is called in the event loop's thread.
+
+    Args:
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        name: for logs.
+        clock: its time; a :class:`ManualClock` in tests. Default: real time.
+        seed: of what a timeline leaves to chance.
+        faults: exact misbehaviour, in order: faults of :mod:`smartcam.emulator.faults`, or mappings
+            of their fields with ``kind``. ``on`` names a request of the dialect's rows, or what
+            answers one.
+        timeline: what happens by itself, and when: cues, or mappings of their fields.
+
+    Attributes:
+        protocol: what it speaks; its first dialect is the one.
+        device: what an operator can do, where a subclass puts anything there: ``start()``,
+            ``stop()``, ``trigger()``, ``reboot(seconds)``,
+            ``switch_application(id, running=False)``. Faults, scenarios and the page find what
+            there is.
+        fault_kinds: the faults that it can do.
+        lines: how lines are read and written.
+
+    Raises:
+        ConfigurationError: something given is wrong.
+    """
+
+    protocol: Protocol
+    device: Any = None
+    takes: ClassVar[frozenset[str]] = frozenset({"scenario", "seed", "web", "replay"})
+    states: ClassVar[frozenset[DeviceState]] = frozenset(
+        {DeviceState.CONNECTED, DeviceState.DISCONNECTED}
+    )
+
+    def __init__(
+        self,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        name: str | None = None,
+        clock: Clock | None = None,
+        seed: int = 0,
+        faults: Iterable[BaseFault | Mapping[str, Any]] = (),
+        timeline: Iterable[Cue | Mapping[str, Any]] = (),
+    ) -> None:
+        self._clients: dict[ClientLink, LineClient] = {}  # the oldest stands first
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._numbers = itertools.count()
+        self._spoken_to: dict[ClientLink, None] = {}  # links that have something to write
+        cues = [validated(Cue, one, f"cue {at}") for at, one in enumerate(timeline, start=1)]
+        self.lines: LineCodec = self.make_codec()
+        super().__init__(
+            spoken=self.lines,
+            device=self.device,
+            host=host,
+            port=port,
+            transport="tcp",
+            dialect=next(iter(self.protocol.dialects)),
+            name=name or self.protocol.name,
+            clock=clock,
+            seed=seed,
+            timeline=cues,
+            applications=self.application_ids,
+        )
+        wrong = self.mistake_in(cues)
+        if wrong is not None:
+            place, text = wrong
+            raise ConfigurationError(f"{self.name}: {'.'.join(map(str, place))}: {text}")
+        self.queue.add(faults)
+
+    @classmethod
+    def from_scenario(
+        cls,
+        plan: Scenario,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+        seed: int | None = None,
+    ) -> Self:
+        """Return a camera of a scenario; what is given beside it goes before it.
+
+        Raises:
+            ConfigurationError: something given is wrong, or nothing that such a camera takes.
+        """
+        options = dict(plan.options)
+        if plan.active is not None or plan.running:
+            options = {**cls.state_options(plan.active, running=plan.running), **options}
+        if quirks:
+            options["quirks"] = {**options.get("quirks", {}), **quirks}
+        given = {"transport": transport, "dialect": dialect}
+        options |= {
+            name: value for name, value in given.items() if value not in {None, getattr(plan, name)}
+        }
+        check_options(cls, options)
+        return cls(
+            host=host,
+            port=plan.port if port is None else port,
+            name=plan.name,
+            clock=clock,
+            seed=plan.seed if seed is None else seed,
+            timeline=plan.timeline,
+            **options,
+        )
+
+    @classmethod
+    def mistake(cls, plan: Scenario) -> Mistake | None:
+        """Return the place in a scenario of what such a camera cannot do, and why; or None."""
+        fields = _FIELDS | (_STATE if cls.state_options(None, running=True) else frozenset())
+        for name in sorted(plan.changed() - fields):
+            if name != "dialect" or plan.dialect not in cls.protocol.dialects:
+                takes = ", ".join(sorted(fields))
+                return (name,), f"a camera of {cls.protocol.name} takes none; it takes {takes}"
+        try:
+            camera = cls.from_scenario(plan.model_copy(update={"timeline": ()}))
+        except ConfigurationError as exc:
+            return ("options",), str(exc)
+        return camera.mistake_in(plan.timeline)
+
+    def mistake_in(self, cues: Sequence[Cue]) -> Mistake | None:
+        """Return the place in a timeline of what it cannot do, and why; or None."""
+        for number, cue in enumerate(cues):
+            if cue.entering is not None and cue.entering not in self.states:
+                able = ", ".join(sorted(state.value for state in self.states))
+                return ("timeline", number, "entering"), f"it tells only of {able}"
+            for place, fault in enumerate(cue.do):
+                wrong = misfit(fault, self.codec, self.application_ids, self.fault_kinds)
+                if wrong is not None:
+                    return ("timeline", number, "do", place, wrong[0]), wrong[1]
+        return None
+
+    def make_codec(self) -> LineCodec:
+        """Return the lines it speaks: those of its protocol's first dialect.
+
+        Raises:
+            ConfigurationError: that is none of lines.
+        """
+        dialect = next(iter(self.protocol.dialects.values()))
+        if not isinstance(dialect, LineDialect):
+            raise ConfigurationError(
+                f"{type(self).__name__}: dialect {dialect.name} is no LineDialect"
+            )
+        return LineCodec(
+            dialect.name,
+            dialect.rows,
+            line_end=dialect.line_end,
+            ends=re.compile(re.escape(dialect.line_end)),
+            max_line=dialect.max_line,
+            encoding=dialect.encoding,
+        )
+
+    # ------------------------------------------------------------------ for subclasses
+
+    def answer(self, line: str) -> str | None:
+        """Return the answer to a line, None for silence; override this or :meth:`hear`."""
+        raise NotImplementedError(f"{type(self).__name__} says no answer()")
+
+    def hear(self, client: LineClient, line: str) -> None:
+        """Do what a line says, and call ``client.answer()`` once, now or later."""
+        client.answer(self.answer(line))
+
+    def greet(self, client: LineClient) -> None:
+        """Say something to a client that has just come; nothing unless overridden."""
+
+    def after(self, seconds: float, action: Callable[[], None]) -> None:
+        """Do something later, by the camera's clock.
+
+        Raises:
+            ConfigurationError: 10,000 things wait already.
+        """
+        if len(self._agenda) >= MAX_AGENDA:
+            raise ConfigurationError(f"{self.name}: {MAX_AGENDA} things wait for their time")
+        when = nanoseconds(self.clock.now) + nanoseconds(seconds)
+        with self.step():
+            heapq.heappush(self._agenda, (when, next(self._numbers), action))
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def url(self) -> str:
+        """Its address."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{next(iter(self.protocol.schemes))}://{host}:{self.port}"
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.url}>"
+
+    @property
+    def application_ids(self) -> list[int]:
+        """Ids of the programs on it; a subclass that has any says so."""
+        return []
+
+    @property
+    def sessions(self) -> list[str]:
+        """Address and port of the clients that it serves, the oldest first."""
+        return [client.peer for link, client in self._clients.items() if self.serves(link)]
+
+    # ------------------------------------------------------------------ links
+
+    def make_machine(self, transport: Transport, trace: Trace) -> LineServer:
+        """Return the machine of a new link."""
+        return LineServer(self.lines, transport, trace)
+
+    def arrived(self, link: ClientLink) -> None:
+        """A connection was made."""
+        assert isinstance(link.machine, LineServer)  # noqa: S101 - it is what make_machine made
+        client = self._clients[link] = self.make_client(link, link.machine)
+        with self.step():
+            self.greet(client)
+            self._timeline.entered(DeviceState.CONNECTED)
+
+    def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
+        """Return a new client."""
+        return LineClient(self, link, server)
+
+    def received(self, link: ClientLink, message: m.Message) -> None:
+        """A link received a line."""
+        client = self._clients.get(link)
+        if client is None or not isinstance(message, HeardLine):
+            return
+        faults = self._provoke(self.queue.device_heard, message)
+        client.begin(message)
+        self.hear(client, self.lines.text(message.data))
+        self._act(faults, "after")
+
+    def serves(self, link: ClientLink) -> bool:
+        """Whether the client on it has said anything."""
+        client = self._clients.get(link)
+        return client is not None and client.heard
+
+    def lost(self, link: ClientLink) -> None:
+        """A link is gone; harmless when said twice."""
+        self._spoken_to.pop(link, None)
+        if self._clients.pop(link, None) is not None:
+            self._timeline.entered(DeviceState.DISCONNECTED)
+
+    def say(self, link: ClientLink, message: SaidLine) -> None:
+        """Say something to a link; written at the end of the step."""
+        with self.step():
+            faults = self._provoke(self.queue.device_said, message)
+            link.say(message)
+            self._spoken_to[link] = None
+            self._act(faults, "after")
+
+    # ------------------------------------------------------------------ steps
+
+    def _move(self) -> None:
+        now = nanoseconds(self.clock.now)
+        while self._agenda and self._agenda[0][0] <= now:
+            heapq.heappop(self._agenda)[2]()
+
+    def _collect(self) -> None:
+        pass  # what is said goes to its link at once
+
+    def _settle(self) -> None:
+        for link in list(self._spoken_to):
+            if not link.closed:
+                link.flush()
+        self._spoken_to.clear()
+        for link in self._clients:
+            link.hold(link.machine.buffered > MAX_WAITING)
+        self._timer.set(self._due())
+
+    def _due(self) -> int | None:
+        """Return when something happens by itself, nanoseconds of the clock; None for never."""
+        return self._agenda[0][0] if self._agenda else None
+
+    def _ends(self) -> None:
+        self._agenda.clear()

@@ -1,0 +1,83 @@
+"""Emulated cameras by the protocol that they speak; a plug-in's protocol brings its own."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from typing import TYPE_CHECKING
+
+from smartcam._suggestions import did_you_mean
+from smartcam.emulator._wire_camera import WireCamera
+from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
+from smartcam.protocols._base import load_protocol
+from smartcam.registry import PROTOCOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+def emulated_class(protocol: str) -> type[WireCamera]:
+    """Return the class of a protocol's emulated cameras.
+
+    Raises:
+        PluginError: the protocol is unknown or broken, or its class is.
+        UnsupportedError: it brings none.
+    """
+    target = load_protocol(protocol).emulator
+    if not target:
+        raise UnsupportedError(
+            f"protocol {protocol!r} brings no emulated camera; those that do: "
+            f"{', '.join(_with_emulator())}"
+        )
+    module, _, attribute = target.partition(":")
+    try:
+        found: object = getattr(importlib.import_module(module), attribute)
+    except Exception as exc:
+        raise PluginError(
+            f"protocol {protocol!r}: its emulated camera {target!r} failed to load: {exc!r}",
+            name=protocol,
+        ) from exc
+    if not (isinstance(found, type) and issubclass(found, WireCamera)):
+        raise PluginError(
+            f"protocol {protocol!r}: {target!r} is {found!r}, no class of emulated cameras",
+            name=protocol,
+        )
+    return found
+
+
+def _with_emulator() -> list[str]:
+    """Return the protocols that have one; a broken one costs only its own name."""
+    names: list[str] = []
+    for info in PROTOCOLS.available():
+        try:
+            names += [info.name] if load_protocol(info.name).emulator else []
+        except ConfigurationError:
+            continue
+    return names
+
+
+def check_options(kind: type[WireCamera], given: Iterable[str]) -> None:
+    """Refuse what a class of emulated cameras does not take.
+
+    Raises:
+        ConfigurationError: names what it takes.
+    """
+    known = options_of(kind)
+    for name in given:
+        if name not in known:
+            raise ConfigurationError(
+                f"{kind.__name__} has no option {name!r}; it has {', '.join(sorted(known))}"
+                f"{did_you_mean(name, known)}"
+            )
+
+
+def options_of(kind: type[WireCamera]) -> frozenset[str]:
+    """Return the names of what a class of emulated cameras is made of."""
+    names: set[str] = set()
+    for one in kind.__mro__:
+        if one is WireCamera:
+            break
+        if "__init__" in vars(one):
+            parameters = inspect.signature(vars(one)["__init__"]).parameters.values()
+            names.update(p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
+    return frozenset(names - {"self"})

@@ -1,0 +1,572 @@
+"""What emulated cameras have in common, whatever they speak: port, links, faults, timeline, log.
+
+Everything that happens is a *step*: bring the device's time up, do it, deliver, set one timer for
+the device's next event.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from smartcam._server import Server
+from smartcam.emulator._clock import Clock, OneTimer, RealClock
+from smartcam.emulator._links import TcpListener, UdpListener
+from smartcam.emulator._port import Port
+from smartcam.emulator._scenario.timeline import Timeline
+from smartcam.emulator._traffic import TrafficLog, Visit
+from smartcam.emulator.faults._base import DeviceFault
+from smartcam.emulator.faults._device_effects import Stage, act, kinds_of
+from smartcam.emulator.faults._matching import FaultQueue
+from smartcam.exceptions import ConfigurationError
+from smartcam.models import Status
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import Transport
+from smartcam.protocols._framed.framing import Frame
+
+if TYPE_CHECKING:
+    from collections import deque
+    from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+    from contextlib import AbstractContextManager
+    from datetime import datetime
+
+    from smartcam.emulator._application import Application
+    from smartcam.emulator._bvs.device import LastReport
+    from smartcam.emulator._client_link import CameraMachine, ClientLink, Trace
+    from smartcam.emulator._clock import TimerHandle
+    from smartcam.emulator._links import Listener
+    from smartcam.emulator._scenario.scenario import Mistake, Scenario
+    from smartcam.emulator._scenario.states import DeviceState
+    from smartcam.emulator._scenario.timeline import Cue
+    from smartcam.emulator._scene import TableScene
+    from smartcam.emulator._traffic import Log
+    from smartcam.emulator.faults import Fault, FiredFault
+    from smartcam.emulator.faults._base import BaseFault
+    from smartcam.emulator.faults._matching import Row
+    from smartcam.emulator.faults._wire_effects import WireCodec, WireMessage
+    from smartcam.exceptions import RemoteProtocolError
+
+_log = logging.getLogger("smartcam.emulator")
+
+MAX_LINKS = 32
+"""Clients that are looked at. The camera serves one; a few more may wait to take over. A newcomer
+always gets in: the one without a session for longest makes room."""
+
+WRITE_LIMIT = 1 << 20
+"""Bytes kept for a client that does not read, or held back by faults; more end its connection."""
+
+_LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
+    Transport.TCP: TcpListener,
+    Transport.UDP: UdpListener,
+}
+
+
+@dataclass(slots=True, eq=False)
+class _Bracket:
+    """A context that begins and ends something; inside itself it does nothing."""
+
+    _begin: Callable[[], None]  # called on the way in; where it raises there is no step
+    _end: Callable[[], None]  # called on the way out, after an error too
+    _depth: int = 0
+
+    def __enter__(self) -> None:
+        if not self._depth:
+            self._depth = 1
+            try:
+                self._begin()
+            except BaseException:
+                self._depth = 0
+                raise
+        else:
+            self._depth += 1
+
+    def __exit__(self, *error: object) -> None:
+        if self._depth > 1:
+            self._depth -= 1
+            return
+        try:
+            self._end()
+        finally:
+            self._depth = 0
+
+
+class WireCamera(Server):
+    """An emulated camera of any make on a real port; what it says is its subclass' matter.
+
+    Args:
+        spoken: the words on the wire.
+        device: what is behind it; faults call its operator's methods.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        transport: ``"tcp"`` or ``"udp"``.
+        dialect: name of the wire dialect.
+        name: for logs.
+        clock: its time.
+        seed: of all that is left to chance.
+        timeline: what happens by itself, and when.
+
+    Raises:
+        ConfigurationError: it cannot do what the timeline wants.
+    """
+
+    max_links: int = MAX_LINKS
+    """Clients that are looked at."""
+    write_limit: int = WRITE_LIMIT
+    """Bytes kept for a client that does not read, or held back by faults; more end its
+    connection."""
+    takes: ClassVar[frozenset[str]] = frozenset()
+    """What it takes of ``scenario``, ``dialect``, ``transport``, ``seed``, ``web``, ``replay``."""
+    device: Any
+    """What is behind the wire."""
+    states: ClassVar[frozenset[DeviceState]] = frozenset()
+    """What it can enter, for a timeline."""
+
+    def __init__(
+        self,
+        *,
+        spoken: WireCodec,
+        device: object,
+        host: str,
+        port: int,
+        transport: Literal["tcp", "udp"],
+        dialect: str,
+        name: str,
+        clock: Clock | None,
+        seed: int,
+        timeline: Sequence[Cue],
+        applications: Container[int] = (),
+    ) -> None:
+        self.host: str = host
+        self.transport: Literal["tcp", "udp"] = transport
+        self.dialect: str = dialect
+        self.name: str = name
+        self.clock: Clock = clock if clock is not None else RealClock()
+        self.seed: int = seed
+        self.fault_kinds: frozenset[str] = kinds_of(device)
+        self.codec: WireCodec = spoken
+        self._cues = timeline
+        self._step = _Bracket(self._begin_step, self._end_step)
+        self._listener: Listener = _LISTENERS[Transport(transport)](self)
+        self._port = Port(self._listener, host, port, name)
+        self._traffic = TrafficLog(spoken)
+        self.queue: FaultQueue = FaultQueue(spoken, self.clock, applications, self.fault_kinds)
+        self._stage = Stage(
+            device=device,
+            refuse=self._refuse,
+            let_second_client_in=self._let_second_client_in,
+            clear=self.clear_faults,
+        )
+        self._timeline = self._make_timeline()
+        self._refusal: TimerHandle | None = None
+        self._refused_until = 0.0
+        self._started = False
+        self._down = False
+        self._timer = OneTimer(self.clock, self._wake)
+
+    @classmethod
+    @abstractmethod
+    def from_scenario(
+        cls,
+        plan: Scenario,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        clock: Clock | None = None,
+        seed: int | None = None,
+    ) -> WireCamera:
+        """Return a camera of a scenario; what is given beside it goes before it.
+
+        Raises:
+            ConfigurationError: something given is wrong, or nothing that such a camera takes.
+        """
+
+    @classmethod
+    @abstractmethod
+    def mistake(cls, plan: Scenario) -> Mistake | None:
+        """Return the place in a scenario of what such a camera cannot do, and why; or None."""
+
+    @classmethod
+    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
+        """Return the options with which a program is active, and runs, from the beginning.
+
+        Nothing, where such a camera knows no programs.
+        """
+        return {}
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    @abstractmethod
+    def url(self) -> str:
+        """Its address."""
+
+    @property
+    @abstractmethod
+    def application_ids(self) -> list[int]:
+        """Ids of the programs on it."""
+
+    @property
+    @abstractmethod
+    def sessions(self) -> list[str]:
+        """Address and port of the clients that have a session."""
+
+    @property
+    def has_session(self) -> bool:
+        """Whether a client has a session."""
+        return bool(self.sessions)
+
+    @property
+    def scene(self) -> TableScene | None:
+        """The table it looks at; None for a camera without."""
+        return None
+
+    @property
+    def clock_time(self) -> datetime | None:
+        """What its own clock shows; None for a camera without."""
+        return None
+
+    @property
+    def last_report(self) -> LastReport | None:
+        """What the last run reported, whether anybody heard it or not; None where none is kept."""
+        return None
+
+    def application_of(self, message: m.ResultContainer) -> Application | None:
+        """Return the application that describes a result; None where none does."""
+        return None
+
+    def shown(self) -> dict[str, Any]:
+        """Return what its page shows of its state; a camera adds and replaces what it has."""
+        return {
+            "mode": "running" if self._started else "stopped",
+            "status": Status(0),
+            "active_application": None,
+            "conditions": {},
+            "running": self._started,
+            "processing": False,
+            "endian": 0,
+            "next_number": None,
+            "queued_inputs": None,
+            "run_ends": "ResultContainer",  # what tells a client so
+            "applications": [],
+            "cells": {},
+            "quirks": {},
+            "quirks_chosen": {},
+        }
+
+    @property
+    def port(self) -> int:
+        """The port it listens on; the one given until it is started."""
+        return self._port.number
+
+    @property
+    def log(self) -> Log:
+        """The last frames in both directions, oldest first."""
+        return self._traffic.entries
+
+    @property
+    def links(self) -> list[str]:
+        """Address and port of all clients that are connected, with a session or without."""
+        return [link.peer for link in self._listener.all_links]
+
+    @property
+    def crowded_out(self) -> int:
+        """Clients without a session that were sent away because too many were connected."""
+        return self._listener.crowded_out
+
+    @property
+    def faults(self) -> list[Fault]:
+        """The faults that still wait, in the order in which they were given."""
+        return self.queue.waiting
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """The commands that the timeline knows, sorted."""
+        return tuple(sorted({cue.command for cue in self._cues if cue.command is not None}))
+
+    @property
+    def is_random(self) -> bool:
+        """Whether chance has a part in the timeline."""
+        return any(cue.is_random for cue in self._cues)
+
+    @property
+    def cues_done(self) -> list[int]:
+        """How often each cue of the timeline has happened since the start."""
+        return self._timeline.done
+
+    @property
+    def visits(self) -> deque[Visit]:
+        """The last connections that have ended, oldest first; over UDP there are none."""
+        return self._traffic.visits
+
+    @property
+    def fired(self) -> deque[FiredFault]:
+        """The last faults that have happened, oldest first."""
+        return self.queue.fired
+
+    async def wait_received(
+        self, what: int | type[m.Message], *, count: int = 1, timeout: float = 5.0
+    ) -> None:
+        """Wait until clients have sent ``count`` whole frames of a kind since the beginning.
+
+        When it returns, the device has handled them. The timeout runs in real time, whatever the
+        emulator's clock is.
+
+        Args:
+            what: a message id, or a message type.
+            count: how many, those that came before this call included.
+            timeout: seconds.
+
+        Raises:
+            ResponseTimeoutError: they did not come in time.
+
+        Cancellation: safe.
+        """
+        await self._traffic.wait_received(what, count=count, timeout=timeout)
+
+    # ------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Open the port; does nothing if it is started already.
+
+        Raises:
+            ConfigurationError: it cannot listen there.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._started:
+            return
+        try:
+            await self._port.open()
+        except (OSError, ValueError, OverflowError) as exc:
+            raise ConfigurationError(
+                f"emulator: cannot listen on {self.transport} {self.host}:{self.port}: {exc}"
+            ) from exc
+        self._started = True
+        self._down = False
+        self._timeline = self._make_timeline()
+        self._began()
+        with self.step():
+            self._act_at_once()
+            self._timeline.start()
+        _log.info("= %s: listening on %s", self.name, self.url)
+        if self.is_random:
+            _log.info("= %s: chance has the seed %d", self.name, self.seed)
+
+    async def stop(self) -> None:
+        """Close the port and every connection; the device stands still. Does nothing if stopped.
+
+        Cancellation: everything is closed nevertheless.
+        """
+        if self._started:
+            self._started = False
+            self._timer.set(None)
+            self._timeline.stop()
+            self._end_refusal()
+            self._ends()
+            self._port.shut()
+            await self._port.wait_closed()
+
+    # ------------------------------------------------------------------ faults
+
+    def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
+        """Add faults behind those that wait; what waits for no message happens now.
+
+        Call it in the event loop's thread. Before the emulator is started they wait until then.
+
+        Args:
+            faults: faults of :mod:`smartcam.emulator.faults`, or mappings with ``kind``.
+
+        Raises:
+            ConfigurationError: one is wrong, or too many would wait; none was added.
+        """
+        with self.step():
+            self._collect()  # what was said before is not changed
+            self.queue.add(faults)
+            if self._started:
+                self._act_at_once()
+
+    def command(self, name: str) -> None:
+        """Give a command: the timeline's cues that wait for it happen.
+
+        Call it in the event loop's thread, while the emulator is started.
+
+        Raises:
+            ConfigurationError: no cue has it.
+        """
+        self._timeline.command(name)
+
+    def clear_faults(self) -> None:
+        """Forget the faults that wait, and end those that last.
+
+        BUSY falls, the port opens, the second client goes, connections that are half open or
+        stalled are reset. What is delayed comes at its time, and a reboot takes its time.
+        """
+        self.queue.clear()
+        with self.step():
+            self._end_device_faults()
+            self._end_refusal()
+            for link in self._listener.all_links:
+                link.heal()
+
+    def _refuse(self, seconds: float) -> None:
+        """Close the port for a time; connections that are open stay."""
+        self._refused_until = max(self._refused_until, self.clock.now + seconds)
+        if self._refusal is not None:
+            self._refusal.cancel()
+        elif not self._down:
+            self._port.close()
+        self._refusal = self.clock.call_at(self._refused_until, self._wake_port)
+
+    def _let_second_client_in(self) -> None:
+        """Let another client connect; where several are served, nothing comes of it."""
+
+    def _make_timeline(self) -> Timeline:
+        return Timeline(
+            self._cues, clock=self.clock, seed=self.seed, inject=lambda do: self.inject(*do)
+        )
+
+    def _entered(self, state: DeviceState) -> None:
+        """The device has entered a state: what it said before is not changed by what follows."""
+        self._collect()
+        self._timeline.entered(state)
+
+    def _act_at_once(self) -> None:
+        self._act(self.queue.at_once(), None)
+
+    def _provoke(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
+        """Let the device faults happen that come before a message; return all it brings about."""
+        if not waiting:
+            return ()
+        faults = self.queue.by_message(waiting, message)
+        self._act(faults, "before")
+        return faults
+
+    def _act(self, faults: Iterable[Fault], when: Literal["before", "after"] | None) -> None:
+        """Let device faults happen; what the camera says to it wakes no other device fault."""
+        for fault in faults:
+            if isinstance(fault, DeviceFault) and when in {None, fault.when}:
+                act(self._stage, fault)
+                self._deliver_at_once()
+
+    # ------------------------------------------------------------------ for links
+
+    @abstractmethod
+    def make_machine(self, transport: Transport, trace: Trace) -> CameraMachine:
+        """Return the machine of a new link."""
+
+    @abstractmethod
+    def received(self, link: ClientLink, message: m.Message) -> None:
+        """A link received a message."""
+
+    @abstractmethod
+    def serves(self, link: ClientLink) -> bool:
+        """Whether the link has a session."""
+
+    @abstractmethod
+    def lost(self, link: ClientLink) -> None:
+        """A link is gone; harmless when said twice."""
+
+    def arrived(self, link: ClientLink) -> None:
+        """A connection was made."""
+
+    def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
+        """A connection has ended."""
+        by: Literal["client", "camera"] = "client" if by_client else "camera"
+        self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
+
+    def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+        """A machine saw a frame, or bytes that make none."""
+        self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
+        if _log.isEnabledFor(logging.DEBUG):
+            self._show_last()
+        if sender is m.Sender.CLIENT and isinstance(what, Frame):
+            self._traffic.count(what)
+
+    def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
+        """What faults made of a message has passed, or is lost."""
+        faults = ", ".join(message.faults) or None
+        self._note(link.peer, sender, message.what, faults, message.wire)
+
+    def _note(
+        self,
+        peer: str,
+        sender: m.Sender,
+        what: Frame | bytes,
+        fault: str | None,
+        wire: bytes | None,
+    ) -> None:
+        self._traffic.add(self.clock.now, peer, sender, what, fault, wire)
+        if _log.isEnabledFor(logging.DEBUG):
+            self._show_last()
+
+    def _show_last(self) -> None:
+        entry = self.log[-1]
+        mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
+        faulty = f" ({entry.fault}; on the wire: {entry.wire})" if entry.fault else ""
+        said = entry.error or entry.message or f"message {entry.message_id}: {entry.hex}"
+        _log.debug("%s %s: %s%s", mark, entry.peer, said, faulty)
+
+    # ------------------------------------------------------------------ steps
+
+    def step(self) -> AbstractContextManager[None]:
+        """Bring the device's time up, do the body, deliver what came of it, set the timer.
+
+        Inside another step it is a part of that one.
+        """
+        return self._step
+
+    def _begin_step(self) -> None:
+        if self._started:
+            self._move()
+
+    def _end_step(self) -> None:
+        if self._started:
+            self._settle()
+
+    def _wake(self) -> None:
+        with self.step():
+            pass
+
+    @abstractmethod
+    def _move(self) -> None:
+        """Bring the device's time up."""
+
+    @abstractmethod
+    def _collect(self) -> None:
+        """Put what the device said into the next write."""
+
+    @abstractmethod
+    def _settle(self) -> None:
+        """Deliver what came of a step, and set the timer."""
+
+    def _deliver_at_once(self) -> None:
+        """Say what a fault made the device say; it wakes no other fault."""
+
+    def _began(self) -> None:
+        """It is started; the first step is to come."""
+
+    def _ends(self) -> None:
+        """It stops; links are still there."""
+
+    def _end_device_faults(self) -> None:
+        """End the faults of the device that last."""
+
+    # ------------------------------------------------------------------ the port
+
+    def _end_refusal(self) -> None:
+        """Open the port that a fault closed."""
+        refusal, self._refusal = self._refusal, None
+        self._refused_until = 0.0
+        if refusal is not None:
+            refusal.cancel()
+            if self._started and not self._down:
+                self._port.reopen()
+
+    def _wake_port(self) -> None:
+        with self.step():
+            self._end_refusal()

@@ -1,0 +1,90 @@
+"""What a calibration is worth: the verdict, and the choice that it makes advisable."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._plane.calibration import fit_plane
+from smartcam.calibration.wizards._points import calibrated_plane
+from smartcam.calibration.wizards._verdict import CURES, VIEW_CURES, judge, refused
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+FIELD = np.array([(0.15 * i, 0.12 * j) for i in range(3) for j in range(3)])
+SHIFT = np.array([0.4, -0.1])
+
+
+@pytest.mark.parametrize(
+    ("held_out", "good_for", "text"),
+    [
+        (0.31, 0.7, "Good for 0.7 mm: "),
+        (0.2, 0.4, "Good for 0.4 mm: "),
+        (0.06, 0.2, "Good for 0.2 mm: "),
+        (0.017, 0.04, "Good for 0.04 mm: "),
+        (0.0, 0.001, "Good for 0.001 mm: "),
+        (12.34, 24.7, "Good for 24.7 mm: "),
+    ],
+)
+def test_verdict_names_twice_the_held_out_error_rounded_up(
+    held_out: float, good_for: float, text: str
+) -> None:
+    judged = judge(held_out, [(Code.SIDE_UNKNOWN, "not checked")], worst=1)
+    assert (judged.good_for, judged.option) == (good_for, "accept")
+    assert (judged.verdict.level, judged.verdict.text[: len(text)]) == ("good", text)
+
+
+def test_verdict_promises_no_less_than_the_noise_leads_to() -> None:
+    judged = judge(0.01, [], worst=1, predicted=0.16, where=" without point 3")
+    assert judged.good_for == 0.4
+    assert judged.verdict.text.startswith("Good for 0.4 mm without point 3: 95 of 100")
+
+
+def test_verdict_without_a_held_out_error_is_not_known() -> None:
+    judged = judge(None, [(Code.NOT_HELD_OUT, "too few")], worst=1)
+    assert (judged.verdict.level, judged.option, judged.good_for) == ("unknown", "more", None)
+    assert judged.verdict.text == "Not known how good: touch more points"
+
+
+def test_verdict_names_the_point_of_the_warning_that_is_to_be_mended_first() -> None:
+    wrong = [(Code.POOR_FIT, "the residuals"), (Code.OUTLIER, "point 3 fits far worse")]
+    judged = judge(0.1, wrong, worst=5)
+    assert (judged.verdict.text, judged.option, judged.number) == (
+        "Not good enough: touch point 3 again", "redo", 3,
+    )  # fmt: skip
+    assert judge(0.1, wrong[:1], worst=5).number == 5
+
+
+@pytest.mark.parametrize("cures", [CURES, VIEW_CURES])
+def test_verdict_of_each_thing_that_is_wrong_says_what_to_do(
+    cures: Mapping[Code, tuple[str, str]],
+) -> None:
+    for code, (_, option) in cures.items():
+        judged = refused(code, "it is", worst=4, cures=cures)
+        assert judged.verdict.text.startswith("Not good enough: ")
+        assert "{" not in judged.verdict.text
+        assert judged.option == option
+        assert judged.chosen(["accept", option]) == option
+        assert judged.chosen(["accept"]) is None
+
+
+def test_verdict_holds_for_new_points() -> None:
+    """Of calibrations that are called good, 95 of 100 new touches lie within what was promised."""
+    random = np.random.default_rng(11)
+    inside: list[float] = []
+    new = random.uniform((0.0, 0.0), (0.3, 0.24), (200, 2))
+    for _ in range(60):
+        touches = np.column_stack([FIELD + SHIFT, np.zeros(9)])
+        touches += random.normal(0.0, 0.0002, touches.shape)
+        found = fit_plane(FIELD, touches, touch_sigma=0.0002, tool_z=(0, 0, -1))
+        judged = calibrated_plane(found).judgement
+        if judged.good_for is not None:
+            true = np.column_stack([new + SHIFT, np.zeros(200)])
+            off = true + random.normal(0.0, 0.0002, true.shape) - found.transform(new)
+            inside.append(float((np.linalg.norm(off, axis=1) < 1e-3 * judged.good_for).mean()))
+    assert len(inside) > 50
+    assert np.mean(inside) > 0.95
