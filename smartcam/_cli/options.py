@@ -196,7 +196,13 @@ class Options:
 
     @contextmanager
     def camera(self, url: str, **other: Any) -> Iterator[SmartCamera]:
-        """Give an unopened camera; the trace file is open around it.
+        """Give an unopened camera, as :meth:`cameras` makes them."""
+        with self.cameras(url, **other) as make:
+            yield make()
+
+    @contextmanager
+    def cameras(self, url: str, **other: Any) -> Iterator[Callable[[], SmartCamera]]:
+        """Give what makes unopened cameras; the trace file is open around it.
 
         ``other``: options of :func:`smartcam.connect` that the command line does not have. Raises
         CalibrationError: the calibration's file is damaged, newer, or holds something else;
@@ -222,7 +228,7 @@ class Options:
                 "connect_timeout": self.step(10.0),
                 "switch_timeout": self.step(10.0),
             }
-            yield connect(url, **{**options, **other})
+            yield functools.partial(connect, url, **{**options, **other})
 
     @contextmanager
     def tracing(self) -> Iterator[Callable[[TraceEntry], None] | None]:

@@ -43,13 +43,16 @@ class PageOptions:
         }
 
 
-def page_options(about: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def page_options(
+    about: str, *, always: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that gives a command the options of a page, as ``web``.
 
-    ``about``: what ``--web`` does.
+    ``about``: what ``--web`` does. ``always``: the command has a page anyway, and no ``--web``.
     """
+    flag = click.option("--web", is_flag=True, help=f'{about} Needs the extra "web".')
     options = [
-        click.option("--web", is_flag=True, help=f'{about} Needs the extra "web".'),
+        *([] if always else [flag]),
         click.option("--web-host", metavar="HOST", help="Its address.  [default: 127.0.0.1]"),
         click.option(
             "--web-port",
@@ -69,8 +72,9 @@ def page_options(about: str) -> Callable[[Callable[..., None]], Callable[..., No
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(function)
         def packed(*args: Any, **given: Any) -> None:
-            web = {name: given.pop(name) for name in ("web", "web_host", "web_port", "web_token")}
-            function(*args, web=PageOptions(**web), **given)
+            place = {name: given.pop(name) for name in ("web_host", "web_port", "web_token")}
+            wanted = always or given.pop("web")
+            function(*args, web=PageOptions(web=wanted, **place), **given)
 
         for option in reversed(options):
             packed = option(packed)

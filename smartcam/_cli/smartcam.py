@@ -17,7 +17,9 @@ from smartcam._cli.decode import decode, from_hex
 from smartcam._cli.dissector import dissector
 from smartcam._cli.doctor import doctor
 from smartcam._cli.image import image
+from smartcam._cli.live import live, serve
 from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, application, runs
+from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
 from smartcam._cli.running import JsonErrors
@@ -51,7 +53,7 @@ EPILOG = (
 
 
 TOPICS: Mapping[str, Sequence[str]] = {
-    "A camera": ("trigger", "watch", "image", "status", "start", "stop", "switch"),
+    "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
     "Recordings": ("record", "replay", "pcap", "dissector"),
@@ -122,8 +124,14 @@ async def trigger(url: str, input_hex: str | None, options: Options) -> None:
     f"result must come within --timeout. {CONNECTS}"
 )
 @click.argument("url")
+@page_options("Show a page instead, as smartcam live does; its address goes to stdout.")
 @runs(*RESULTS, interrupted=0)
-async def watch(url: str, options: Options) -> None:
+async def watch(url: str, web: PageOptions, options: Options) -> None:
+    if web.wanted:
+        if options.count:
+            raise click.UsageError("--count and --web do not go together")
+        await serve(url, web, options)
+        return
     each = options.step(DEFAULT_TRIGGER_TIMEOUT) if options.count else None
     with options.camera(url) as unopened:
         # subscribed before the session is there, so the first result is seen too
@@ -276,7 +284,7 @@ async def demo_command(pick: bool, picture: str, seed: int, options: Options) ->
     await (demo_pick.pick(options, picture, seed) if pick else demo.demo(options))
 
 
-for _one in (probe, doctor, image, decode, calibrate, sheet, record, replay, pcap, dissector):
+for _one in (live, probe, doctor, image, decode, calibrate, sheet, record, replay, pcap, dissector):
     command.add_command(_one)
 
 

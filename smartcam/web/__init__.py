@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: the emulator's, to see and control it while it runs, and the wizard's.
+"""Pages and HTTP calls: the emulator's, which controls it, a camera's, the wizard's.
 
 ::
 
@@ -18,11 +18,14 @@ from smartcam.exceptions import MissingExtraError
 
 if TYPE_CHECKING:
     from smartcam.web._emulator import EmulatorSite
+    from smartcam.web._live import LiveSite
     from smartcam.web._wizard import WizardSite
 
-__all__ = ["EmulatorSite", "WizardSite"]
+__all__ = ["EmulatorSite", "LiveSite", "WizardSite"]
 
-_resolve = lazy(__name__, {"_emulator": "EmulatorSite", "_wizard": "WizardSite"})
+_resolve = lazy(
+    __name__, {"_emulator": "EmulatorSite", "_live": "LiveSite", "_wizard": "WizardSite"}
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -19,7 +19,7 @@ from smartcam.web._routes import MAX_BODY, middleware, routes
 from smartcam.web._streams import Streams
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Sequence
 
     from smartcam.web._routes import Calls
 
@@ -46,6 +46,7 @@ class Site(Server):
 
     Args:
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css.
+        styles: names of other pages whose PAGE.css it uses, too.
         host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
 
     Attributes:
@@ -62,6 +63,7 @@ class Site(Server):
         calls: Calls[Any],
         page: str,
         *,
+        styles: Sequence[str] = (),
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
@@ -75,6 +77,7 @@ class Site(Server):
         self.streams: Streams = Streams()
         self._calls = calls
         self._page = page
+        self._files = [f"{page}.js", *(f"{one}.css" for one in (page, *styles))]
         self._port = port
         self._open: _Open | None = None
 
@@ -152,8 +155,8 @@ class Site(Server):
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))
         application.router.add_get("/", _file(f"{self._page}.html"))
-        for suffix in ("js", "css"):
-            application.router.add_get(f"/{self._page}.{suffix}", _file(f"{self._page}.{suffix}"))
+        for name in self._files:
+            application.router.add_get(f"/{name}", _file(name))
         return application
 
 

@@ -13,6 +13,7 @@ import aiohttp
 
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.web import EmulatorSite
+from smartcam.web._site import Site
 
 TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
 
@@ -28,7 +29,7 @@ class Answer(NamedTuple):
 class Caller:
     """Makes calls to a site, of one camera where the path begins with no slash."""
 
-    def __init__(self, site: EmulatorSite, session: aiohttp.ClientSession, camera: str) -> None:
+    def __init__(self, site: Site, session: aiohttp.ClientSession, camera: str) -> None:
         self.site = site
         self.session = session
         self.camera = camera
@@ -134,7 +135,7 @@ class Raw:
 
     @classmethod
     @contextlib.asynccontextmanager
-    async def connected(cls, site: EmulatorSite) -> AsyncIterator[Self]:
+    async def connected(cls, site: Site) -> AsyncIterator[Self]:
         reader, writer = await asyncio.open_connection("127.0.0.1", site.port)
         try:
             yield cls(reader, writer)

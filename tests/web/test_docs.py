@@ -23,11 +23,15 @@ from smartcam.web import _routes as routes
 from smartcam.web import _serialize as serialize
 from smartcam.web import _streams as streams
 from smartcam.web._emulator import CALLS
+from smartcam.web._live import CALLS as LIVE_CALLS
+from smartcam.web._live import MAX_NEWS
+from smartcam.web._live_view import FAIL_WORDS, MAX_RESULTS, NOT_WORDS, PASS_WORDS
 from smartcam.web._wizard import CALLS as WIZARD_CALLS
 from tests import ROOT
 from tests.web.sitekit import TOKEN
 
 PAGE = (ROOT / "docs" / "control.md").read_text(encoding="utf-8")
+LIVE_PAGE = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
 WIZARD_PAGE = (ROOT / "docs" / "calibrating.md").read_text(encoding="utf-8")
 CURL = [
     line
@@ -37,8 +41,20 @@ CURL = [
 ]
 
 
+def test_live_page_has_its_numbers() -> None:
+    assert f"The last {MAX_RESULTS}." in LIVE_PAGE
+    assert f"faster than {MAX_NEWS / streams.PERIOD:g} a second" in LIVE_PAGE
+    words = PASS_WORDS | FAIL_WORDS
+    named = set(
+        re.findall(r"`(\w+)`", LIVE_PAGE.partition("## Pass and fail")[2].partition("##")[0])
+    )
+    assert {one.removesuffix("ed") for one in words} | NOT_WORDS == named
+
+
 @pytest.mark.parametrize(
-    ("page", "calls"), [(PAGE, CALLS), (WIZARD_PAGE, WIZARD_CALLS)], ids=["control", "calibrating"]
+    ("page", "calls"),
+    [(PAGE, CALLS), (LIVE_PAGE, LIVE_CALLS), (WIZARD_PAGE, WIZARD_CALLS)],
+    ids=["control", "live", "calibrating"],
 )
 def test_table_has_every_call(page: str, calls: routes.Calls[Any]) -> None:
     table = page.partition("\n## Calls\n")[2].partition("\n`GET /api")[0]

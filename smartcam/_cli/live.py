@@ -1,0 +1,68 @@
+"""``smartcam live``: a page of a camera, which is awaited where it is not there."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+import click
+
+from smartcam._cli.options import CAMERA, CONNECTS, Options, runs
+from smartcam._cli.page import PageOptions, page_options
+from smartcam.backoff import Backoff
+from smartcam.exceptions import LinkError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.client import SmartCamera
+    from smartcam.web import LiveSite
+
+
+@click.command(
+    help="Serve a page of a camera until Ctrl-C: results as they come, status, account. The page's "
+    "address goes to stdout. A camera that is not there, or is lost, is awaited, and the page says "
+    f'so. Needs the extra "web". {CONNECTS}'
+)
+@click.argument("url")
+@click.option(
+    "--control", is_flag=True, help="The page may trigger, start, stop and switch applications."
+)
+@page_options("", always=True)
+@runs(
+    *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--seconds"),
+    *CAMERA,
+)
+async def live(url: str, control: bool, web: PageOptions, options: Options) -> None:
+    """Serve a page of a camera."""
+    await serve(url, web, options, control=control)
+
+
+async def serve(url: str, web: PageOptions, options: Options, *, control: bool = False) -> None:
+    """Serve the page until the end; a camera that cannot be used at all ends it."""
+    from smartcam.web import LiveSite
+
+    with contextlib.suppress(TimeoutError):  # --seconds are over
+        async with asyncio.timeout(options.seconds):
+            with options.cameras(url, reconnect=Backoff()) as make:
+                camera = make()
+                options.remark(camera)
+                async with LiveSite(camera, control=control, **web.place) as site:
+                    options.show({"page": site.url}, f"page: {site.url}")
+                    await _have_open(camera, make, site)
+
+
+async def _have_open(camera: SmartCamera, make: Callable[[], SmartCamera], site: LiveSite) -> None:
+    """Open the camera until it is there, and have it open until this is cancelled."""
+    policy = Backoff()
+    for delay in policy.delays():
+        try:
+            async with camera:
+                await asyncio.Event().wait()
+        except LinkError as exc:
+            if not policy.transient(exc):
+                raise
+            camera = make()
+            await site.view.follow(camera, str(exc))
+        await asyncio.sleep(delay)

@@ -1,0 +1,224 @@
+"""The live page's site: what a camera sends, and calls that trigger it where allowed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aiohttp import web
+from pydantic import Field
+
+from smartcam.exceptions import SmartCamError
+from smartcam.web._errors import RefusedError
+from smartcam.web._live_view import LiveView
+from smartcam.web._routes import CallBody, CallRequest, Calls
+from smartcam.web._site import API, Site
+from smartcam.web._streams import PERIOD, News
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+    from smartcam.client import SmartCamera
+
+MAX_NEWS = 20
+"""Results in one event: at ten a second the page sees 200 a second, and is told what it missed."""
+
+CLOCK_LOOKS = round(1.0 / PERIOD)
+"""Looks after which clock and account are told: once a second."""
+
+
+class LiveSite(Site):
+    """A page and HTTP calls that show what a camera sends.
+
+    ::
+
+        async with smartcam.connect(url) as camera, LiveSite(camera) as site:
+            site.url    # http://127.0.0.1:PORT/
+
+    Args:
+        camera: it; opened and closed by who made it. Made before it is opened, the page sees all.
+        control: whether the page may trigger, start, stop and switch. Without it nothing that a
+            reader does reaches the camera, but that it is asked for its picture where it has one.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
+            and ``_`` at least. None: nothing on a loopback address; on any other one is made.
+
+    Attributes:
+        view: what it shows.
+        control: as given.
+
+    Raises:
+        ConfigurationError: the token cannot be used.
+    """
+
+    def __init__(
+        self,
+        camera: SmartCamera[Any],
+        *,
+        control: bool = False,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        super().__init__(CALLS, "live", styles=["emulator"], host=host, port=port, token=token)
+        self.control: bool = control
+        self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)))
+
+    async def start(self) -> None:
+        """Open the port, and follow the camera."""
+        await super().start()
+        self.view.start()
+
+    async def stop(self) -> None:
+        """Close the port, and leave the camera alone."""
+        await self.view.stop()
+        await super().stop()
+
+
+class LiveReader:
+    """What one reader knows."""
+
+    def __init__(self, site: LiveSite, since: int | None = None) -> None:
+        self._site = site
+        self._view = site.view
+        oldest = self._view.entries[0].serial if self._view.entries else self._view.serial
+        self._serial = oldest if since is None else since
+        self._known: dict[str, Any] = {}
+        self._looks = 0
+
+    def look(self) -> Iterator[News]:
+        """Yield what changed since the last look; the first one tells everything."""
+        view = self._view
+        yield from self._changed("camera", {**view.state(), "control": self._site.control})
+        yield from self._results()
+        picture = 0 if view.picture is None else view.picture.serial
+        yield from self._changed("picture", {"serial": picture})
+        if self._looks % CLOCK_LOOKS == 0:
+            yield from self._changed("account", view.account())
+            points = list(view.series) if self._looks == 0 else list(view.series)[-1:]
+            yield News("clock", {"series": points})
+        self._looks += 1
+
+    def _results(self) -> Iterator[News]:
+        view = self._view
+        if self._serial > view.serial:  # of another process' time
+            self._serial = 0
+        new = [one for one in view.entries if one.serial >= self._serial]
+        missed = (new[0].serial if new else view.serial) - self._serial
+        shown = new[-MAX_NEWS:]
+        missed += len(new) - len(shown)
+        if shown or missed:
+            self._serial = view.serial
+            entries = [one.as_json() for one in shown]
+            yield News("results", {"results": entries, "missed": missed}, self._serial)
+
+    def _changed(self, kind: str, value: Any) -> Iterator[News]:
+        if self._known.get(kind) != value:
+            self._known[kind] = value
+            yield News(kind, value)
+
+
+# ---------------------------------------------------------------------- what calls take
+
+
+class _TriggerBody(CallBody):
+    application: int | None = Field(default=None, ge=0, le=0xFFFFFFFF)
+    timeout: float = Field(default=5.0, gt=0.0, le=60.0)
+
+
+class _SwitchBody(CallBody):
+    application: int = Field(ge=0, le=0xFFFFFFFF)
+
+
+# ---------------------------------------------------------------------- what calls do
+
+CALLS: Calls[LiveSite] = Calls()
+"""All calls."""
+
+
+async def _commanded(site: LiveSite, do: Callable[[], Awaitable[Any]]) -> Any:
+    """Do something to the camera, where that is allowed."""
+    if not site.control:
+        raise RefusedError(403, "a command to the camera", "looking only: no --control was given")
+    try:
+        return await do()
+    except SmartCamError as exc:
+        raise RefusedError(
+            409, f"{type(exc).__name__}: {exc}", "a camera that can do it now"
+        ) from exc
+
+
+@CALLS.add("GET", API)
+def _calls(_site: LiveSite, _call: CallRequest) -> object:
+    """These calls."""
+    return {"calls": CALLS.as_json()}
+
+
+@CALLS.add("GET", f"{API}/camera")
+def _camera(site: LiveSite, _call: CallRequest) -> object:
+    """How the camera is, and what was counted."""
+    return {**site.view.state(), "control": site.control, "account": site.view.account()}
+
+
+@CALLS.add("GET", f"{API}/results")
+def _results(site: LiveSite, _call: CallRequest) -> object:
+    """The last results, the oldest first."""
+    return {"results": [one.as_json() for one in site.view.entries]}
+
+
+@CALLS.add("GET", f"{API}/picture")
+def _picture(site: LiveSite, _call: CallRequest) -> web.Response:
+    """The last picture that was fetched, as the camera sends it."""
+    picture = site.view.picture
+    if picture is None:
+        raise RefusedError(404, "no picture", site.view.picture_error or "one that was fetched")
+    kind = "image/bmp" if picture.data.startswith(b"BM") else "application/octet-stream"
+    return web.Response(body=picture.data, content_type=kind)
+
+
+@CALLS.add("POST", f"{API}/picture")
+def _want_picture(site: LiveSite, _call: CallRequest) -> object:
+    """Ask the camera for its picture anew, once a second at most; the events tell of it."""
+    site.view.want_picture()
+    return site.view.state()
+
+
+@CALLS.add(
+    "GET",
+    f"{API}/events",
+    about="What happens, as server-sent events: camera, results, picture, account, clock.",
+)
+def _events(site: LiveSite, call: CallRequest) -> object:
+    last = call.request.headers.get("Last-Event-ID", "")
+    since = int(last) if last.isdecimal() and len(last) < 20 else None
+    return site.streams.serve(call.request, LiveReader(site, since).look)
+
+
+@CALLS.add("POST", f"{API}/trigger", body=_TriggerBody, optional=True, sample='{"timeout": 5.0}')
+async def _trigger(site: LiveSite, call: CallRequest) -> object:
+    """Trigger; answers when the result is there, which the events tell."""
+    body: _TriggerBody = call.body
+    camera = site.view.camera
+    result = await _commanded(site, lambda: camera.trigger(body.application, timeout=body.timeout))
+    return {"number": result.number, "latency": result.latency}
+
+
+@CALLS.add("POST", f"{API}/switch", body=_SwitchBody, sample='{"application": 7}')
+async def _switch(site: LiveSite, call: CallRequest) -> object:
+    """Load another application."""
+    await _commanded(site, lambda: site.view.camera.switch_application(call.body.application))
+    return site.view.state()
+
+
+@CALLS.add("POST", f"{API}/start")
+async def _start(site: LiveSite, _call: CallRequest) -> object:
+    """Enter run mode."""
+    await _commanded(site, site.view.camera.start)
+    return site.view.state()
+
+
+@CALLS.add("POST", f"{API}/stop")
+async def _stop(site: LiveSite, _call: CallRequest) -> object:
+    """Leave run mode."""
+    await _commanded(site, site.view.camera.stop)
+    return site.view.state()

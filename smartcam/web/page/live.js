@@ -1,0 +1,484 @@
+// The live page: shows what a camera sends. Everything it does is one of the HTTP calls of GET /api.
+
+const $ = (id) => document.getElementById(id);
+const SVG = "http://www.w3.org/2000/svg";
+const MAX_ROWS = 100; // results in the document
+const SILENT_MS = 6000; // the stream tells its clock once a second
+const OLD_S = 10; // a result of before is called old
+const SERIES = 300; // seconds that the plots show
+const MM = 1000;
+const BITS = [
+  ["RUNNING", "Running", "good"],
+  ["WAITING_FOR_TRIGGER", "Waiting for trigger", "good"],
+  ["BUSY", "Busy", "warn"],
+  ["OVERTRIGGERED", "Overtriggered", "warn"],
+  ["INPUT_CONTAINER", "Input container", "warn"],
+  ["OVERHEAT", "Overheat", "bad"],
+  ["SYSTEM_ERROR", "System error", "bad"],
+];
+
+let token = null;
+let state = null; // the camera, as its events tell it
+let reached = false; // whether the page's own server answers
+let results = []; // the newest first
+let missed = 0;
+let series = [];
+let view = null; // what the drawing shows, metres
+let offset = 0; // seconds that this machine's clock is ahead of the server's
+
+function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key in element) element[key] = value;
+    else if (value !== null && value !== undefined) element.setAttribute(key, value);
+  }
+  element.append(...children);
+  return element;
+}
+
+function draw(tag, attributes = {}, ...children) {
+  const element = document.createElementNS(SVG, tag);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.append(...children);
+  return element;
+}
+
+function setText(id, text) {
+  if ($(id).textContent !== text) $(id).textContent = text;
+}
+
+// ---------------------------------------------------------------------- calls
+
+const headers = () => (token ? { Authorization: `Bearer ${token}` } : {});
+
+async function ask(path, options = {}) {
+  const response = await fetch(path, { ...options, headers: { ...headers(), ...options.headers }, cache: "no-store" });
+  if (response.ok) return response;
+  const answer = await response.json();
+  if (response.status === 401) askToken(answer);
+  throw Object.assign(new Error(answer.expected ? `${answer.came}; expected ${answer.expected}` : answer.error), { status: response.status });
+}
+
+async function act(what, path, body) {
+  const options = { method: "POST" };
+  if (body !== undefined) Object.assign(options, { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  try {
+    await ask(path, options);
+    if (what) tell(what);
+  } catch (error) {
+    tell(error.message, true);
+  }
+}
+
+function tell(text, bad = false) {
+  const box = make("div", { className: bad ? "bad" : "", textContent: text });
+  $("told").replaceChildren(box);
+  setTimeout(() => box.remove(), bad ? 9000 : 3500);
+}
+
+function askToken(answer) {
+  $("main").hidden = $("alarm").hidden = true;
+  $("gate").hidden = false;
+  $("gate-error").textContent = token ? `Refused: ${answer.came}` : "";
+  live("lost", "token needed");
+}
+
+$("gate").addEventListener("submit", (event) => {
+  event.preventDefault();
+  token = $("token").value.trim();
+  sessionStorage.setItem("smartcam-token", token);
+  $("gate").hidden = true;
+  listen();
+});
+
+function live(mode, text) {
+  $("live").dataset.state = mode;
+  setText("live", text);
+}
+
+// ---------------------------------------------------------------------- the event stream
+
+async function listen() {
+  let last = null; // the stream's last event with an id
+  let pause = 300;
+  for (;;) {
+    const quiet = new AbortController();
+    const stop = () => quiet.abort();
+    let watchdog = setTimeout(stop, SILENT_MS);
+    try {
+      const more = last === null ? {} : { "Last-Event-ID": last };
+      const response = await ask("/api/events", { headers: more, signal: quiet.signal });
+      for await (const event of events(response.body)) {
+        clearTimeout(watchdog);
+        watchdog = setTimeout(stop, SILENT_MS);
+        pause = 300;
+        reached = true;
+        last = event.id ?? last;
+        TAKE[event.kind]?.(event.data);
+        showAlarm();
+      }
+    } catch (error) {
+      if (error.status === 401) return;
+    } finally {
+      clearTimeout(watchdog);
+    }
+    reached = false;
+    showAlarm();
+    await new Promise((done) => setTimeout(done, pause));
+    pause = Math.min(3000, pause * 2);
+  }
+}
+
+async function* events(body) {
+  const reader = body.pipeThrough(new TextDecoderStream()).getReader();
+  let rest = "";
+  for (;;) {
+    const { value, done } = await reader.read();
+    if (done) return;
+    const parts = (rest + value).split("\n\n");
+    rest = parts.pop();
+    for (const part of parts) {
+      const lines = part.split("\n").map((line) => [line.slice(0, line.indexOf(": ")), line.slice(line.indexOf(": ") + 2)]);
+      const { event: kind, data, id } = Object.fromEntries(lines);
+      yield { kind, id, data: JSON.parse(data) };
+    }
+  }
+}
+
+const TAKE = { camera: takeState, results: takeResults, account: showAccount, picture: takePicture, clock: takeClock };
+
+// ---------------------------------------------------------------------- how it is
+
+const CONNECTIONS = {
+  connected: ["running", "connected"],
+  awaited: ["switching", "not reached yet"],
+  lost: ["rebooting", "lost, trying again"],
+  taken: ["rebooting", "taken by another client"],
+  ended: ["rebooting", "given up"],
+};
+const clock = (seconds) => new Date(1000 * seconds).toLocaleTimeString([], { hour12: false });
+
+function takeState(value) {
+  state = value;
+  $("main").hidden = false;
+  document.title = `${state.name} · smartcam live`;
+  setText("name", state.name);
+  setText("url", state.url);
+  const [mode, text] = CONNECTIONS[state.connection];
+  setText("mode", text);
+  $("mode").dataset.mode = mode;
+  const rows = BITS.map(([name, label, tone]) => {
+    const on = state.status.includes(name);
+    return make("li", { className: tone, "data-on": String(on), "data-bit": name, textContent: label, "aria-label": `${label}: ${on ? "set" : "not set"}` });
+  });
+  $("status").replaceChildren(...rows);
+  const can = state.can ?? {};
+  const facts = {
+    Application: state.application ?? "not known yet",
+    Speaks: can.dialect ?? "not known yet",
+    [state.connection === "connected" ? "Connected since" : "Not connected since"]: clock(state.changed_at),
+  };
+  $("facts").replaceChildren(...list(facts));
+  showControls(can);
+  $("image-panel").hidden = !can.read_image;
+  if (can.read_image) setText("image-note", state.picture_error || ($("image").hidden ? "Not fetched yet." : ""));
+  arrange();
+}
+
+const list = (facts) => Object.entries(facts).flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", { textContent: String(value) })]);
+
+function showControls(can) {
+  const ready = state.connection === "connected";
+  $("control").hidden = !state.control;
+  for (const [id, able] of [["trigger", true], ["start", can.start_stop], ["stop", can.start_stop]]) $(id).disabled = !(ready && able);
+  for (const one of $("switch").querySelectorAll("input, button")) one.disabled = !(ready && can.switch);
+  if (document.activeElement !== $("application")) $("application").placeholder = state.application ?? "";
+  const mute = can.unasked_results === false && !state.control ? " This camera sends no results by itself." : "";
+  setText("looking", `Looking only: --control lets this page trigger and switch.${mute}`);
+  $("looking").hidden = state.control;
+}
+
+$("trigger").addEventListener("click", () => act("", "/api/trigger", {}));
+$("start").addEventListener("click", () => act("It runs.", "/api/start"));
+$("stop").addEventListener("click", () => act("It has stopped.", "/api/stop"));
+$("switch").addEventListener("submit", (event) => {
+  event.preventDefault();
+  act("Loaded.", "/api/switch", { application: $("application").valueAsNumber });
+});
+
+// Says in words what is wrong; what is shown is dimmed then, as it is of before.
+function showAlarm() {
+  let text = "";
+  if (!reached) text = "This page's server does not answer: smartcam live has ended, or the network is gone. What is shown is of before.";
+  else if (state && state.connection !== "connected") {
+    const since = clock(state.changed_at);
+    const why = state.loss ? ` (${state.loss})` : "";
+    const tried = state.last_error && !state.loss.includes(state.last_error) ? ` Last try: ${state.last_error}` : "";
+    text = {
+      awaited: state.loss ? `The camera is not reached yet; it is tried again. ${state.loss}` : "The camera is being connected.",
+      lost: `The camera is lost since ${since}${why}; it is tried again.${tried} What is shown is of before.`,
+      taken: `Another client has taken the camera, at ${since}. Start smartcam live again to take it back.`,
+      ended: `The camera is given up, at ${since}${why}. Start smartcam live again.`,
+    }[state.connection];
+  }
+  if ($("gate").hidden) $("alarm").hidden = !text;
+  setText("alarm", text);
+  $("main").classList.toggle("stale", Boolean(text));
+  live(reached ? (text ? "wait" : "live") : "lost", reached ? (text ? "no camera" : "live") : "no server");
+}
+
+function showAge() {
+  const last = results.find((one) => one.error === undefined);
+  if (!last) return setText("age", "none yet");
+  const age = Math.max(0, Date.now() / 1000 - offset - last.received_at);
+  const old = age >= OLD_S || $("main").classList.contains("stale");
+  $("age").classList.toggle("old", old);
+  setText("age", `${duration(age)} ago${old ? ": not fresh" : ""}`);
+}
+
+function duration(seconds) {
+  if (seconds < 1) return "less than 1 s";
+  if (seconds < 120) return `${Math.floor(seconds)} s`;
+  return seconds < 7200 ? `${Math.floor(seconds / 60)} min` : `${Math.floor(seconds / 3600)} h`;
+}
+
+// ---------------------------------------------------------------------- results
+
+function takeResults(value) {
+  const first = value.results[0];
+  if (first && results.length && first.serial <= results[0].serial) [results, missed] = [[], 0]; // another server's
+  missed += value.missed;
+  results = [...value.results.reverse(), ...results].slice(0, MAX_ROWS);
+  $("rows").replaceChildren(...results.map(makeRow));
+  $("none").hidden = results.length > 0;
+  setText("missed", [`the last ${results.length}`, missed ? `${missed} more came too fast to be shown` : ""].filter(Boolean).join(" · "));
+  showLast();
+  showAge();
+}
+
+const number = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(5))));
+
+function short(value) {
+  if (value === null || value === undefined) return "none";
+  if (Array.isArray(value)) return `${value.length} records${value.length ? ": " : ""}${value.slice(0, 3).map(short).join(" | ")}${value.length > 3 ? " …" : ""}`;
+  if (typeof value === "object") return Object.entries(value).map(([key, one]) => `${key} ${short(one)}`).join(", ");
+  return typeof value === "number" ? number(value) : String(value);
+}
+
+const WORDS = { pass: "PASS", fail: "FAIL" };
+const word = ({ true: count, of, verdict }) => (of === 1 ? (WORDS[verdict] ?? (count ? "true" : "false")) : `${verdict ? `${WORDS[verdict]} ` : ""}${count} of ${of} true`);
+const mm = (metres) => (metres === null ? "?" : (metres * MM).toFixed(1));
+const degrees = (theta) => (theta === null ? "?" : `${((theta * 180) / Math.PI).toFixed(1)}°`);
+
+function says(one) {
+  if (one.error !== undefined) return `not readable: ${one.error}`;
+  if (one.parts) return one.count ? `${one.count} ${one.count === 1 ? "part" : "parts"}: ${one.parts.slice(0, 4).map((part) => `${part.name} ${mm(part.x)}, ${mm(part.y)} mm, ${degrees(part.theta)}`).join(" | ")}${one.count > 4 ? " …" : ""}` : "no part";
+  if (one.cut !== undefined) return `${one.cut} … (${one.size} bytes, too long for this page)`;
+  const text = short(one.value);
+  return text.length > 300 ? `${text.slice(0, 300)} …` : text;
+}
+
+function makeRow(one) {
+  const cells = one.error === undefined
+    ? [one.number, clock(one.received_at), one.latency === null ? "" : `${(one.latency * MM).toFixed(1)} ms`, one.application ?? ""]
+    : ["", "", "", ""];
+  const marks = (one.verdicts ?? []).filter((each) => each.verdict).map((each) => make("b", { "data-verdict": each.verdict, textContent: `${each.name} ${word(each)} ` }));
+  return make("tr", { className: one.error === undefined ? "" : "marked", "data-serial": one.serial },
+    ...cells.map((text, index) => make("td", { className: index ? "" : "time", textContent: String(text) })), make("td", {}, ...marks, says(one)));
+}
+
+function showLast() {
+  const last = results[0];
+  if (!last) return;
+  $("verdicts").replaceChildren(...(last.verdicts ?? []).map((one) =>
+    make("span", { "data-verdict": one.verdict ?? "", "data-name": one.name }, one.name, make("b", { textContent: word(one) }))));
+  $("last").replaceChildren(makeValue(last));
+  if (results.some((one) => one.parts?.length)) {
+    $("scene-panel").hidden = false;
+    arrange();
+    drawParts();
+  }
+}
+
+function makeValue(one) {
+  if (one.error !== undefined) return make("p", { className: "error", textContent: says(one) });
+  if (one.parts) return makeTable(one.parts.slice(0, 20).map((part) => ({ part: part.name, "x, mm": mm(part.x), "y, mm": mm(part.y), θ: degrees(part.theta), quality: part.quality === null ? "" : number(part.quality) })), one.count, "No part was found.");
+  const { value } = one;
+  if (Array.isArray(value) && value.every((each) => each !== null && typeof each === "object" && !Array.isArray(each))) return makeTable(value.slice(0, 20), value.length, "No record.");
+  if (value !== null && typeof value === "object" && !Array.isArray(value)) return make("dl", {}, ...list(Object.fromEntries(Object.entries(value).map(([key, each]) => [key, short(each)]))));
+  return make("code", { textContent: says(one) });
+}
+
+function makeTable(rows, count, none) {
+  if (!count) return make("p", { textContent: none });
+  const names = Object.keys(rows[0]);
+  const table = make("table", {}, make("thead", {}, make("tr", {}, ...names.map((name) => make("th", { scope: "col", textContent: name })))),
+    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...names.map((name) => make("td", { textContent: short(row[name]) }))))));
+  return make("div", {}, table, ...(count > rows.length ? [make("p", { className: "note", textContent: `and ${count - rows.length} more` })] : []));
+}
+
+// ---------------------------------------------------------------------- parts
+
+// The lengths 1, 2, 5, 10 ... mm: the first that is not below this one.
+function round(length) {
+  const decade = 10 ** Math.floor(Math.log10(length));
+  return decade * [1, 2, 5, 10].find((one) => one * decade >= length * 0.999);
+}
+
+const drawable = (one) => (one.parts ?? []).filter((part) => part.x !== null && part.y !== null);
+
+// What is shown grows with what comes, and shrinks only when it is four times too large.
+function fit() {
+  const all = results.flatMap(drawable);
+  const span = (of) => [Math.min(...all.map(of)), Math.max(...all.map(of))];
+  const [left, right] = span((part) => part.x * MM);
+  const [bottom, top] = span((part) => part.y * MM);
+  const edge = Math.max(20, 0.15 * Math.max(right - left, top - bottom));
+  const wanted = { left: left - edge, right: right + edge, bottom: bottom - edge, top: top + edge };
+  const inside = view && view.left <= left && view.right >= right && view.bottom <= bottom && view.top >= top;
+  if (!inside || view.right - view.left > 4 * (wanted.right - wanted.left)) view = wanted;
+}
+
+function drawParts() {
+  const svg = $("parts");
+  const { clientWidth: width, clientHeight: height } = svg;
+  if (!width || !results.some((one) => drawable(one).length)) return;
+  fit();
+  const head = 36; // pixels, for the scale
+  const scale = Math.min(width / (view.right - view.left), (height - head) / (view.top - view.bottom)); // pixels per mm
+  const middle = [(view.left + view.right) / 2, (view.bottom + view.top) / 2];
+  const at = (x, y) => [width / 2 + (x - middle[0]) * scale, (height + head) / 2 - (y - middle[1]) * scale];
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const step = round(70 / scale);
+  const drawn = [];
+  const [left, right] = [middle[0] - width / 2 / scale, middle[0] + width / 2 / scale];
+  const [bottom, top] = [middle[1] - height / scale, middle[1] + height / scale];
+  for (let x = Math.ceil(left / step) * step; x <= right; x += step) {
+    const [px] = at(x, 0);
+    drawn.push(draw("line", { class: Math.abs(x) < step / 2 ? "axis" : "rule", x1: px, x2: px, y1: 0, y2: height }));
+    if (px > 60 && px < width - 20) drawn.push(draw("text", { x: px + 3, y: height - 6 }, number(x)));
+  }
+  for (let y = Math.ceil(bottom / step) * step; y <= top; y += step) {
+    const [, py] = at(0, y);
+    drawn.push(draw("line", { class: Math.abs(y) < step / 2 ? "axis" : "rule", x1: 0, x2: width, y1: py, y2: py }));
+    if (py > head && py < height - 24) drawn.push(draw("text", { x: 5, y: py - 3 }, number(y)));
+  }
+  const last = results.find((one) => one.error === undefined) ?? {};
+  for (const part of drawable(last)) drawn.push(drawPart(part, at(part.x * MM, part.y * MM), width));
+  const length = step * scale;
+  drawn.push(draw("line", { class: "bar", x1: width - 12 - length, x2: width - 12, y1: 14, y2: 14 }));
+  drawn.push(draw("text", { x: width - 12 - length / 2, y: 30, "text-anchor": "middle", "data-scale": step }, `${number(step)} mm`));
+  svg.replaceChildren(...drawn);
+  setText("frame", last.frame ? `mm, in the frame of ${last.frame}; x right, y up` : "mm; x right, y up");
+}
+
+function drawPart(part, [x, y], width) {
+  const label = `${part.name}: x ${mm(part.x)} mm, y ${mm(part.y)} mm, ${degrees(part.theta)}`;
+  const turned = part.theta === null ? 0 : (-part.theta * 180) / Math.PI;
+  const beside = x > width - 130 ? { x: x - 16, "text-anchor": "end" } : { x: x + 16 };
+  return draw("g", { class: "found", "data-part": part.name }, draw("title", {}, label),
+    draw("g", { transform: `translate(${x} ${y}) rotate(${turned})` },
+      draw("circle", { class: "body", r: 9 }), draw("path", { class: "arrow", d: "M0 0H24M18 -5L24 0L18 5M0 -6V6" })),
+    draw("text", { class: "called", y: y - 12, ...beside }, part.name));
+}
+
+function arrange() {
+  const shown = [$("scene-panel"), $("image-panel")].filter((one) => !one.hidden).length;
+  $("main").classList.toggle("plain", shown === 0);
+  $("main").classList.toggle("both", shown === 2);
+}
+
+// ---------------------------------------------------------------------- picture
+
+let fetching = false;
+let shown = 0; // serial of the picture
+let newest = 0;
+
+async function takePicture({ serial }) {
+  newest = serial;
+  if (fetching) return;
+  fetching = true;
+  try {
+    while (newest && newest !== shown) {
+      const wanted = newest;
+      const data = await (await ask("/api/picture")).blob();
+      $("image").src = await new Promise((done, failed) => {
+        const reader = new FileReader();
+        reader.onload = () => done(reader.result);
+        reader.onerror = failed;
+        reader.readAsDataURL(data);
+      });
+      $("image").hidden = false;
+      shown = wanted;
+      setText("image-note", `Fetched at ${clock(Date.now() / 1000)}.`);
+    }
+  } catch (error) {
+    setText("image-note", error.message);
+  }
+  fetching = false;
+}
+
+$("fetch").addEventListener("click", () => act("", "/api/picture"));
+
+// ---------------------------------------------------------------------- account and plots
+
+const ACCOUNT = [
+  ["triggered", "answers to a trigger of ours"],
+  ["streamed", "sent by itself"],
+  ["late", "after its trigger had given up"],
+  ["wrong_application", "of another application"],
+  ["uninterpretable", "not readable"],
+  ["unclaimed", "nobody listened"],
+];
+const BESIDE = [["inspections_by_others", "triggered by others"], ["overtriggers", "overtriggered"], ["reconnects", "reconnects"], ["not_shown", "too fast for this page"]];
+
+function showAccount(account) {
+  const row = ([name, label], sign) => [make("dt", { textContent: `${sign}${label}` }), make("dd", { "data-count": name, textContent: String(account[name]) })];
+  $("account").replaceChildren(...row(["received", "received"], ""), ...ACCOUNT.flatMap((one, index) => row(one, index ? "+ " : "= ")), ...BESIDE.flatMap((one) => row(one, "")));
+  const sum = ACCOUNT.reduce((total, [name]) => total + account[name], 0);
+  setText("sum", sum === account.received ? "adds up" : `does not add up: ${sum} of ${account.received}`);
+}
+
+function takeClock(value) {
+  series = value.series.length > 1 ? value.series : [...series, ...value.series];
+  series = series.slice(-SERIES);
+  const last = series.at(-1);
+  if (!last) return;
+  if (value.series.length) offset = Date.now() / 1000 - last.at;
+  setText("rate-now", number(last.rate));
+  const told = series.filter((one) => one.latency !== null).at(-1);
+  setText("latency-now", told ? (told.latency * MM).toFixed(1) : "");
+  plot("rate", series.map((one) => [one.at, one.rate]));
+  plot("latency", series.filter((one) => one.latency !== null).map((one) => [one.at, one.latency * MM]));
+}
+
+function plot(id, points) {
+  const svg = $(id);
+  const { clientWidth: width, clientHeight: height } = svg;
+  if (!width) return;
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const most = round(Math.max(1, ...points.map(([, y]) => y)));
+  const end = series.at(-1).at;
+  const [left, top, low] = [34, 8, height - 16];
+  const at = ([x, y]) => [left + (1 + (x - end) / SERIES) * (width - left - 4), low - (y / most) * (low - top)];
+  const drawn = [];
+  for (const y of [0, most / 2, most]) {
+    const py = at([end, y])[1];
+    drawn.push(draw("line", { class: "rule", x1: left, x2: width, y1: py, y2: py }), draw("text", { x: left - 4, y: py + 3, "text-anchor": "end" }, number(y)));
+  }
+  for (const [minutes, anchor] of [[5, "start"], [2.5, "middle"], [0, "end"]]) drawn.push(draw("text", { x: at([end - 60 * minutes, 0])[0], y: height - 3, "text-anchor": anchor }, minutes ? `−${minutes} min` : "now"));
+  const visible = points.map(at);
+  drawn.push(draw("path", { d: visible.map(([x, y], index) => `${index && points[index][0] - points[index - 1][0] < 3 ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("") }));
+  if (visible.length) drawn.push(draw("circle", { cx: visible.at(-1)[0], cy: visible.at(-1)[1], r: 2.5 }));
+  svg.replaceChildren(...drawn);
+}
+
+// ---------------------------------------------------------------------- begin
+
+const given = new URLSearchParams(location.hash.slice(1)).get("token");
+if (given) sessionStorage.setItem("smartcam-token", given);
+token = sessionStorage.getItem("smartcam-token");
+history.replaceState(null, "", location.pathname);
+setInterval(showAge, 500);
+addEventListener("resize", drawParts);
+listen();

@@ -1,0 +1,374 @@
+"""The live page's site: what it tells of a camera, what it refuses, what bounds it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import aiohttp
+import pytest
+
+import smartcam
+from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight
+from smartcam.models import Localization, Pose, Position, Quaternion, Result
+from smartcam.web import LiveSite
+from smartcam.web._live import CALLS, MAX_NEWS
+from smartcam.web._live_view import (
+    MAX_PARTS,
+    MAX_RESULTS,
+    MAX_SHOWN_RAW,
+    MAX_VALUE,
+    ShownResult,
+    meaning,
+    verdicts,
+)
+from tests.web.sitekit import TOKEN, Caller, Listener, Raw, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from smartcam.client import SmartCamera
+
+CHECK = "ok: bool, width: real32"
+APPLICATIONS = (
+    Application(
+        id=5,
+        layout=CHECK,
+        constant={"ok": True, "width": 12.5},
+        load_time=0,
+        processing_time=0.001,
+    ),
+    Application(id=6, layout="n: int32", generator="sequence", rate=500, load_time=0,
+                processing_time=0.001),
+)  # fmt: skip
+FAST = smartcam.Backoff(initial=0.01, maximum=0.05)
+SUM = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
+
+
+class World(NamedTuple):
+    """A camera at the wire, its site, and who calls it."""
+
+    camera: SmartCamera[Any]
+    site: LiveSite
+    caller: Caller
+
+    @contextlib.asynccontextmanager
+    async def events(self, **headers: str) -> AsyncIterator[Listener]:
+        url = self.caller.url("/api/events")
+        async with self.caller.session.get(url, headers=headers) as response:
+            assert response.status == 200
+            yield Listener(response)
+
+
+@contextlib.asynccontextmanager
+async def shown(
+    url: str, *, control: bool = False, token: str | None = None, **options: Any
+) -> AsyncIterator[World]:
+    """Show the camera of a URL."""
+    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+    camera = smartcam.connect(url, **{"reconnect": FAST, **options})
+    async with (
+        LiveSite(camera, control=control, token=token) as site,
+        camera,
+        aiohttp.ClientSession(headers=headers) as session,
+    ):
+        yield World(camera, site, Caller(site, session, ""))
+
+
+@pytest.fixture
+async def emulator() -> AsyncIterator[EmulatedCamera]:
+    async with EmulatedCamera(APPLICATIONS, active=5, running=True) as emulator:
+        yield emulator
+
+
+# ---------------------------------------------------------------------- calls
+
+
+async def test_list_of_calls_has_every_call(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url) as world:
+        calls = (await world.caller.get("/api"))["calls"]
+    assert [(one["method"], one["path"]) for one in calls] == [(c.method, c.path) for c in CALLS]
+    assert all(one["about"] for one in calls)
+
+
+async def test_page_has_its_files_and_the_shared_style(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url) as world:
+        for path in ("/", "/live.js", "/live.css", "/emulator.css"):
+            async with world.caller.session.get(world.caller.url(path)) as response:
+                assert response.status == 200
+                assert "img-src 'self' data:" in response.headers["Content-Security-Policy"]
+        assert (await world.caller.call("GET", "/emulator.js")).status == 404
+
+
+COMMANDS: dict[str, object] = {
+    "trigger": {"timeout": 5.0},
+    "switch": {"application": 6},
+    "start": None,
+    "stop": None,
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+async def test_command_without_control_is_refused_and_reaches_no_camera(
+    emulator: EmulatedCamera, command: str
+) -> None:
+    async with shown(emulator.url) as world:
+        before = world.camera.statistics().frames_sent
+        answer = await world.caller.call("POST", f"/api/{command}", COMMANDS[command])
+        await world.caller.get("/api/camera")
+        await world.caller.get("/api/results")
+        assert world.camera.statistics().frames_sent == before
+    assert answer.status == 403
+    assert "--control" in answer.value["expected"]
+
+
+async def test_commands_with_control(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url, control=True) as world:
+        caller = world.caller
+        assert "RUNNING" not in (await caller.post("/api/stop"))["status"]
+        refused = await caller.call("POST", "/api/trigger")
+        assert (refused.status, "NotRunningError" in refused.value["came"]) == (409, True)
+        assert "RUNNING" in (await caller.post("/api/start"))["status"]
+        assert (await caller.post("/api/trigger", {"timeout": 30.0}))["number"] == 1
+        assert (await caller.post("/api/switch", {"application": 6}))["application"] == 6
+        gone = await caller.call("POST", "/api/switch", {"application": 99})
+        assert (gone.status, "CommandRejectedError" in gone.value["came"]) == (409, True)
+
+
+@pytest.mark.parametrize(
+    ("call", "body"),
+    [
+        ("trigger", {"timeout": 61.0}),
+        ("trigger", {"timeout": 0.0}),
+        ("trigger", {"more": 1}),
+        ("switch", {"application": -1}),
+        ("switch", {"application": 1 << 32}),
+        ("switch", {}),
+    ],
+)
+async def test_call_out_of_bounds_is_refused(
+    emulator: EmulatedCamera, call: str, body: object
+) -> None:
+    async with shown(emulator.url, control=True) as world:
+        assert (await world.caller.call("POST", f"/api/{call}", body)).status == 422
+
+
+async def test_site_is_guarded(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url, control=True) as world, Raw.connected(world.site) as raw:
+        status, _ = await raw.call("GET /api/camera HTTP/1.1", "Host: evil.example")
+        assert status == 403
+        evil = {"Origin": "http://evil.example"}
+        answer = await world.caller.call("POST", "/api/trigger", headers=evil)
+        assert answer.status == 403
+        assert world.camera.statistics().received == 0
+
+
+async def test_token_is_needed_where_there_is_one(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url, token=TOKEN) as world:
+        await world.caller.get("/api/camera")
+        for path in ("camera", "results", "picture", "events"):
+            other = {"Authorization": "Bearer another-token-of-some"}
+            answer = await world.caller.call("GET", f"/api/{path}", headers=other)
+            assert answer.status == 401
+
+
+# ---------------------------------------------------------------------- what is told
+
+
+async def test_result_is_told_and_the_account_adds_up(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url, interpret_as=CHECK) as world, world.events() as events:
+        first = await events.next("camera")
+        assert (first.data["connection"], first.data["control"]) == ("connected", False)
+        result = await world.camera.trigger()
+        (told,) = (await events.next("results")).data["results"]
+        account = await events.until("account", lambda account: account["received"])
+        (later,) = (await events.until("clock", lambda clock: clock["series"]))["series"][-1:]
+    assert told["number"] == result.number
+    assert told["value"] == {"ok": True, "width": 12.5}
+    assert told["verdicts"] == [{"name": "ok", "true": 1, "of": 1, "verdict": "pass"}]
+    assert told["raw"] == result.raw.hex(" ")
+    assert account["received"] == sum(account[name] for name in SUM) == account["triggered"] == 1
+    assert set(later) == {"at", "rate", "latency"}
+
+
+async def test_rate_is_told_over_time(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url, application=6) as world, world.events() as events:
+        told = await events.until(
+            "clock", lambda clock: clock["series"] and clock["series"][-1]["rate"] > 10
+        )
+        assert told["series"][-1]["latency"] is None
+
+
+async def test_container_that_cannot_be_read_is_told(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url, interpret_as="text: string[50]") as world:
+        with pytest.raises(smartcam.InterpretationError):
+            await world.camera.trigger()
+        await until(lambda: world.site.view.entries)
+        (told,) = (await world.caller.get("/api/results"))["results"]
+        account = (await world.caller.get("/api/camera"))["account"]
+    assert set(told) == {"serial", "error"}
+    assert account["uninterpretable"] == account["received"] == 1
+
+
+async def test_results_are_bounded_and_the_page_is_told_what_it_missed(
+    emulator: EmulatedCamera,
+) -> None:
+    async with shown(emulator.url, application=6) as world:
+        await until(lambda: world.site.view.serial > 2 * MAX_RESULTS)
+        await world.camera.stop()
+        assert len((await world.caller.get("/api/results"))["results"]) == MAX_RESULTS
+        async with world.events(**{"Last-Event-ID": "0"}) as events:
+            told = await events.next("results")
+    assert len(told.data["results"]) == MAX_NEWS
+    assert told.data["missed"] == told.data["results"][0]["serial"]
+    assert told.serial == str(told.data["results"][-1]["serial"] + 1)
+
+
+def result_of(value: object, raw: bytes = b"") -> Result[Any]:
+    return Result(
+        camera="c", application=7, sequence=None, number=1, triggered_at=None,
+        received_at=datetime.now(UTC), latency=None, raw=raw, value=value,
+    )  # fmt: skip
+
+
+def test_long_values_are_cut() -> None:
+    told = ShownResult(0, result_of(["x" * MAX_VALUE], bytes(1000)), "").as_json()
+    assert "value" not in told
+    assert len(json.dumps(told)) < MAX_VALUE
+    assert told["raw"] == bytes(MAX_SHOWN_RAW).hex(" ")
+    assert told["size"] == 1000
+
+
+def test_parts_are_told_in_the_plane_and_bounded() -> None:
+    header = smartcam.Header(1, datetime.now(UTC), "table")
+    pose = Pose(header, Position(0.1, 0.2), Quaternion.from_theta(0.5))
+    found = [Localization("bolt", 0.9, 0, pose)] * (MAX_PARTS + 1)
+    told = ShownResult(0, result_of(found), "").as_json()
+    assert (len(told["parts"]), told["count"], told["frame"]) == (
+        MAX_PARTS,
+        MAX_PARTS + 1,
+        "table",
+    )
+    assert told["parts"][0] == pytest.approx(
+        {"name": "bolt", "quality": 0.9, "x": 0.1, "y": 0.2, "z": 0.0, "theta": 0.5}
+    )
+    assert ShownResult(0, result_of([]), "").as_json()["parts"] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "good"),
+    [
+        ("ok", True),
+        ("Pass", True),
+        ("code_valid", True),
+        ("nok", False),
+        ("defect", False),
+        ("not_ok", False),
+        ("no_error", True),
+        ("present", None),
+        ("token", None),
+        ("ok_or_defect", None),
+    ],
+)
+def test_what_is_good_is_told_by_the_name(name: str, good: bool | None) -> None:
+    assert meaning(name) is good
+
+
+def test_verdict_of_records_counts() -> None:
+    records = [{"ok": True, "here": False}, {"ok": False, "here": False}]
+    assert verdicts(records) == [
+        {"name": "ok", "true": 1, "of": 2, "verdict": "fail"},
+        {"name": "here", "true": 0, "of": 2, "verdict": None},
+    ]
+    assert verdicts([{"defect": False}])[0]["verdict"] == "pass"
+    assert verdicts([1, 2]) == verdicts([]) == verdicts("text") == []
+
+
+# ---------------------------------------------------------------------- connection
+
+
+async def test_lost_camera_is_told_and_found_again(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url, interpret_as=CHECK) as world, world.events() as events:
+        await world.camera.trigger()
+        await emulator.stop()
+        lost = await events.until("camera", lambda state: "nothing listens" in state["last_error"])
+        assert lost["connection"] == "lost"
+        assert lost["loss"] == "the camera closed the connection"
+        again = EmulatedCamera(APPLICATIONS, active=5, running=True, port=emulator.port)
+        async with again:
+            found = await events.until("camera", lambda state: state["connection"] == "connected")
+            account = await events.until("account", lambda account: account["reconnects"])
+            await world.camera.trigger()
+            serials = [one.serial for one in world.site.view.entries]
+    assert (found["loss"], found["last_error"]) == ("", "")
+    assert account["reconnects"] == 1
+    assert serials == [0, 1]
+
+
+async def test_camera_taken_by_another_client_is_told(emulator: EmulatedCamera) -> None:
+    async with (
+        shown(emulator.url) as world,
+        world.events() as events,
+        smartcam.connect(emulator.url, reconnect=FAST),
+    ):
+        over = {"taken", "ended"}
+        told = await events.until("camera", lambda state: state["connection"] in over)
+    assert told["connection"] == "taken"
+    assert "another client" in told["loss"]
+
+
+async def test_another_camera_is_followed_while_the_first_is_not_there(
+    emulator: EmulatedCamera,
+) -> None:
+    async with shown(emulator.url) as world, world.events() as events:
+        await world.camera.trigger()
+        other = smartcam.connect(emulator.url)
+        await world.site.view.follow(other, "nothing there")
+        told = await events.until("camera", lambda state: state["connection"] == "awaited")
+        assert (told["loss"], told["status"], told["can"]) == ("nothing there", [], None)
+        async with other:
+            await events.until("camera", lambda state: state["connection"] == "connected")
+            await other.trigger()
+            await until(lambda: len(world.site.view.entries) == 2)
+        assert [one.serial for one in world.site.view.entries] == [0, 1]
+
+
+# ---------------------------------------------------------------------- picture
+
+
+async def test_picture_is_fetched_when_somebody_looks() -> None:
+    async with EmulatedInSight(online=True) as emulator, shown(emulator.url) as world:
+        assert (await world.caller.call("GET", "/api/picture")).status == 404
+        async with world.events() as events:
+            await events.until("picture", lambda picture: picture["serial"] == 1)
+            url = world.caller.url("/api/picture")
+            async with world.caller.session.get(url) as response:
+                assert response.content_type == "image/bmp"
+                data = await response.read()
+            await world.caller.post("/api/picture")
+            await events.until("picture", lambda picture: picture["serial"] == 2)
+    assert data.startswith(b"BM")
+
+
+async def test_picture_that_cannot_be_had_is_told() -> None:
+    async with (
+        EmulatedInSight(online=True) as emulator,
+        shown(emulator.url) as world,
+        world.events() as events,
+    ):
+        await events.until("picture", lambda picture: picture["serial"] == 1)
+        emulator.answer_next(-2, command="RI")
+        await world.caller.post("/api/picture")
+        told = await events.until("camera", lambda state: state["picture_error"])
+    assert "-2" in told["picture_error"]
+
+
+async def test_camera_without_pictures_is_asked_for_none(emulator: EmulatedCamera) -> None:
+    async with shown(emulator.url) as world, world.events() as events:
+        await world.caller.post("/api/picture")
+        await events.next("account")
+        await events.next("clock")
+        assert world.site.view.picture is None
+        assert world.site.view.picture_error == ""
