@@ -302,7 +302,7 @@ function showLast() {
 
 function makeValue(one) {
   if (one.error !== undefined) return make("p", { className: "error", textContent: says(one) });
-  if (one.parts) return makeTable(one.parts.slice(0, 20).map((part) => ({ part: part.name, "x, mm": mm(part.x), "y, mm": mm(part.y), ...(one.parts.some((each) => each.z) ? { "z, mm": mm(part.z) } : {}), θ: degrees(part.theta), quality: part.quality === null ? "" : number(part.quality) })), one.count, "No part was found.");
+  if (one.parts) return makeTable(one.parts.slice(0, 20).map((part) => ({ part: part.name, "x, mm": mm(part.x), "y, mm": mm(part.y), ...(one.parts.some((each) => each.z) ? { "z, mm": mm(part.z) } : {}), θ: degrees(part.theta), quality: part.quality === null ? "" : part.quality.toFixed(3) })), one.count, "No part was found.");
   const { value } = one;
   if (Array.isArray(value) && value.every((each) => each !== null && typeof each === "object" && !Array.isArray(each))) return makeTable(value.slice(0, 20), value.length, "No record.");
   if (value !== null && typeof value === "object" && !Array.isArray(value)) return make("dl", {}, ...list(Object.fromEntries(Object.entries(value).map(([key, each]) => [key, short(each)]))));
@@ -364,7 +364,11 @@ function drawParts() {
     if (py > head && py < height - 24) drawn.push(draw("text", { x: 5, y: py - 3 }, number(y)));
   }
   const last = results.find((one) => one.error === undefined) ?? {};
-  for (const part of drawable(last)) drawn.push(drawPart(part, at(part.x * MM, part.y * MM), width));
+  const taken = drawable(last).flatMap(({ x, y, theta }) => { // what names keep clear of: parts and their arrows
+    const centre = at(x * MM, y * MM);
+    return [box(centre, -10, -10, 20, 20), box(centre, 18 * Math.cos(theta) - 6, -18 * Math.sin(theta) - 6, 12, 12)];
+  });
+  for (const part of drawable(last)) drawn.push(drawPart(part, at(part.x * MM, part.y * MM), width, taken));
   const length = step * scale;
   drawn.push(draw("line", { class: "bar", x1: width - 12 - length, x2: width - 12, y1: 14, y2: 14 }));
   drawn.push(draw("text", { x: width - 12 - length / 2, y: 30, "text-anchor": "middle", "data-scale": step }, `${number(step)} mm`));
@@ -372,14 +376,26 @@ function drawParts() {
   setText("frame", last.frame ? `mm, in the frame of ${last.frame}; x right, y up` : "mm; x right, y up");
 }
 
-function drawPart(part, [x, y], width) {
+const box = ([x, y], left, top, width, height) => ({ left: x + left, top: y + top, right: x + left + width, bottom: y + top + height });
+const meets = (one, other) => one.left < other.right && other.left < one.right && one.top < other.bottom && other.top < one.bottom;
+
+// Where a name stands beside its part: the first of some places that is free, or the first.
+function nameAt(name, at, width, taken) {
+  const long = 7 * name.length;
+  const places = [[14, -24], [-14 - long, -24], [14, 10], [-14 - long, 10], [-long / 2, -38], [-long / 2, 24]].map(([left, top]) => box(at, left, top, long, 15));
+  const inside = places.filter((one) => one.left >= 0 && one.right <= width);
+  const found = inside.find((one) => !taken.some((other) => meets(one, other))) ?? inside[0] ?? places[0];
+  taken.push(found);
+  return { x: found.left, y: found.top + 12 };
+}
+
+function drawPart(part, [x, y], width, taken) {
   const label = `${part.name}: x ${mm(part.x)} mm, y ${mm(part.y)} mm, ${degrees(part.theta)}`;
   const turned = part.theta === null ? 0 : (-part.theta * 180) / Math.PI;
-  const beside = x > width - 130 ? { x: x - 16, "text-anchor": "end" } : { x: x + 16 };
   return draw("g", { class: "found", "data-part": part.name }, draw("title", {}, label),
     draw("g", { transform: `translate(${x} ${y}) rotate(${turned})` },
       draw("circle", { class: "body", r: 9 }), draw("path", { class: "arrow", d: "M0 0H24M18 -5L24 0L18 5M0 -6V6" })),
-    draw("text", { class: "called", y: y - 12, ...beside }, part.name));
+    draw("text", { class: "called", ...nameAt(part.name, [x, y], width, taken) }, part.name));
 }
 
 function arrange() {
