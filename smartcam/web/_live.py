@@ -60,7 +60,7 @@ class LiveSite(Site):
         port: int = 0,
         token: str | None = None,
     ) -> None:
-        super().__init__(CALLS, "live", styles=["emulator"], host=host, port=port, token=token)
+        super().__init__(CALLS, "live", host=host, port=port, token=token)
         self.control: bool = control
         self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)))
 

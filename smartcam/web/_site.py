@@ -1,4 +1,4 @@
-"""A web site in the running event loop: a page of three files, and calls."""
+"""A web site in the running event loop: a page, which is a few files, and calls."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from smartcam.web._routes import MAX_BODY, middleware, routes
 from smartcam.web._streams import Streams
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Awaitable, Callable
 
     from smartcam.web._routes import Calls
 
@@ -46,7 +46,7 @@ class Site(Server):
 
     Args:
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css.
-        styles: names of other pages whose PAGE.css it uses, too.
+            Pages may use ``base.css``, too.
         host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
 
     Attributes:
@@ -63,7 +63,6 @@ class Site(Server):
         calls: Calls[Any],
         page: str,
         *,
-        styles: Sequence[str] = (),
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
@@ -77,7 +76,6 @@ class Site(Server):
         self.streams: Streams = Streams()
         self._calls = calls
         self._page = page
-        self._files = [f"{page}.js", *(f"{one}.css" for one in (page, *styles))]
         self._port = port
         self._open: _Open | None = None
 
@@ -155,7 +153,7 @@ class Site(Server):
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))
         application.router.add_get("/", _file(f"{self._page}.html"))
-        for name in self._files:
+        for name in ("base.css", f"{self._page}.css", f"{self._page}.js"):
             application.router.add_get(f"/{name}", _file(name))
         return application
 

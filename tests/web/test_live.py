@@ -95,7 +95,7 @@ async def test_list_of_calls_has_every_call(emulator: EmulatedCamera) -> None:
 
 async def test_page_has_its_files_and_the_shared_style(emulator: EmulatedCamera) -> None:
     async with shown(emulator.url) as world:
-        for path in ("/", "/live.js", "/live.css", "/emulator.css"):
+        for path in ("/", "/live.js", "/live.css", "/base.css"):
             async with world.caller.session.get(world.caller.url(path)) as response:
                 assert response.status == 200
                 assert "img-src 'self' data:" in response.headers["Content-Security-Policy"]

@@ -205,6 +205,8 @@ async def test_nothing_is_cut(page: Page, width: int, height: int) -> None:
         async with EmulatedCamera() as emulator, opened(page, emulator.url, **PARTS):
             await page.click("#trigger")
             await see(page, ".found")
+            for drawn in ("#last th", "#rate text", "#latency text", ".results th"):
+                await see(page, drawn)
             assert await page.evaluate("document.documentElement.scrollWidth") == width
             wide = await page.evaluate(
                 "[...document.querySelectorAll('.panel, .panel button, .last, dl, svg, .log-box')]"
