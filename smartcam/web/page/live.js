@@ -302,7 +302,7 @@ function showLast() {
 
 function makeValue(one) {
   if (one.error !== undefined) return make("p", { className: "error", textContent: says(one) });
-  if (one.parts) return makeTable(one.parts.slice(0, 20).map((part) => ({ part: part.name, "x, mm": mm(part.x), "y, mm": mm(part.y), θ: degrees(part.theta), quality: part.quality === null ? "" : number(part.quality) })), one.count, "No part was found.");
+  if (one.parts) return makeTable(one.parts.slice(0, 20).map((part) => ({ part: part.name, "x, mm": mm(part.x), "y, mm": mm(part.y), ...(one.parts.some((each) => each.z) ? { "z, mm": mm(part.z) } : {}), θ: degrees(part.theta), quality: part.quality === null ? "" : number(part.quality) })), one.count, "No part was found.");
   const { value } = one;
   if (Array.isArray(value) && value.every((each) => each !== null && typeof each === "object" && !Array.isArray(each))) return makeTable(value.slice(0, 20), value.length, "No record.");
   if (value !== null && typeof value === "object" && !Array.isArray(value)) return make("dl", {}, ...list(Object.fromEntries(Object.entries(value).map(([key, each]) => [key, short(each)]))));
