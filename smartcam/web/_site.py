@@ -46,7 +46,7 @@ class Site(Server):
 
     Args:
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css.
-            Pages may use ``base.css``, too.
+            Pages may use ``base.css`` and ``base.js``, too.
         host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
 
     Attributes:
@@ -153,7 +153,7 @@ class Site(Server):
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))
         application.router.add_get("/", _file(f"{self._page}.html"))
-        for name in ("base.css", f"{self._page}.css", f"{self._page}.js"):
+        for name in ("base.css", "base.js", f"{self._page}.css", f"{self._page}.js"):
             application.router.add_get(f"/{name}", _file(name))
         return application
 

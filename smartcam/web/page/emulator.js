@@ -1,18 +1,8 @@
 // The emulator's page. Everything it does is one of the HTTP calls of GET /api.
 
-const $ = (id) => document.getElementById(id);
-const SVG = "http://www.w3.org/2000/svg";
+import { $, BITS, SILENT_MS, draw, events, make, setText } from "./base.js";
+
 const MAX_ROWS = 300; // log rows in the document
-const SILENT_MS = 6000; // the stream tells its clock once a second
-const BITS = [
-  ["RUNNING", "Running", "good"],
-  ["WAITING_FOR_TRIGGER", "Waiting for trigger", "good"],
-  ["BUSY", "Busy", "warn"],
-  ["OVERTRIGGERED", "Overtriggered", "warn"],
-  ["INPUT_CONTAINER", "Input container", "warn"],
-  ["OVERHEAT", "Overheat", "bad"],
-  ["SYSTEM_ERROR", "System error", "bad"],
-];
 
 let token = null;
 let camera = null; // name of the one shown
@@ -22,23 +12,6 @@ let kinds = [];
 let selected = null; // name of a part
 let origin = 0; // of the times shown: the log's first
 let stream = null; // AbortController of the event stream
-
-function make(tag, attributes = {}, ...children) {
-  const element = document.createElement(tag);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (key in element && key !== "list" && key !== "form") element[key] = value;
-    else if (value !== null && value !== undefined) element.setAttribute(key, value);
-  }
-  element.append(...children);
-  return element;
-}
-
-function draw(tag, attributes = {}, ...children) {
-  const element = document.createElementNS(SVG, tag);
-  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-  element.append(...children);
-  return element;
-}
 
 // ---------------------------------------------------------------------- calls
 
@@ -256,22 +229,6 @@ async function listen(name) {
   }
 }
 
-async function* events(body) {
-  const reader = body.pipeThrough(new TextDecoderStream()).getReader();
-  let rest = "";
-  for (;;) {
-    const { value, done } = await reader.read();
-    if (done) return;
-    const parts = (rest + value).split("\n\n");
-    rest = parts.pop();
-    for (const part of parts) {
-      const lines = part.split("\n").map((line) => [line.slice(0, line.indexOf(": ")), line.slice(line.indexOf(": ") + 2)]);
-      const { event: kind, data } = Object.fromEntries(lines);
-      yield { kind, data: JSON.parse(data) };
-    }
-  }
-}
-
 const seconds = (time, digits) => (time - origin).toFixed(digits);
 
 const TAKE = {
@@ -289,11 +246,6 @@ const TAKE = {
 };
 
 // ---------------------------------------------------------------------- the camera's state
-
-function setText(id, text) {
-  const element = $(id);
-  if (element && element.textContent !== text) element.textContent = text;
-}
 
 function takeState(value) {
   if (value.name !== camera) return;

@@ -1,21 +1,11 @@
 // The live page: shows what a camera sends. Everything it does is one of the HTTP calls of GET /api.
 
-const $ = (id) => document.getElementById(id);
-const SVG = "http://www.w3.org/2000/svg";
+import { $, BITS, SILENT_MS, draw, events, make, setText } from "./base.js";
+
 const MAX_ROWS = 100; // results in the document
-const SILENT_MS = 6000; // the stream tells its clock once a second
 const OLD_S = 10; // a result of before is called old
 const SERIES = 300; // seconds that the plots show
 const MM = 1000;
-const BITS = [
-  ["RUNNING", "Running", "good"],
-  ["WAITING_FOR_TRIGGER", "Waiting for trigger", "good"],
-  ["BUSY", "Busy", "warn"],
-  ["OVERTRIGGERED", "Overtriggered", "warn"],
-  ["INPUT_CONTAINER", "Input container", "warn"],
-  ["OVERHEAT", "Overheat", "bad"],
-  ["SYSTEM_ERROR", "System error", "bad"],
-];
 
 let token = null;
 let state = null; // the camera, as its events tell it
@@ -25,27 +15,6 @@ let missed = 0;
 let series = [];
 let view = null; // what the drawing shows, metres
 let offset = 0; // seconds that this machine's clock is ahead of the server's
-
-function make(tag, attributes = {}, ...children) {
-  const element = document.createElement(tag);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (key in element) element[key] = value;
-    else if (value !== null && value !== undefined) element.setAttribute(key, value);
-  }
-  element.append(...children);
-  return element;
-}
-
-function draw(tag, attributes = {}, ...children) {
-  const element = document.createElementNS(SVG, tag);
-  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-  element.append(...children);
-  return element;
-}
-
-function setText(id, text) {
-  if ($(id).textContent !== text) $(id).textContent = text;
-}
 
 // ---------------------------------------------------------------------- calls
 
@@ -126,22 +95,6 @@ async function listen() {
     showAlarm();
     await new Promise((done) => setTimeout(done, pause));
     pause = Math.min(3000, pause * 2);
-  }
-}
-
-async function* events(body) {
-  const reader = body.pipeThrough(new TextDecoderStream()).getReader();
-  let rest = "";
-  for (;;) {
-    const { value, done } = await reader.read();
-    if (done) return;
-    const parts = (rest + value).split("\n\n");
-    rest = parts.pop();
-    for (const part of parts) {
-      const lines = part.split("\n").map((line) => [line.slice(0, line.indexOf(": ")), line.slice(line.indexOf(": ") + 2)]);
-      const { event: kind, data, id } = Object.fromEntries(lines);
-      yield { kind, id, data: JSON.parse(data) };
-    }
   }
 }
 
