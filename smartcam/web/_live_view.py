@@ -123,7 +123,7 @@ class LiveView:
         """
         await self.stop()
         self._end, self.loss = None, loss
-        self.camera = camera
+        self.camera: SmartCamera[Any] = camera
         self._subscribe(camera)
         self.start()
 
