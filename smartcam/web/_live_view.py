@@ -78,7 +78,7 @@ class LiveView:
     """
 
     def __init__(self, camera: SmartCamera[Any], is_watched: Callable[[], bool]) -> None:
-        self.camera = camera
+        self.camera: SmartCamera[Any] = camera
         self.entries: collections.deque[ShownResult] = collections.deque(maxlen=MAX_RESULTS)
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
         self.picture: Picture | None = None
@@ -123,7 +123,7 @@ class LiveView:
         """
         await self.stop()
         self._end, self.loss = None, loss
-        self.camera: SmartCamera[Any] = camera
+        self.camera = camera
         self._subscribe(camera)
         self.start()
 
