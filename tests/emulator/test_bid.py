@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from typing import Any
 
 import pytest
@@ -248,11 +248,12 @@ async def test_bid_switch_voids_the_inspection_under_way(at_21: Rig) -> None:
     ],
 )
 @pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("waiting", [(), (faults.Drop(on=m.ResultContainer), faults.NoResult())])
 async def test_bid_bad_message_is_answered_with_a_code_or_ignored(
-    transport: Any, request_: str, answer: str, *, told: bool
+    transport: Any, request_: str, answer: str, *, told: bool, waiting: Sequence[faults.Fault]
 ) -> None:
     quirks = {"bad_message": "code" if told else "ignore"}
-    async with rig(transport, "bid", active=21, quirks=quirks) as camera:
+    async with rig(transport, "bid", active=21, quirks=quirks, faults=waiting) as camera:
         await camera.opens(CONNECTED)
         camera.client.send(frame(request_))
         if told:

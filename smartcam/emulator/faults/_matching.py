@@ -112,8 +112,9 @@ class FaultQueue:
     def by_message(self, rows: list[Row], message: m.Message) -> list[Fault]:
         """Return the faults among ``rows`` that a message brings about, as :meth:`by_frame`."""
         number = self._dialect.message_id(message)
-        name = self._dialect.message_type(message.sender, number).__name__
-        return self._take(rows, name, number, message)
+        unnamed = isinstance(message, m.UnknownMessage)  # a code that refuses, alone
+        kind = type(message) if unnamed else self._dialect.message_type(message.sender, number)
+        return self._take(rows, kind.__name__, number, message)
 
     def at_once(self) -> list[Fault]:
         """Return the faults that wait for no message, in order."""
