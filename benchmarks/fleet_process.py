@@ -99,7 +99,7 @@ class SmartcamSide:
 
     def __init__(self, port: int) -> None:
         self._url = f"bvs://127.0.0.1:{port}?dialect=handbook"
-        self.cameras: list[smartcam.SmartCamera] = []
+        self.cameras: list[smartcam.Camera] = []
 
     async def open(self) -> None:
         """Open one more."""

@@ -133,7 +133,7 @@ async def _measure(
 
     async with contextlib.AsyncExitStack() as stack:
 
-        async def connect(port: int, interpret_as: str) -> smartcam.SmartCamera:
+        async def connect(port: int, interpret_as: str) -> smartcam.Camera:
             url = f"bvs://127.0.0.1:{port}?dialect=handbook"
             camera = smartcam.connect(url, interpret_as=interpret_as)
             return await stack.enter_async_context(camera)

@@ -139,7 +139,7 @@ def _connected() -> Machine:
     return machine
 
 
-async def _end_to_end(camera: smartcam.SmartCamera, messages: int, times: int) -> Cost:
+async def _end_to_end(camera: smartcam.Camera, messages: int, times: int) -> Cost:
     go = messages.to_bytes(8, "little")
     begin = time.process_time()
     for _ in range(times):

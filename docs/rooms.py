@@ -38,7 +38,7 @@ ROOMS = (
     Room("conformance", "judges", 3, 1),
     Room("calibration", "camera to robot", 0, 5),
     Room("doctor", "what is wrong", 1, 2),
-    Room("client", "what a program uses", 1, 3, ("client", "sync")),
+    Room("client", "what a program uses", 1, 3, ("camera", "client", "connecting", "sync")),
     Room("emulator", "cameras without one", 3, 3),
     Room("_client", "how a client works", 1.5, 4),
     Room("interpreters", "payload to value", 1, 5),
@@ -74,7 +74,7 @@ def _room(module: str) -> str:
             return room.title
     if any((ROOT / "smartcam").glob(f"{module}*")):
         raise LookupError(f"smartcam/{module} is in no room of the drawing")
-    return "client" if module in {"SmartCamera", "connect"} else "values"
+    return "client" if module in {"Camera", "SmartCamera", "connect"} else "values"
 
 
 def _imported(tree: ast.AST) -> set[str]:

@@ -1,7 +1,7 @@
 """Talk to industrial smart cameras.
 
 ``async with smartcam.connect("bvs://192.168.0.10", application=7) as camera`` gives a
-:class:`~smartcam.SmartCamera`. ``import smartcam`` is light: names are resolved when they
+:class:`~smartcam.Camera`. ``import smartcam`` is light: names are resolved when they
 are first used.
 """
 
@@ -14,7 +14,9 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam import emulator, exceptions, interpreters, layout, models, protocols
     from smartcam.backoff import Backoff
-    from smartcam.client import SmartCamera, connect
+    from smartcam.camera import Camera
+    from smartcam.client import SmartCamera
+    from smartcam.connecting import connect
     from smartcam.exceptions import (
         CalibrationError,
         CameraBusyError,
@@ -74,6 +76,7 @@ __all__ = [
     "ApplicationChanged",
     "Backoff",
     "CalibrationError",
+    "Camera",
     "CameraBusyError",
     "CameraEvent",
     "CameraFaultError",
@@ -137,7 +140,9 @@ if not TYPE_CHECKING:
         {
             "": "emulator exceptions interpreters layout models protocols",
             "backoff": "Backoff",
-            "client": "SmartCamera connect",
+            "camera": "Camera",
+            "client": "SmartCamera",
+            "connecting": "connect",
             "exceptions": " ".join(name for name in __all__ if name.endswith("Error")),
             "layout": "Layout",
             "models": "ApplicationChanged CameraEvent Capabilities Connected Disconnected Header "

@@ -1,4 +1,4 @@
-"""The camera as the user sees it.
+"""A camera at the wire.
 
 ``open()`` starts the :class:`~smartcam._client.supervisor.Supervisor`, which makes sessions and has
 every chunk of their links handed on by the :class:`~smartcam._client.dispatch.Dispatch`. Commands
@@ -7,20 +7,16 @@ stand here; each is a few messages out and a wait with a deadline.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
+from datetime import datetime
+from typing import TYPE_CHECKING
 
 from smartcam._client.camera_state import CameraState
 from smartcam._client.command_lock import CommandLock
 from smartcam._client.commands import Commands
 from smartcam._client.connection import Connection
-from smartcam._client.counters import ClientCounters
 from smartcam._client.dispatch import Dispatch
-from smartcam._client.interpretation import Interpretation
 from smartcam._client.keepalive import KeepAlive
-from smartcam._client.listeners import Listeners
 from smartcam._client.polling import Polling
 from smartcam._client.requests import Requests
 from smartcam._client.results import Results
@@ -28,8 +24,8 @@ from smartcam._client.status import StatusRequests, is_ready
 from smartcam._client.supervisor import Supervisor
 from smartcam._client.triggering import TriggerRequest, Triggers
 from smartcam._client.waits import Waits
+from smartcam.camera import DEFAULT_RECONNECT_TIMEOUT, Camera
 from smartcam.exceptions import (
-    ConfigurationError,
     ConnectionClosedError,
     InterpretationError,
     LocalProtocolError,
@@ -37,159 +33,31 @@ from smartcam.exceptions import (
     SmartCamError,
     TriggerTimeoutError,
 )
-from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status, ValueT
-from smartcam.observers import Observer, Observers
+from smartcam.models import Capabilities, Result, Status, ValueT
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Transport
-from smartcam.settings import CameraOptions, CameraSettings
-from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterable
-    from types import TracebackType
-    from typing import Literal, NoReturn, Self, Unpack
+    from collections.abc import AsyncGenerator, Callable, Iterable
+    from typing import Self
 
-    from smartcam.interpreters._base import AnySpec, TypedSpec
-    from smartcam.models import Localization
-    from smartcam.settings import OtherOptions
+    from smartcam.observers import Observer
+    from smartcam.settings import CameraSettings
 
 
-__all__ = ["SmartCamera", "connect"]
-
-QueueT = TypeVar("QueueT", bound=Queue[Any])
-T = TypeVar("T")
-
-DEFAULT_MAX_QUEUE = 1024
-"""Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
-
-DEFAULT_MAX_QUEUE_BYTES = 1 << 26
-"""Bytes of containers a subscriber's queue holds: 1024 of the 64 kB that a camera sends at most, so
-it bounds nothing but larger ones; what is made of them may take several times as much."""
-
-MAX_INTERPRETATIONS = 32
-"""Texts given as ``interpret_as`` whose interpreters a client keeps."""
-
-DEFAULT_TRIGGER_TIMEOUT = 5.0
-"""Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
-
-DEFAULT_RECONNECT_TIMEOUT = 60.0
-"""Seconds for a session to be there again: a reboot takes about 30 (mvBlueGEMINI manual p. 31,
-published for the sibling)."""
+__all__ = ["SmartCamera"]
 
 
-@overload
-def connect(
-    url: str,
-    *,
-    model: str | None = None,
-    observers: Iterable[Observer] = (),
-    interpret_as: None = None,
-    **options: Unpack[OtherOptions],
-) -> SmartCamera[bytes]: ...
+class SmartCamera(Camera[ValueT]):
+    """A camera at the wire: this client has its only session.
 
-
-@overload
-def connect(
-    url: str,
-    *,
-    model: str | None = None,
-    observers: Iterable[Observer] = (),
-    interpret_as: Literal["localizations"],
-    **options: Unpack[OtherOptions],
-) -> SmartCamera[list[Localization]]: ...
-
-
-@overload
-def connect(
-    url: str,
-    *,
-    model: str | None = None,
-    observers: Iterable[Observer] = (),
-    interpret_as: AnySpec,
-    **options: Unpack[OtherOptions],
-) -> SmartCamera[Any]: ...
-
-
-@overload
-def connect(
-    url: str,
-    *,
-    model: str | None = None,
-    observers: Iterable[Observer] = (),
-    interpret_as: TypedSpec[T],
-    **options: Unpack[OtherOptions],
-) -> SmartCamera[T]: ...
-
-
-@overload
-def connect(
-    url: str,
-    *,
-    model: str | None = None,
-    observers: Iterable[Observer] = (),
-    **options: Unpack[CameraOptions],
-) -> SmartCamera[Any]: ...
-
-
-def connect(
-    url: str,
-    *,
-    model: str | None = None,
-    observers: Iterable[Observer] = (),
-    **options: Unpack[CameraOptions],
-) -> SmartCamera[Any]:
-    """Return a camera to be opened with ``async with`` (or ``await``).
-
-    Args:
-        url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
-            pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
-        model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
-        observers: see frames, events, results and errors:
-            :class:`~smartcam.Observer`.
-        **options: ``name``, ``application``, ``interpret_as``, ``calibration``, ``y_down``,
-            ``lenient``, ``connect_timeout``, ``connect_attempts``, ``switch_timeout``,
-            ``request_timeout``, ``close_timeout``, ``liveness_timeout``, ``reconnect``,
-            ``restore``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
-
-    With ``calibration`` the value of every result is a list of localizations in the robot's frame,
-    as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
-    an observer. It gets what ``interpret_as`` gives, turned to y up with ``y_down``; the headers'
-    frame is the camera's ``name``, which a calibration with a ``camera_frame`` wants to be that.
-    No value passes without it. One that is no list of localizations, or that the calibration
-    refuses, is an :exc:`~smartcam.InterpretationError` with the cause chained; an
-    interpreter whose values never are localizations (raw, record, table, strings50) is a
-    ConfigurationError at once. A mapping from application id takes another calibration for each,
-    and None for those whose values are to stay as they are; an application that it lacks is an
-    error, too.
-
-    Raises:
-        ConfigurationError: an address or option cannot work; nothing was tried.
-    """
-    return SmartCamera(CameraSettings.make(url, model, options), observers=observers)
-
-
-class SmartCamera(Generic[ValueT]):
-    """A smart camera; made by :func:`connect`.
-
-    It outlives its links: one that is lost is made again as ``reconnect`` says. Until then every
-    method that talks to the camera raises :exc:`~smartcam.ConnectionLostError` at once,
-    with the first cause chained; nothing is sent again by itself. Before ``open()`` and after
-    ``close()`` it is :exc:`~smartcam.ConnectionClosedError`, and
-    :exc:`~smartcam.ConnectionTakenError` once another client has taken the camera,
-    which ends this one. Then make a new one.
-
-    Args:
-        settings: validated options.
-        observers: see what happens.
+    :exc:`~smartcam.ConnectionTakenError` is what everything raises once another client has taken
+    the camera, which ends this one. Then make a new one.
     """
 
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
-        self.settings = settings
-        self._observers = Observers(observers)
-        self._observed = bool(self._observers)
-        self._interpretations: dict[str, Interpretation] = {}  # by their text
-        self._counters = counters = ClientCounters()
-        self._listeners = listeners = Listeners(settings.name, self._observers)
+        super().__init__(settings, observers=observers)
+        counters, listeners = self._counters, self._listeners
         self._state = state = CameraState(settings.name, settings.application, listeners)
         self._waits = waits = Waits(counters)
         self._connection = connection = Connection(settings.name, waits)
@@ -198,9 +66,8 @@ class SmartCamera(Generic[ValueT]):
         polling = Polling(connection, state, waits, listeners, patience)
         self._status = status = StatusRequests(connection, requests, polling, state, waits)
         self._commands = commands = Commands(connection, requests, status, state)
-        spec = settings.interpret_as
         self._results = results = Results(
-            settings.name, self._interpretation(spec), requests, state, listeners, counters
+            settings.name, self._default, requests, state, listeners, counters
         )
         self._dispatch = Dispatch(
             settings.name, state, waits, results, listeners, requests, polling, counters
@@ -224,19 +91,22 @@ class SmartCamera(Generic[ValueT]):
             self._observers,
         )
 
-    # ------------------------------------------------------------------ life
+    def _require_session(self) -> None:
+        self._connection.require_link()
+
+    def _deadline(self, timeout: float) -> float:
+        return self._connection.deadline(timeout)
+
+    def _listens(self, subscribers: object) -> None:
+        self._status.wanted()
+
+    def _over(self) -> tuple[SmartCamError | None] | None:
+        end = self._waits.end
+        if end is None or not self._supervisor.over:  # between two sessions it waits for the next
+            return None
+        return (None if isinstance(end, ConnectionClosedError) else end,)
 
     async def open(self) -> Self:
-        """Connect; with ``application=`` in the options also have it running and ready.
-
-        Raises:
-            ConnectFailedError: no session; names each attempt and what came.
-            CommandRejectedError: the camera does not have the application.
-            ResponseTimeoutError: it did not become ready within ``switch_timeout``.
-            ConnectionLostError: the session was lost again before the application was ready.
-
-        Cancellation: the link is dropped.
-        """
         if self._supervisor.started or self._waits.end is not None:
             raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
         try:
@@ -250,421 +120,55 @@ class SmartCamera(Generic[ValueT]):
         return self
 
     async def close(self) -> None:
-        """Send Disconnect, end the link, wait for the client's tasks. Idempotent, bounded.
-
-        Going back after a temporary switch is finished first, within ``switch_timeout``. Otherwise
-        the camera's application and run state are left as they are.
-        Cancellation: the link is dropped at once.
-        """
         await self._supervisor.close()
 
     async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
-        """Wait until there is a session, and what ``restore`` asks for is done.
-
-        Args:
-            timeout: seconds.
-
-        Raises:
-            ResponseTimeoutError: there was none in time; the last loss is told.
-            ConnectionLostError: ``reconnect`` is None, or it gave up.
-            ConnectionTakenError: another client has the camera.
-            ConnectionClosedError: not opened, or closed.
-
-        Cancellation: safe.
-        """
         await self._supervisor.wait_connected(self._connection.deadline(timeout), timeout)
-
-    async def __aenter__(self) -> Self:
-        return await self.open()
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
-    ) -> None:
-        await self.close()
-
-    def __await__(self) -> Generator[Any, None, Self]:
-        return self.open().__await__()
-
-    def __enter__(self) -> NoReturn:
-        raise TypeError(
-            "a smartcam.SmartCamera is opened by `async with smartcam.connect(...) as camera`; "
-            "without asyncio: `with smartcam.sync.connect(...) as camera`"
-        )
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def __repr__(self) -> str:
-        return f"<SmartCamera {self.name} {self.url}>"
-
-    # ------------------------------------------------------------------ what is known
-
-    @property
-    def name(self) -> str:
-        """The camera's name in logs and results."""
-        return self.settings.name
 
     @property
     def url(self) -> str:
-        """Its address, with the dialect pinned once it was found out."""
         return self._supervisor.address.url
 
     @property
     def connected(self) -> bool:
-        """Whether there is a session."""
         return self._supervisor.connected
 
     @property
     def status(self) -> Status:
-        """The last status the camera sent; after a loss it is the one of before.
-
-        Raises:
-            ConnectionClosedError: there was no session yet.
-        """
         if self._state.status is None:
             raise self._supervisor.closed_error()
         return self._state.status
 
     @property
     def active_application(self) -> int | None:
-        """Id of the active application as last told by the camera; None before ``open()``."""
         return self._state.active
 
     @property
     def protocol_version(self) -> int | None:
-        """Version from the answer to Connect; None before ``open()``."""
         session = self._supervisor.session
         return session.version if session is not None else None
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the camera can do in the dialect that it speaks.
-
-        Raises:
-            ConnectionClosedError: there was no session yet, so the dialect is not known.
-        """
         session = self._supervisor.session
         if session is None:
             raise self._supervisor.closed_error()
         return session.dialect.capabilities
 
-    def statistics(self) -> Statistics:
-        """Return everything counted so far, over all sessions. The accounts balance at any time."""
-        streams = self._listeners.streams()
-        return self._counters.statistics(s.statistics() for s in streams if not s.ended)
-
-    # ------------------------------------------------------------------ streams and waits
-
-    @overload
-    def results(
-        self,
-        *,
-        batch: Literal[False] = False,
-        min_interval: float = 0.0,
-        max_queue: int = DEFAULT_MAX_QUEUE,
-        max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
-        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> Subscription[Result[ValueT]]: ...
-
-    @overload
-    def results(
-        self,
-        *,
-        batch: Literal[True],
-        min_interval: float = 0.0,
-        max_queue: int = DEFAULT_MAX_QUEUE,
-        max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
-        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> BatchSubscription[Result[ValueT]]: ...
-
-    def results(
-        self,
-        *,
-        batch: bool = False,
-        min_interval: float = 0.0,
-        max_queue: int = DEFAULT_MAX_QUEUE,
-        max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
-        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> Subscription[Result[ValueT]] | BatchSubscription[Result[ValueT]]:
-        """Subscribe to everything the camera sends, triggered or not; subscribed when called.
-
-        The stream goes on over a reconnect; what the camera sent in between nobody got.
-
-        A container that does not fit its layout, or its calibration, is raised from the iterator as
-        :exc:`~smartcam.InterpretationError`; the iterator stays usable. Results of
-        another application than the one named are counted, not delivered.
-
-        Args:
-            batch: give lists of what is there, one result at least, instead of single results:
-                for a camera that sends thousands a second. ``max_queue`` counts results.
-            min_interval: seconds; results that come sooner after the last one are dropped.
-            max_queue: results kept for a slow reader. One read of the link brings up to 32 KiB.
-            max_queue_bytes: bytes that their containers may have together (``Result.raw``; values
-                may be larger). One that is larger alone is kept while no other is.
-            overflow: what happens beyond either.
-        """
-        kind = BatchSubscription[Result[ValueT]] if batch else Subscription[Result[ValueT]]
-        stream = kind(
-            "results",
-            max_queue=max_queue,
-            max_queue_bytes=max_queue_bytes,
-            size_of=_size_of,
-            overflow=overflow,
-            min_interval=min_interval,
-        )
-        return self._subscribed(self._listeners.results, stream)
-
-    def statuses(
-        self,
-        *,
-        min_interval: float = 0.0,
-        max_queue: int = DEFAULT_MAX_QUEUE,
-        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> Subscription[Status]:
-        """Subscribe to every status the camera sends from now on; arguments as in `results`."""
-        stream = Subscription[Status](
-            "statuses", max_queue=max_queue, overflow=overflow, min_interval=min_interval
-        )
-        return self._subscribed(self._listeners.statuses, stream)
-
-    def events(
-        self,
-        *,
-        max_queue: int = DEFAULT_MAX_QUEUE,
-        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
-    ) -> Subscription[CameraEvent]:
-        """Subscribe to what happens to the camera, in order.
-
-        The events are ``Connected``, ``Disconnected``, ``Reconnected``, ``StatusChanged`` and
-        ``ApplicationChanged``. Subscribe before :meth:`open` to see the first ones.
-        """
-        stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
-        return self._subscribed(self._listeners.events, stream)
-
     async def wait_status(
         self, predicate: Callable[[Status], bool], timeout: float = 10.0
     ) -> Status:
-        """Return the first status, the present one included, that ``predicate`` accepts.
-
-        It is shown every status in order, never only the last.
-
-        Raises:
-            ResponseTimeoutError: after ``timeout`` seconds.
-
-        Cancellation: safe.
-        """
         self._connection.require_link()
         deadline = self._connection.deadline(timeout)
         await self._status.refresh(deadline)
         return await self._status.until(predicate, deadline, "the status wanted", insist=False)
 
     async def wait_ready(self, timeout: float = 10.0) -> Status:
-        """Wait until the camera is not BUSY, and Running if a start was asked for.
-
-        Raises:
-            ResponseTimeoutError: after ``timeout`` seconds.
-
-        Cancellation: safe.
-        """
         self._connection.require_link()
         deadline = self._connection.deadline(timeout)
         await self._status.refresh(deadline)
         predicate = is_ready if self._state.wanted.running else _is_not_busy
         return await self._status.until(predicate, deadline, "the camera to be ready")
-
-    def next_result(
-        self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
-    ) -> Coroutine[Any, Any, Result[ValueT]]:
-        """Wait for the next result, whoever triggers it; registered when called, not when awaited.
-
-        One that is known to be of a trigger that was given up is not taken for it.
-
-        ``waiting = camera.next_result(); start_conveyor(); result = await waiting``
-
-        Args:
-            timeout: seconds from the call.
-
-        Raises:
-            TriggerTimeoutError: nothing came in time.
-            InterpretationError: what came does not fit its layout, or its calibration.
-
-        Cancellation: safe; the result still goes to the streams.
-        """
-        self._connection.require_link()
-        future = self._listeners.next_result()
-        return self._await_next(future, self._connection.deadline(timeout), timeout)
-
-    # ------------------------------------------------------------------ commands
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: None = None,
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: None = None,
-    ) -> Result[ValueT]: ...
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: None = None,
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: int,
-    ) -> list[Result[ValueT]]: ...
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: Literal["localizations"],
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: None = None,
-    ) -> Result[list[Localization]]: ...
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: Literal["localizations"],
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: int,
-    ) -> list[Result[list[Localization]]]: ...
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: AnySpec,
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: None = None,
-    ) -> Result[Any]: ...
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: AnySpec,
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: int,
-    ) -> list[Result[Any]]: ...
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: TypedSpec[T],
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: None = None,
-    ) -> Result[T]: ...
-
-    @overload
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: TypedSpec[T],
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: int,
-    ) -> list[Result[T]]: ...
-
-    async def trigger(
-        self,
-        application: int | None = None,
-        *,
-        interpret_as: object = None,
-        input: bytes | None = None,
-        timeout: float = DEFAULT_TRIGGER_TIMEOUT,
-        when_busy: Literal["wait", "refuse"] = "wait",
-        results_per_trigger: int | None = None,
-    ) -> Result[Any] | list[Result[Any]]:
-        """Trigger one inspection and return its result.
-
-        Waits until the camera waits for a trigger, then sends. One trigger at a time: a second
-        caller waits its turn, within its own ``timeout``. A trigger is never sent twice.
-
-        Where the layout has an ``@sequence`` field, the run's number is set right before the
-        trigger, and only the container that carries it is the result. Otherwise, over TCP, a Query
-        goes out in front of the trigger: what comes before its answer is older. An
-        earlier trigger that was given up is settled first: its result is awaited a moment, or made
-        impossible (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP without
-        ``@sequence`` a late result can pass for the next one's: nothing on the wire tells.
-
-        Args:
-            application: have this application running for this trigger, and go back to the present
-                one afterwards, also after an error or a cancellation. Each switch has
-                ``switch_timeout`` of its own.
-            interpret_as: how to read this result; default as given to :func:`connect`.
-            input: input data for this inspection, sent right before the trigger.
-            timeout: seconds, for the turn, the readiness and the result together.
-            when_busy: ``refuse`` raises CameraBusyError instead of waiting for readiness.
-            results_per_trigger: how many results the application sends for a trigger (one for each
-                "send results" tool); they come as a list then. By default it is one, and more are
-                counted as ``extra_results``.
-
-        Raises:
-            NotRunningError: the application is stopped (neither BUSY nor Running), or somebody
-                else stopped it during the inspection.
-            TriggerTimeoutError: no result in time; it says what the status was. An application
-                that runs free never waits for a trigger and ends here, and so does a switch to
-                ``application`` that takes too long.
-            OvertriggeredError: the camera dropped a trigger meanwhile.
-            CameraBusyError: with ``when_busy="refuse"``.
-            CameraFaultError: the camera reports System Error.
-            InputContainerError: with ``input``: it did not belong to this inspection, or the input
-                of an earlier trigger without a result may still be queued in the camera; loading
-                an application (:meth:`switch_application`) empties its queue (inferred).
-            InterpretationError: the result does not fit its layout, or its calibration.
-            WrongApplicationError: the result is another application's, or another application is
-                active than the one that was named.
-            CommandRejectedError: with ``application``: the camera does not have it.
-            ConnectionLostError: the link was lost; whether the camera got the trigger is unknown.
-
-        Cancellation: safe. A result still under way is never taken for the next trigger's, and
-        counted as late if it comes.
-        """
-        interpretation = (
-            self._results.interpretation
-            if interpret_as is None
-            else self._interpretation(interpret_as)
-        )
-        if when_busy not in {"wait", "refuse"}:
-            raise ConfigurationError(f"trigger: when_busy is 'wait' or 'refuse', not {when_busy!r}")
-        wanted = 1 if results_per_trigger is None else results_per_trigger
-        if wanted < 1:
-            raise ConfigurationError(f"trigger: results_per_trigger is 1 or more, not {wanted}")
-        data = None if input is None else bytes(input)
-        request = TriggerRequest(interpretation, data, wanted, when_busy == "wait")
-        called_at = datetime.now(UTC) if self._observed else None
-        try:
-            results = await self._trigger(application, request, timeout)
-        except SmartCamError as error:
-            self._observers.error(self.name, error, called_at)
-            raise
-        return results[0] if results_per_trigger is None else results
 
     async def _trigger(
         self, application: int | None, request: TriggerRequest, timeout: float
@@ -680,24 +184,6 @@ class SmartCamera(Generic[ValueT]):
     async def switch_application(
         self, application: int | str, *, timeout: float | None = None
     ) -> None:
-        """Load another application; returns when the camera is ready for it.
-
-        A running application is stopped first (the camera demands it) and the new one started.
-        Results are expected from the new application from then on. After a refusal the old one
-        runs again, if it ran, before the error is raised.
-
-        Args:
-            application: its id, or the name of its file where the camera can load by that.
-            timeout: seconds for the whole; default ``switch_timeout``.
-
-        Raises:
-            UnsupportedError: a name, to a camera that knows ids only.
-            CommandRejectedError: unknown id, or 0; tells the id that is active.
-            ResponseTimeoutError: the camera did not answer, or stayed BUSY.
-
-        Cancellation: safe; the camera may be in either application, and stopped.
-        Source: SC manual p. 34 (published).
-        """
         limit = self.settings.switch_timeout if timeout is None else timeout
         async with self._lock.hold(limit) as deadline:
             await self._status.refresh(deadline)
@@ -705,13 +191,6 @@ class SmartCamera(Generic[ValueT]):
 
     @contextlib.asynccontextmanager
     async def application(self, application: int) -> AsyncGenerator[Self]:
-        """Have an application running inside the ``async with``, then go back to the one before.
-
-        Raises:
-            CommandRejectedError, ResponseTimeoutError: as :meth:`switch_application`.
-
-        Cancellation: going back is finished by the client's supervisor; the next call waits for it.
-        """
         async with self._lock.hold(self.settings.switch_timeout) as deadline:
             before = await self._lock.enter(application, deadline)
         try:
@@ -722,69 +201,24 @@ class SmartCamera(Generic[ValueT]):
         await self._lock.leave_and_wait(before)
 
     async def start(self, *, timeout: float = 10.0) -> None:
-        """Enter run mode; returns when the camera reports Running and is not BUSY.
-
-        Raises:
-            UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: it did not within ``timeout`` seconds.
-
-        Cancellation: safe; the command may have been sent.
-        """
         async with self._lock.hold(timeout) as deadline:
             await self._commands.start(deadline)
 
     async def stop(self, *, timeout: float = 10.0) -> None:
-        """Leave run mode; returns when the camera no longer reports Running.
-
-        An inspection under way is voided (inferred).
-
-        Raises:
-            UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: it did not within ``timeout`` seconds.
-
-        Cancellation: safe; the command may have been sent.
-        """
         async with self._lock.hold(timeout) as deadline:
             await self._commands.stop(deadline)
 
     async def query_application(self, *, timeout: float | None = None) -> int:
-        """Ask the camera which application is active.
-
-        Raises:
-            ResponseTimeoutError: no answer; the link is given up, since a later answer could pass
-                for the next one's.
-
-        Cancellation: safe; the answer is dropped when it comes.
-        """
         limit = self.settings.request_timeout if timeout is None else timeout
         return await self._commands.query(self._connection.deadline(limit))
 
     async def query_status(self, *, timeout: float | None = None) -> Status:
-        """Ask the camera for its status.
-
-        Raises:
-            UnsupportedError: the camera cannot be asked; its status comes by itself.
-            ResponseTimeoutError: no answer; the link is given up.
-
-        Cancellation: safe.
-        """
         limit = self.settings.request_timeout if timeout is None else timeout
         self._connection.require(m.GetStatus)
         await self._status.refresh(self._connection.deadline(limit))
         return self._status.last
 
     async def reset_errors(self, *, timeout: float | None = None) -> Status:
-        """Clear the error bits that stay set until then; return the status after it.
-
-        :meth:`trigger` does so by itself where a Trigger Error of before would hide its own.
-
-        Raises:
-            UnsupportedError: the camera's bits fall by themselves.
-            ResponseTimeoutError: no answer; the link is given up.
-
-        Cancellation: safe; the command may have been sent.
-        Source: BVS ID guide p. 227 (published).
-        """
         limit = self.settings.request_timeout if timeout is None else timeout
         deadline = self._connection.deadline(limit)
         await self._requests.command(m.ResetErrors(), deadline)
@@ -792,15 +226,6 @@ class SmartCamera(Generic[ValueT]):
         return self._status.last
 
     async def read_image(self, *, timeout: float | None = None) -> bytes:
-        """Return the last picture, as a file's bytes.
-
-        Raises:
-            UnsupportedError: the protocol has no message for it, as BVS.
-            CommandRejectedError: the camera refused.
-            ResponseTimeoutError: no answer; the link is given up.
-
-        Cancellation: safe; the answer is dropped when it comes.
-        """
         limit = self.settings.request_timeout if timeout is None else timeout
         self._connection.require(m.ReadImage)
         image = await self._requests.ask(m.ReadImage(), m.Image, self._connection.deadline(limit))
@@ -808,14 +233,6 @@ class SmartCamera(Generic[ValueT]):
         return image.data
 
     async def get_clock(self, *, timeout: float | None = None) -> datetime:
-        """Return the camera's clock: a naive datetime, since it carries no time zone.
-
-        Raises:
-            ResponseTimeoutError: no answer; the link is given up.
-            InterpretationError: what came is no date.
-
-        Cancellation: safe; the answer is dropped when it comes.
-        """
         limit = self.settings.request_timeout if timeout is None else timeout
         clock = await self._requests.ask(
             m.GetClock(), m.ClockAnswer, self._connection.deadline(limit)
@@ -833,13 +250,6 @@ class SmartCamera(Generic[ValueT]):
             ) from exc
 
     async def set_clock(self, when: datetime) -> None:
-        """Set the camera's clock to the fields of ``when``; only result codes confirm it.
-
-        Raises:
-            CommandRejectedError: the camera refused.
-
-        Source: mvBlueGEMINI manual p. 29 (published, sibling): invalid values may be dropped.
-        """
         await self._tell(
             m.SetClock(
                 year=when.year,
@@ -852,38 +262,13 @@ class SmartCamera(Generic[ValueT]):
         )
 
     async def set_input(self, data: bytes) -> None:
-        """Send input data for the next inspection; only result codes confirm it.
-
-        ``trigger(input=...)`` binds data to its own trigger. The camera queues containers against
-        inspections; the Input Container bit says when they are out of step.
-        """
         await self._tell(m.SetInput(data=bytes(data)))
 
     async def set_sequence_number(self, number: int) -> None:
-        """Set the number of the next run (0 to 4294967295); nothing confirms it.
-
-        :meth:`trigger` takes it for the next run's where the layout has an ``@sequence`` field;
-        otherwise it picks numbers of its own there. A run that something else triggers in between
-        would take this number: then leave the numbers to :meth:`trigger`.
-
-        Raises:
-            UnsupportedError: the dialect has no such request (``bid``).
-            LocalProtocolError: the number does not fit.
-        """
         await self._tell(m.SetSequenceNumber(number=number))
         self._triggers.give_number(number)
 
     async def reboot(self) -> None:
-        """Restart the camera; returns when the session is over.
-
-        The camera is away for about 30 seconds then (published for a sibling) and comes back with
-        the last application, stopped. :meth:`wait_connected` waits for it.
-
-        Raises:
-            UnsupportedError: the dialect has no such request (``bid``).
-
-        Cancellation: the command may have been sent.
-        """
         link = self._connection.require_link()
         self._connection.require(m.Reboot)
         self._supervisor.restarts(link)
@@ -902,25 +287,6 @@ class SmartCamera(Generic[ValueT]):
         answered: bool | None = None,
         timeout: float | None = None,
     ) -> bytes | None:
-        """Send any message; the escape hatch for what has no method here.
-
-        Args:
-            message_id: its id; a command's text where the protocol has commands.
-            payload: its body.
-            answered: whether to wait for an answer under the same id; by default what the message
-                table says, True for an unknown id.
-            timeout: seconds for the answer.
-
-        Returns:
-            The answer's body, None where none is waited for: returned once written.
-
-        Raises:
-            LocalProtocolError: Connect and Disconnect (sessions are the client's own).
-            UnsupportedError: an id of another kind than the protocol's.
-            ResponseTimeoutError: no answer; the link is given up.
-
-        Cancellation: safe; the answer is dropped when it comes.
-        """
         dialect = self._connection.dialect
         raw = dialect.raw_request(message_id, bytes(payload))
         deadline = self._connection.deadline(
@@ -935,51 +301,10 @@ class SmartCamera(Generic[ValueT]):
             await self._requests.tell(raw.message, deadline, answered=False)
         return None
 
-    # ------------------------------------------------------------------ small helpers
-
     async def _tell(self, message: m.Request) -> None:
         await self._requests.command(
             message, self._connection.deadline(self.settings.request_timeout)
         )
-
-    def _interpretation(self, spec: object) -> Interpretation:
-        known = self._interpretations.get(spec) if isinstance(spec, str) else None
-        if known is not None:
-            return known
-        lenient, y_down = self.settings.lenient, self.settings.y_down
-        made = Interpretation(
-            spec, lenient=lenient, y_down=y_down, calibration=self.settings.calibration
-        )
-        if isinstance(spec, str) and len(self._interpretations) < MAX_INTERPRETATIONS:
-            self._interpretations[spec] = made
-        return made
-
-    def _subscribed(self, subscribers: Subscribers[Any], queue: QueueT) -> QueueT:
-        """Have a queue offered what comes; it has ended already where nothing will."""
-        end = self._waits.end
-        if end is not None and self._supervisor.over:  # between two sessions it waits for the next
-            queue.end(None if isinstance(end, ConnectionClosedError) else end)
-        subscribers.add(queue)
-        self._status.wanted()
-        return queue
-
-    async def _await_next(
-        self, future: asyncio.Future[Result], deadline: float, timeout: float
-    ) -> Result:
-        try:
-            async with asyncio.timeout_at(deadline):
-                return await future
-        except TimeoutError as exc:
-            if future.done() and not future.cancelled():
-                return future.result()
-            raise TriggerTimeoutError(
-                f"{self.name}: no result came within {timeout:g} s; status: {self.status}",
-                waited=timeout,
-            ) from exc
-
-
-def _size_of(result: Result) -> int:
-    return len(result.raw)
 
 
 def _is_not_busy(status: Status) -> bool:

@@ -28,7 +28,7 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
     from smartcam.emulator import Scenario
     from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
 
@@ -59,7 +59,7 @@ MARKER = (
     "looked for beside the test, then below the root."
 )
 
-_CLIENT: pytest.StashKey[SmartCamera] = pytest.StashKey()
+_CLIENT: pytest.StashKey[Camera] = pytest.StashKey()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -139,14 +139,14 @@ def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
 
 
 @pytest.fixture
-def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> SmartCamera:
+def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> Camera:
     """A client of the emulated camera, connected while an asynchronous test runs.
 
     It is opened in the task of the test itself, right before it, and closed behind it: so it has
     the event loop of the test, whatever plugin and settings made that. A fixture that needs it
     earlier opens it with ``await camera``.
     """
-    from smartcam.client import connect
+    from smartcam.connecting import connect
 
     said = _said(request)
     options = {
@@ -234,7 +234,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, None]:
     item.obj = test
 
 
-def _with_client(test: Callable[..., Any], client: SmartCamera) -> Callable[..., Any]:
+def _with_client(test: Callable[..., Any], client: Camera) -> Callable[..., Any]:
     """Return the test with the client open around it, in its own event loop and task."""
 
     @functools.wraps(test)

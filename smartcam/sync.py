@@ -6,7 +6,7 @@
         print(camera.trigger().value)
 
 One thread of the process has an event loop for all cameras; the calls of any other thread are done
-there. Names, outcomes, timeouts and accounts are those of :class:`smartcam.SmartCamera`, and a test
+there. Names, outcomes, timeouts and accounts are those of :class:`smartcam.Camera`, and a test
 holds the signatures against it.
 """
 
@@ -21,15 +21,15 @@ import warnings
 import weakref
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
-import smartcam.client
 from smartcam._loop_thread import LoopThread
-from smartcam.client import (
+from smartcam.camera import (
     DEFAULT_MAX_QUEUE,
     DEFAULT_MAX_QUEUE_BYTES,
     DEFAULT_RECONNECT_TIMEOUT,
     DEFAULT_TRIGGER_TIMEOUT,
-    SmartCamera,
+    Camera,
 )
+from smartcam.connecting import connect as connect_async
 from smartcam.exceptions import ConnectionClosedError, LocalProtocolError, ResponseTimeoutError
 from smartcam.models import ValueT
 
@@ -164,40 +164,40 @@ def connect(
     Raises:
         ConfigurationError: an address or option cannot work; nothing was tried.
     """
-    return SyncCamera(smartcam.client.connect(url, model=model, observers=observers, **options))
+    return SyncCamera(connect_async(url, model=model, observers=observers, **options))
 
 
 class SyncCamera(Generic[ValueT]):
-    """A :class:`~smartcam.SmartCamera` for programs without asyncio; made by :func:`connect`.
+    """A :class:`~smartcam.Camera` for programs without asyncio; made by :func:`connect`.
 
     Any thread may call any method, at the same time as others. A call raises
     :exc:`~smartcam.LocalProtocolError` in an event loop (there the async form is at hand), in a
     predicate or observer, and in a fork of the process that made the camera. Ctrl-C ends any call
-    as a cancellation does, of which each method of :class:`~smartcam.SmartCamera` tells.
+    as a cancellation does, of which each method of :class:`~smartcam.Camera` tells.
 
     Args:
         camera: what it is the face of, not opened yet.
     """
 
-    def __init__(self, camera: SmartCamera[ValueT]) -> None:
+    def __init__(self, camera: Camera[ValueT]) -> None:
         self._camera = camera
         self._thread = _started_thread()
 
     # ------------------------------------------------------------------ life
 
     def open(self) -> Self:
-        """Connect: :meth:`smartcam.SmartCamera.open`."""
+        """Connect: :meth:`smartcam.Camera.open`."""
         self._wait(self._camera.open)
         _cameras.add(self)
         return self
 
     def close(self) -> None:
-        """Disconnect; idempotent: :meth:`smartcam.SmartCamera.close`."""
+        """Disconnect; idempotent: :meth:`smartcam.Camera.close`."""
         self._wait(self._camera.close)
         _cameras.discard(self)
 
     def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
-        """Wait until there is a session: :meth:`smartcam.SmartCamera.wait_connected`."""
+        """Wait until there is a session: :meth:`smartcam.Camera.wait_connected`."""
         self._wait(lambda: self._camera.wait_connected(timeout))
 
     def __enter__(self) -> Self:
@@ -246,12 +246,12 @@ class SyncCamera(Generic[ValueT]):
 
     @property
     def status(self) -> Status:
-        """The last status: :attr:`smartcam.SmartCamera.status`."""
+        """The last status: :attr:`smartcam.Camera.status`."""
         return self._camera.status
 
     @property
     def active_application(self) -> int | None:
-        """The active application: :attr:`smartcam.SmartCamera.active_application`."""
+        """The active application: :attr:`smartcam.Camera.active_application`."""
         return self._camera.active_application
 
     @property
@@ -261,11 +261,11 @@ class SyncCamera(Generic[ValueT]):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What it can do: :attr:`smartcam.SmartCamera.capabilities`."""
+        """What it can do: :attr:`smartcam.Camera.capabilities`."""
         return self._camera.capabilities
 
     def statistics(self) -> Statistics:
-        """Return everything counted so far: :meth:`smartcam.SmartCamera.statistics`."""
+        """Return everything counted so far: :meth:`smartcam.Camera.statistics`."""
         return self._do(self._camera.statistics)
 
     # ------------------------------------------------------------------ streams and waits
@@ -301,7 +301,7 @@ class SyncCamera(Generic[ValueT]):
         max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> SyncSubscription[Any]:
-        """Subscribe to everything the camera sends: :meth:`smartcam.SmartCamera.results`."""
+        """Subscribe to everything the camera sends: :meth:`smartcam.Camera.results`."""
         subscribe = cast("Callable[..., Subscription[Any]]", self._camera.results)
         return self._subscribed(
             lambda: subscribe(
@@ -320,7 +320,7 @@ class SyncCamera(Generic[ValueT]):
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> SyncSubscription[Status]:
-        """Subscribe to every status: :meth:`smartcam.SmartCamera.statuses`."""
+        """Subscribe to every status: :meth:`smartcam.Camera.statuses`."""
         return self._subscribed(
             lambda: self._camera.statuses(
                 min_interval=min_interval, max_queue=max_queue, overflow=overflow
@@ -333,19 +333,19 @@ class SyncCamera(Generic[ValueT]):
         max_queue: int = DEFAULT_MAX_QUEUE,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> SyncSubscription[CameraEvent]:
-        """Subscribe to what happens to the camera: :meth:`smartcam.SmartCamera.events`."""
+        """Subscribe to what happens to the camera: :meth:`smartcam.Camera.events`."""
         return self._subscribed(lambda: self._camera.events(max_queue=max_queue, overflow=overflow))
 
     def wait_status(self, predicate: Callable[[Status], bool], timeout: float = 10.0) -> Status:
-        """Return the first status that is accepted: :meth:`smartcam.SmartCamera.wait_status`."""
+        """Return the first status that is accepted: :meth:`smartcam.Camera.wait_status`."""
         return self._wait(lambda: self._camera.wait_status(predicate, timeout))
 
     def wait_ready(self, timeout: float = 10.0) -> Status:
-        """Wait until it is not BUSY: :meth:`smartcam.SmartCamera.wait_ready`."""
+        """Wait until it is not BUSY: :meth:`smartcam.Camera.wait_ready`."""
         return self._wait(lambda: self._camera.wait_ready(timeout))
 
     def next_result(self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT) -> Result[ValueT]:
-        """Wait for the next result, whoever triggers it: :meth:`smartcam.SmartCamera.next_result`.
+        """Wait for the next result, whoever triggers it: :meth:`smartcam.Camera.next_result`.
 
         Where what causes it is started by the same thread, subscribe first::
 
@@ -463,7 +463,7 @@ class SyncCamera(Generic[ValueT]):
         when_busy: Literal["wait", "refuse"] = "wait",
         results_per_trigger: int | None = None,
     ) -> Any:
-        """Trigger one inspection and return its result: :meth:`smartcam.SmartCamera.trigger`."""
+        """Trigger one inspection and return its result: :meth:`smartcam.Camera.trigger`."""
         trigger = cast("Callable[..., Coroutine[Any, Any, Any]]", self._camera.trigger)
         return self._wait(
             lambda: trigger(
@@ -477,14 +477,14 @@ class SyncCamera(Generic[ValueT]):
         )
 
     def switch_application(self, application: int | str, *, timeout: float | None = None) -> None:
-        """Load another application: :meth:`smartcam.SmartCamera.switch_application`."""
+        """Load another application: :meth:`smartcam.Camera.switch_application`."""
         self._wait(lambda: self._camera.switch_application(application, timeout=timeout))
 
     @contextlib.contextmanager
     def application(self, application: int) -> Generator[Self]:
         """Have an application running inside the ``with``, then go back to the one before.
 
-        As :meth:`smartcam.SmartCamera.application`.
+        As :meth:`smartcam.Camera.application`.
         """
         inside = self._camera.application(application)
         self._wait(inside.__aenter__)
@@ -496,47 +496,47 @@ class SyncCamera(Generic[ValueT]):
         self._leave(inside, None)
 
     def start(self, *, timeout: float = 10.0) -> None:
-        """Enter run mode: :meth:`smartcam.SmartCamera.start`."""
+        """Enter run mode: :meth:`smartcam.Camera.start`."""
         self._wait(lambda: self._camera.start(timeout=timeout))
 
     def stop(self, *, timeout: float = 10.0) -> None:
-        """Leave run mode: :meth:`smartcam.SmartCamera.stop`."""
+        """Leave run mode: :meth:`smartcam.Camera.stop`."""
         self._wait(lambda: self._camera.stop(timeout=timeout))
 
     def query_application(self, *, timeout: float | None = None) -> int:
-        """Ask which application is active: :meth:`smartcam.SmartCamera.query_application`."""
+        """Ask which application is active: :meth:`smartcam.Camera.query_application`."""
         return self._wait(lambda: self._camera.query_application(timeout=timeout))
 
     def query_status(self, *, timeout: float | None = None) -> Status:
-        """Ask for the status: :meth:`smartcam.SmartCamera.query_status`."""
+        """Ask for the status: :meth:`smartcam.Camera.query_status`."""
         return self._wait(lambda: self._camera.query_status(timeout=timeout))
 
     def reset_errors(self, *, timeout: float | None = None) -> Status:
-        """Clear error bits: :meth:`smartcam.SmartCamera.reset_errors`."""
+        """Clear error bits: :meth:`smartcam.Camera.reset_errors`."""
         return self._wait(lambda: self._camera.reset_errors(timeout=timeout))
 
     def read_image(self, *, timeout: float | None = None) -> bytes:
-        """Return the last picture: :meth:`smartcam.SmartCamera.read_image`."""
+        """Return the last picture: :meth:`smartcam.Camera.read_image`."""
         return self._wait(lambda: self._camera.read_image(timeout=timeout))
 
     def get_clock(self, *, timeout: float | None = None) -> datetime:
-        """Return the camera's clock: :meth:`smartcam.SmartCamera.get_clock`."""
+        """Return the camera's clock: :meth:`smartcam.Camera.get_clock`."""
         return self._wait(lambda: self._camera.get_clock(timeout=timeout))
 
     def set_clock(self, when: datetime) -> None:
-        """Set the camera's clock: :meth:`smartcam.SmartCamera.set_clock`."""
+        """Set the camera's clock: :meth:`smartcam.Camera.set_clock`."""
         self._wait(lambda: self._camera.set_clock(when))
 
     def set_input(self, data: bytes) -> None:
-        """Send input data for the next inspection: :meth:`smartcam.SmartCamera.set_input`."""
+        """Send input data for the next inspection: :meth:`smartcam.Camera.set_input`."""
         self._wait(lambda: self._camera.set_input(data))
 
     def set_sequence_number(self, number: int) -> None:
-        """Set the number of the next run: :meth:`smartcam.SmartCamera.set_sequence_number`."""
+        """Set the number of the next run: :meth:`smartcam.Camera.set_sequence_number`."""
         self._wait(lambda: self._camera.set_sequence_number(number))
 
     def reboot(self) -> None:
-        """Restart the camera: :meth:`smartcam.SmartCamera.reboot`."""
+        """Restart the camera: :meth:`smartcam.Camera.reboot`."""
         self._wait(self._camera.reboot)
 
     def request(
@@ -547,7 +547,7 @@ class SyncCamera(Generic[ValueT]):
         answered: bool | None = None,
         timeout: float | None = None,
     ) -> bytes | None:
-        """Send any message: :meth:`smartcam.SmartCamera.request`."""
+        """Send any message: :meth:`smartcam.Camera.request`."""
         return self._wait(
             lambda: self._camera.request(message_id, payload, answered=answered, timeout=timeout)
         )

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from smartcam import exceptions
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.emulator import Quirks
 from smartcam.models import Status
 from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK
@@ -297,7 +297,7 @@ def test_promises_have_every_wait_with_its_default() -> None:
     named: set[str] = set()
     for call, bound, default in waits:
         name = call.partition("(")[0]
-        method = inspect.signature(getattr(SmartCamera, name))
+        method = inspect.signature(getattr(Camera, name))
         options = re.findall(r"\b(\w*timeout)\b(?!=)", bound)
         seconds = [
             method.parameters[option].default
@@ -309,7 +309,7 @@ def test_promises_have_every_wait_with_its_default() -> None:
         named.add(name)
     waiting = {
         name
-        for name, member in vars(SmartCamera).items()
+        for name, member in vars(Camera).items()
         if inspect.iscoroutinefunction(member) and not name.startswith("_")
     }
     assert named == waiting | {"application", "next_result"}  # these two are no coroutine functions

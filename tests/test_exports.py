@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 PUBLIC = [
-    "ApplicationChanged", "Backoff", "CalibrationError", "CameraBusyError", "CameraEvent",
+    "ApplicationChanged", "Backoff", "CalibrationError", "Camera", "CameraBusyError", "CameraEvent",
     "CameraFaultError",
     "Capabilities", "CommandRejectedError", "ConfigurationError", "ConnectFailedError",
     "Connected",

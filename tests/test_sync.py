@@ -19,6 +19,7 @@ import pytest
 
 import smartcam.sync
 from smartcam import (
+    Camera,
     CameraEvent,
     CommandRejectedError,
     ConfigurationError,
@@ -30,11 +31,10 @@ from smartcam import (
     LocalProtocolError,
     ResponseTimeoutError,
     Result,
-    SmartCamera,
     Status,
     TriggerTimeoutError,
 )
-from smartcam.client import connect
+from smartcam.connecting import connect
 from smartcam.emulator.faults import Drop
 from smartcam.sync import SyncCamera, SyncSubscription
 from smartcam.testing import ThreadedCamera
@@ -67,12 +67,12 @@ def faces(kind: type) -> dict[str, Any]:
 
 
 def test_camera_has_everything_that_the_async_one_has() -> None:
-    assert faces(SyncCamera).keys() == faces(SmartCamera).keys() | {"settings"}
+    assert faces(SyncCamera).keys() == faces(Camera).keys() | {"settings"}
 
 
-@pytest.mark.parametrize("name", [*faces(SmartCamera)])
+@pytest.mark.parametrize("name", [*faces(Camera)])
 def test_method_takes_what_the_async_one_takes(name: str) -> None:
-    theirs, ours = faces(SmartCamera)[name], faces(SyncCamera)[name]
+    theirs, ours = faces(Camera)[name], faces(SyncCamera)[name]
     assert isinstance(ours, property) == isinstance(theirs, property)
     if isinstance(theirs, property):
         theirs, ours = theirs.fget, ours.fget

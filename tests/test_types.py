@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, assert_type
 
 import smartcam
-from smartcam import Layout, Localization, Result, SmartCamera
+from smartcam import Camera, Layout, Localization, Result
 from smartcam.emulator import EmulatedCamera
 from smartcam.interpreters import Interpreter, Reader
 
@@ -28,24 +28,24 @@ def reading(reader: Reader) -> tuple[int, str]:
 
 
 def test_camera_knows_the_type_of_its_values() -> None:
-    assert_type(smartcam.connect(URL), SmartCamera[bytes])
+    assert_type(smartcam.connect(URL), Camera[bytes])
     assert_type(
         smartcam.connect(URL, interpret_as="localizations", name="a"),
-        SmartCamera[list[Localization]],
+        Camera[list[Localization]],
     )
-    assert_type(smartcam.connect(URL, interpret_as=reading), SmartCamera[tuple[int, str]])
-    assert_type(smartcam.connect(URL, interpret_as=Measured), SmartCamera[Measured])
-    assert_type(smartcam.connect(URL, interpret_as=list[Measured]), SmartCamera[list[Measured]])
-    assert_type(smartcam.connect(URL, interpret_as="x: int8"), SmartCamera[Any])
-    assert_type(smartcam.connect(URL, interpret_as=Layout("x: int8")), SmartCamera[Any])
-    assert_type(smartcam.connect(URL, interpret_as=Length), SmartCamera[Any])
-    assert_type(smartcam.connect(URL, interpret_as={7: Measured}), SmartCamera[Any])
+    assert_type(smartcam.connect(URL, interpret_as=reading), Camera[tuple[int, str]])
+    assert_type(smartcam.connect(URL, interpret_as=Measured), Camera[Measured])
+    assert_type(smartcam.connect(URL, interpret_as=list[Measured]), Camera[list[Measured]])
+    assert_type(smartcam.connect(URL, interpret_as="x: int8"), Camera[Any])
+    assert_type(smartcam.connect(URL, interpret_as=Layout("x: int8")), Camera[Any])
+    assert_type(smartcam.connect(URL, interpret_as=Length), Camera[Any])
+    assert_type(smartcam.connect(URL, interpret_as={7: Measured}), Camera[Any])
 
 
-def given(interpreter: Interpreter) -> SmartCamera:
-    """A bare SmartCamera stays what it always was."""
+def given(interpreter: Interpreter) -> Camera:
+    """A bare Camera stays what it always was."""
     camera = smartcam.connect(URL, interpret_as=interpreter)
-    assert_type(camera, SmartCamera[Any])
+    assert_type(camera, Camera[Any])
     return camera
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import smartcam
 
 if TYPE_CHECKING:
-    from smartcam import SmartCamera
+    from smartcam import Camera
 
 __all__ = ["APPLICATION", "LAYOUT", "Tally", "sort_bolts"]
 
@@ -34,7 +34,7 @@ class Tally:
     unseen: int = 0
 
 
-async def sort_bolts(camera: SmartCamera, count: int, *, timeout: float = 2.0) -> Tally:
+async def sort_bolts(camera: Camera, count: int, *, timeout: float = 2.0) -> Tally:
     """Look at so many bolts; a bolt without a result is never taken for a good one.
 
     Raises:

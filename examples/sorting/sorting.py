@@ -20,7 +20,7 @@ from smartcam.models import Pose, Position
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam import SmartCamera
+    from smartcam import Camera
 
 __all__ = ["APPLICATION", "CONTAINERS", "Robot", "TableRobot", "calibrate", "sort"]
 
@@ -49,7 +49,7 @@ class Robot(Protocol):
         ...
 
 
-async def calibrate(camera: SmartCamera, robot: Robot) -> PlaneCalibration:
+async def calibrate(camera: Camera, robot: Robot) -> PlaneCalibration:
     """Return the way from the camera to the robot: it touches each mark that the camera sees."""
     seen = (await camera.trigger(timeout=2.0)).value
     touched = [await robot.touch(mark.feature_id) for mark in seen]
@@ -57,7 +57,7 @@ async def calibrate(camera: SmartCamera, robot: Robot) -> PlaneCalibration:
 
 
 async def sort(
-    camera: SmartCamera,
+    camera: Camera,
     robot: Robot,
     calibration: PlaneCalibration,
     containers: Mapping[str, Position] = CONTAINERS,

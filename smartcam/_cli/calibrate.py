@@ -13,7 +13,7 @@ import click
 from smartcam._cli.calibrate_terminal import drive, listing_text
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
 from smartcam._cli.page import PageOptions, page_options
-from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import CalibrationError, ConfigurationError, UnsupportedError
 from smartcam.models import Localization
 

@@ -64,7 +64,7 @@ async def demo(options: Options) -> None:
         )
 
 
-async def _switch(camera: smartcam.SmartCamera, say: Steps) -> None:
+async def _switch(camera: smartcam.Camera, say: Steps) -> None:
     loop = asyncio.get_running_loop()
     say.step(
         f"Switch to application {TANGRAM}. The camera must be stopped, is BUSY, then runs again:"
@@ -91,7 +91,7 @@ async def _switch(camera: smartcam.SmartCamera, say: Steps) -> None:
     )
 
 
-async def _localize(camera: smartcam.SmartCamera, emulator: EmulatedCamera, say: Steps) -> None:
+async def _localize(camera: smartcam.Camera, emulator: EmulatedCamera, say: Steps) -> None:
     result = await camera.trigger(timeout=2.0)
     say.step(
         f"Triggered: {len(result.value)} parts after {1e3 * (result.latency or 0):.0f} ms. "
@@ -119,7 +119,7 @@ async def _localize(camera: smartcam.SmartCamera, emulator: EmulatedCamera, say:
     say.detail(table_text(head, rows), result=result)
 
 
-async def _stream(camera: smartcam.SmartCamera, say: Steps) -> None:
+async def _stream(camera: smartcam.Camera, say: Steps) -> None:
     say.step(f"Application {COUNTER} runs free: {STREAMED} results as they come:")
     async with camera.application(COUNTER):
         numbers: list[int] = []

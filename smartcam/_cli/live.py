@@ -16,7 +16,7 @@ from smartcam.exceptions import LinkError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
     from smartcam.web import LiveSite
 
 
@@ -53,7 +53,7 @@ async def serve(url: str, web: PageOptions, options: Options, *, control: bool =
                     await _have_open(camera, make, site)
 
 
-async def _have_open(camera: SmartCamera, make: Callable[[], SmartCamera], site: LiveSite) -> None:
+async def _have_open(camera: Camera, make: Callable[[], Camera], site: LiveSite) -> None:
     """Open the camera until it is there, and have it open until this is cancelled."""
     policy = Backoff()
     for delay in policy.delays():

@@ -14,7 +14,7 @@ import click
 
 from smartcam._cli.running import run
 from smartcam._client.handshake import remarks
-from smartcam.client import SmartCamera, connect
+from smartcam.connecting import connect
 from smartcam.doctor._context import FrameObserver
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import jsonable
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping
 
     from smartcam.calibration._files.load import AnyCalibration
+    from smartcam.camera import Camera
     from smartcam.observers import TraceEntry
 
 F = TypeVar("F", bound="Callable[..., Any]")
@@ -195,13 +196,13 @@ class Options:
             )
 
     @contextmanager
-    def camera(self, url: str, **other: Any) -> Iterator[SmartCamera]:
+    def camera(self, url: str, **other: Any) -> Iterator[Camera]:
         """Give an unopened camera, as :meth:`cameras` makes them."""
         with self.cameras(url, **other) as make:
             yield make()
 
     @contextmanager
-    def cameras(self, url: str, **other: Any) -> Iterator[Callable[[], SmartCamera]]:
+    def cameras(self, url: str, **other: Any) -> Iterator[Callable[[], Camera]]:
         """Give what makes unopened cameras; the trace file is open around it.
 
         ``other``: options of :func:`smartcam.connect` that the command line does not have. Raises
@@ -258,7 +259,7 @@ class Options:
         if failed:
             raise ConfigurationError(f"--trace {self.trace}: {failed[0].strerror}") from failed[0]
 
-    def remark(self, camera: SmartCamera) -> None:
+    def remark(self, camera: Camera) -> None:
         """Say on stderr what who asks this camera for results should know."""
         for text in remarks(camera.settings.address):
             click.echo(f"note: {text}", err=True)

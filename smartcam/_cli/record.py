@@ -13,7 +13,7 @@ from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, ru
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import camera_value, not_running
 from smartcam.backoff import Backoff
-from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     CameraFaultError,
     ConnectionClosedError,
@@ -31,7 +31,7 @@ from smartcam.recording import replay as replay_camera
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
     from smartcam.recording import Recording
 
 _camera = click.option(
@@ -62,7 +62,7 @@ async def record(url: str, output: str, force: bool, every: float | None, option
 
 
 async def _record(
-    unopened: SmartCamera, recorder: Recorder, every: float | None, options: Options
+    unopened: Camera, recorder: Recorder, every: float | None, options: Options
 ) -> None:
     recorder.open()
     options.remark(unopened)
@@ -119,7 +119,7 @@ async def _count(results: Any, recorder: Recorder, count: int | None) -> None:
             return
 
 
-async def _trigger(camera: SmartCamera, every: float, timeout: float) -> None:
+async def _trigger(camera: Camera, every: float, timeout: float) -> None:
     """Send triggers; what goes wrong with one is recorded, as long as the first ones went well."""
     loop = asyncio.get_running_loop()
     when, worked = loop.time(), False
@@ -142,7 +142,7 @@ async def _trigger(camera: SmartCamera, every: float, timeout: float) -> None:
         await asyncio.sleep(when - loop.time())
 
 
-async def _end(recorder: Recorder, camera: SmartCamera, options: Options) -> None:
+async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
     """End the file, and tell what is in it; without a session there is no file."""
     path = recorder.path
     await asyncio.to_thread(recorder.close)

@@ -26,7 +26,7 @@ from smartcam._cli.running import JsonErrors
 from smartcam._cli.sheet import sheet
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import application_text, not_running, result_text, table_text
-from smartcam.client import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     NotRunningError,
     PluginError,
@@ -291,7 +291,7 @@ for _one in (live, probe, doctor, image, decode, calibrate, sheet, record, repla
 async def _then_show(
     url: str,
     options: Options,
-    action: Callable[[smartcam.SmartCamera], Awaitable[None]] | None = None,
+    action: Callable[[smartcam.Camera], Awaitable[None]] | None = None,
 ) -> None:
     """Connect, do something, show how the camera is then."""
     with options.camera(url) as unopened:
@@ -301,7 +301,7 @@ async def _then_show(
             _show_camera(camera, options)
 
 
-def _show_camera(camera: smartcam.SmartCamera, options: Options) -> None:
+def _show_camera(camera: smartcam.Camera, options: Options) -> None:
     value = {
         "camera": camera.name,
         "url": camera.url,

@@ -13,7 +13,7 @@ import click
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
 
 COLOURS = {"ok": "green", "hint": "cyan", "warning": "yellow", "error": "red"}
 """Of words that judge; the word says the same without it."""
@@ -44,7 +44,7 @@ class CountingLine:
             print(result)
     """
 
-    def __init__(self, camera: SmartCamera[Any]) -> None:
+    def __init__(self, camera: Camera[Any]) -> None:
         self._camera = camera
         self._width = 0
 
@@ -77,7 +77,7 @@ class CountingLine:
 
 
 @contextlib.asynccontextmanager
-async def counting(camera: SmartCamera[Any]) -> AsyncIterator[CountingLine]:
+async def counting(camera: Camera[Any]) -> AsyncIterator[CountingLine]:
     """Have a line that counts a camera's results, where stderr is a terminal."""
     line = CountingLine(camera)
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":

@@ -13,7 +13,7 @@ from smartcam.protocols.messages import UNNAMED_APPLICATION
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
     from smartcam.emulator import WireCamera
 
 
@@ -72,7 +72,7 @@ def application_text(application: int | None) -> str:
     return f"application {application}"
 
 
-def not_running(error: NotRunningError, camera: SmartCamera, verb: str) -> NotRunningError:
+def not_running(error: NotRunningError, camera: Camera, verb: str) -> NotRunningError:
     """Return an error with what to do beside it; ``verb`` is the command that met it."""
     return NotRunningError(
         f"{error}. To start it: smartcam start {shlex.quote(camera.url)}, or {verb} with "

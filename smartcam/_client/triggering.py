@@ -121,7 +121,7 @@ class Triggers:
         """Wait until the camera takes a trigger, send it, return its results.
 
         Raises:
-            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
+            SmartCamError: one of the outcomes of :meth:`Camera.trigger`.
         """
         if self._connection.features.acknowledged:
             return self._trigger_until_taken(request, deadline)
@@ -148,7 +148,7 @@ class Triggers:
         """Send one trigger as soon as the camera takes it, return its results.
 
         Raises:
-            SmartCamError: one of the outcomes of :meth:`SmartCamera.trigger`.
+            SmartCamError: one of the outcomes of :meth:`Camera.trigger`.
         """
         connection, state, correlation = self._connection, self._state, self._correlation
         features = connection.features

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from datetime import datetime
 
+    from smartcam.camera import Camera
     from smartcam.exceptions import SmartCamError
     from smartcam.models import ByteOrder
     from smartcam.observers import TraceEntry
@@ -183,7 +184,7 @@ class Examination:
     stack: AsyncExitStack = field(default_factory=AsyncExitStack)  # what is undone at the end
     # an application that is loaded for the triggers, and goes back
     borrowed: AsyncExitStack = field(default_factory=AsyncExitStack)
-    camera: SmartCamera | None = None  # the client, None before the session
+    camera: Camera | None = None  # the client, None before the session
     connected_at: float = 0.0  # loop time of the session
     wants_trigger: bool = False  # whether triggers are still wanted
     may_trigger: bool = False  # whether the camera waits for them
@@ -225,7 +226,7 @@ class Examination:
         return taken
 
     @property
-    def patient(self) -> SmartCamera:
+    def patient(self) -> Camera:
         """The camera in a session.
 
         LookupError: there is none; checks that use it come behind the one that connects.
@@ -247,7 +248,7 @@ class Examination:
             scheme=found.scheme, dialect=found.dialect, quirks=found.quirks
         )
 
-    def make_camera(self) -> SmartCamera:
+    def make_camera(self) -> Camera:
         """Return a client that takes the camera once and never takes it back.
 
         Raises ConfigurationError: a time-out is none.

@@ -21,7 +21,7 @@ from smartcam.protocols._base import Transport, load_protocol
 
 if TYPE_CHECKING:
     from smartcam._client.attempts import Reason, Try
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
     from smartcam.doctor._context import Examination
     from smartcam.doctor._probing import CameraAnswer, Trial
     from smartcam.exceptions import SmartCamError
@@ -110,7 +110,7 @@ async def connect(exam: Examination) -> None:
 
 
 def _say_session(
-    exam: Examination, camera: SmartCamera, first: float | None, times: list[float]
+    exam: Examination, camera: Camera, first: float | None, times: list[float]
 ) -> None:
     measured = figures(times)
     link, dialect = exam.address.scheme, exam.address.dialect
@@ -131,7 +131,7 @@ def _say_session(
 # ---------------------------------------------------------------------- no session
 
 
-async def _diagnose(exam: Examination, failure: ConnectFailedError) -> SmartCamera | None:
+async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | None:
     """Say why there is no session; return a camera where another way leads to one."""
     own, found = exam.address, await _try_all(exam)
     answer = found[-1].answer

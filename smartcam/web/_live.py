@@ -17,7 +17,7 @@ from smartcam.web._streams import PERIOD, News
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
 
 MAX_NEWS = 20
 """Results in one event: at ten a second the page sees 200 a second, and is told what it missed."""
@@ -53,7 +53,7 @@ class LiveSite(Site):
 
     def __init__(
         self,
-        camera: SmartCamera[Any],
+        camera: Camera[Any],
         *,
         control: bool = False,
         host: str = "127.0.0.1",

@@ -16,7 +16,7 @@ from smartcam.models import Connected, Disconnected, Localization, Reconnected, 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
 
 MAX_RESULTS = 100
 """Results that the page can show: those before are on it no more."""
@@ -77,8 +77,8 @@ class LiveView:
         is_watched: whether anybody looks, so that a picture is worth being fetched.
     """
 
-    def __init__(self, camera: SmartCamera[Any], is_watched: Callable[[], bool]) -> None:
-        self.camera: SmartCamera[Any] = camera
+    def __init__(self, camera: Camera[Any], is_watched: Callable[[], bool]) -> None:
+        self.camera: Camera[Any] = camera
         self.entries: collections.deque[ShownResult] = collections.deque(maxlen=MAX_RESULTS)
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
         self.picture: Picture | None = None
@@ -93,7 +93,7 @@ class LiveView:
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
 
-    def _subscribe(self, camera: SmartCamera[Any]) -> None:
+    def _subscribe(self, camera: Camera[Any]) -> None:
         self._results = camera.results(batch=True, max_queue=10 * MAX_RESULTS)
         self._events = camera.events()
 
@@ -116,7 +116,7 @@ class LiveView:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def follow(self, camera: SmartCamera[Any], loss: str) -> None:
+    async def follow(self, camera: Camera[Any], loss: str) -> None:
         """Show this camera instead, which is not opened yet; ``loss``: why the one before is not.
 
         Cancellation: leaves it stopped.

@@ -10,7 +10,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, TypeVar
 
 import smartcam
-from smartcam import Backoff, ConnectionLostError, SmartCamera
+from smartcam import Backoff, Camera, ConnectionLostError
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.models import Statistics
 from smartcam.observers import Observer, TraceEntry
@@ -30,7 +30,7 @@ SHORT = 0.05
 
 
 @contextlib.asynccontextmanager
-async def in_session(made: BoxT, **options: Any) -> AsyncIterator[tuple[BoxT, SmartCamera]]:
+async def in_session(made: BoxT, **options: Any) -> AsyncIterator[tuple[BoxT, Camera]]:
     """A camera and a client in a session with it, which does not reconnect by default."""
     options.setdefault("reconnect", None)
     async with nothing_unheard(), made, smartcam.connect(made.url, **options) as camera:
@@ -39,14 +39,14 @@ async def in_session(made: BoxT, **options: Any) -> AsyncIterator[tuple[BoxT, Sm
 
 def by_hand(
     *, box: dict[str, Any] | None = None, **options: Any
-) -> AbstractAsyncContextManager[tuple[HandmadeCamera, SmartCamera]]:
+) -> AbstractAsyncContextManager[tuple[HandmadeCamera, Camera]]:
     """A handmade camera and a client, :func:`in_session`."""
     return in_session(HandmadeCamera(**(box or {})), **options)
 
 
 def bid_by_hand(
     *, box: dict[str, Any] | None = None, **options: Any
-) -> AbstractAsyncContextManager[tuple[HandmadeBid, SmartCamera]]:
+) -> AbstractAsyncContextManager[tuple[HandmadeBid, Camera]]:
     """A handmade BVS ID and a client, :func:`in_session`."""
     return in_session(HandmadeBid(**(box or {})), **options)
 
@@ -54,7 +54,7 @@ def bid_by_hand(
 @contextlib.asynccontextmanager
 async def emulated(
     *, box: dict[str, Any] | None = None, **options: Any
-) -> AsyncIterator[tuple[EmulatedCamera, ManualClock, SmartCamera]]:
+) -> AsyncIterator[tuple[EmulatedCamera, ManualClock, Camera]]:
     """An emulated camera on a clock that stands still and a client, :func:`in_session`."""
     clock = ManualClock()
     async with in_session(EmulatedCamera(clock=clock, **(box or {})), **options) as (made, camera):
@@ -151,7 +151,7 @@ def answers(*statuses: int, result: bytes | None = None, application: int | None
     return script
 
 
-async def lose(box: HandmadeCamera, camera: SmartCamera) -> None:
+async def lose(box: HandmadeCamera, camera: Camera) -> None:
     """End the link from the camera's side, and wait until the client has told it."""
     waiting = asyncio.create_task(camera.wait_status(lambda _: False))
     await steps(2)
@@ -159,7 +159,7 @@ async def lose(box: HandmadeCamera, camera: SmartCamera) -> None:
     assert isinstance(await gone(waiting), ConnectionLostError)
 
 
-async def lose_and_come_back(box: HandmadeCamera, camera: SmartCamera) -> None:
+async def lose_and_come_back(box: HandmadeCamera, camera: Camera) -> None:
     """End the link from the camera's side, and wait until there is the next session."""
     sessions = camera.statistics().sessions
     box.hang_up()
@@ -173,7 +173,7 @@ def only(times: int, answer: Callable[[bytes], bytes]) -> Callable[[bytes], byte
     return lambda payload: b"" if next(left, None) is None else answer(payload)
 
 
-async def cancelled_at_its_fence(box: HandmadeCamera, camera: SmartCamera) -> None:
+async def cancelled_at_its_fence(box: HandmadeCamera, camera: Camera) -> None:
     """Lose a trigger's result, then cancel the next trigger while its fence is not answered.
 
     The camera answers Query again from then on, and no Trigger.

@@ -9,10 +9,10 @@ import pytest
 
 import smartcam
 from smartcam import (
+    Camera,
     CommandRejectedError,
     ConnectionLostError,
     OvertriggeredError,
-    SmartCamera,
     Status,
     StatusChanged,
     TriggerTimeoutError,
@@ -50,7 +50,7 @@ def bid(transport: Any = "tcp", *, push: bool = False, **options: Any) -> dict[s
     }
 
 
-async def number(camera: SmartCamera, **options: Any) -> int:
+async def number(camera: Camera, **options: Any) -> int:
     """Trigger and return the run's number."""
     result = await camera.trigger(interpret_as="n: uint32", **options)
     return int(result.value.n)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import smartcam
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.exceptions import SmartCamError, TriggerTimeoutError
 from smartcam.models import Result
 from tests.client.clientkit import TriggerEar, balance, cancelled, nothing_unheard, until
@@ -45,7 +45,7 @@ LATE_SECOND: Sequence[Step] = ((0.0, 0), (0.0, AGAIN), (None, 1))
 class Attack:
     """A camera on a line, a client in a session with it, and who is asked whose a result is."""
 
-    def __init__(self, box: LineCamera, camera: SmartCamera, ear: TriggerEar) -> None:
+    def __init__(self, box: LineCamera, camera: Camera, ear: TriggerEar) -> None:
         self.box = box
         self.camera = camera
         self.ear = ear

@@ -11,6 +11,7 @@ import pytest
 
 import smartcam
 from smartcam import (
+    Camera,
     CameraBusyError,
     CommandRejectedError,
     ConfigurationError,
@@ -19,7 +20,6 @@ from smartcam import (
     OvertriggeredError,
     Reconnected,
     ResponseTimeoutError,
-    SmartCamera,
     Status,
     StatusChanged,
     TriggerTimeoutError,
@@ -58,6 +58,7 @@ from tests.client.clientkit import (
     until,
 )
 from tests.handmade import LIMIT, Peer, scripted
+from tests.insides import inside
 
 TRANSPORTS = pytest.mark.parametrize("transport", ["tcp", "udp"])
 IDLE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
@@ -401,7 +402,7 @@ async def test_bid_connect_with_an_application_has_it_loaded() -> None:
 # ---------------------------------------------------------------------- what it cannot
 
 
-CANNOT: dict[str, Callable[[SmartCamera], Coroutine[Any, Any, object]]] = {
+CANNOT: dict[str, Callable[[Camera], Coroutine[Any, Any, object]]] = {
     "Start": lambda camera: camera.start(),
     "Stop": lambda camera: camera.stop(),
     "Reboot": lambda camera: camera.reboot(),
@@ -560,7 +561,7 @@ async def test_bid_status_is_asked_for_only_while_somebody_wants_it() -> None:
     async with bid_by_hand() as (box, camera):
         with pytest.raises(ResponseTimeoutError):
             await camera.wait_status(lambda _: False, timeout=2 * SHORT)
-        poll: Any = camera._status._polling
+        poll: Any = inside(camera)._status._polling
         await until(lambda: poll._timer is None)
         statuses = camera.statuses()
         assert poll._timer is not None
@@ -596,7 +597,7 @@ async def test_bid_request_gives_the_answers_body() -> None:
 
 # ---------------------------------------------------------------------- cancelling
 
-BUSY_CALLS: dict[str, tuple[int, Callable[[SmartCamera], Coroutine[Any, Any, object]]]] = {
+BUSY_CALLS: dict[str, tuple[int, Callable[[Camera], Coroutine[Any, Any, object]]]] = {
     "trigger": (TRIGGER, lambda camera: camera.trigger()),
     "switch": (SWITCH, lambda camera: camera.switch_application(3)),
     "query": (QUERY, lambda camera: camera.query_application()),
@@ -619,7 +620,7 @@ async def test_bid_call_cancelled_between_two_tries_is_not_repeated(name: str) -
         balance(camera.statistics())
 
 
-UNANSWERED_CALLS: dict[str, tuple[int, Callable[[SmartCamera], Coroutine[Any, Any, object]]]] = {
+UNANSWERED_CALLS: dict[str, tuple[int, Callable[[Camera], Coroutine[Any, Any, object]]]] = {
     "trigger": (TRIGGER, lambda camera: camera.trigger()),
     "trigger with input": (INPUT, lambda camera: camera.trigger(input=b"Hello")),
     "set_input": (INPUT, lambda camera: camera.set_input(b"Hello")),

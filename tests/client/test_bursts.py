@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 
 from smartcam import (
+    Camera,
     InterpretationError,
     Observer,
     Result,
-    SmartCamera,
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
@@ -28,6 +28,7 @@ from smartcam.models import Localization
 from smartcam.protocols._framed.machine import ResultBurst
 from tests.client.camera_by_hand import NUMBER, READY, RUNNING, TRIGGER, WAITING, HandmadeCamera
 from tests.client.clientkit import SHORT, balance, by_hand, cancelled, gone, steps, until
+from tests.insides import inside
 
 BOLT = struct.pack("<50sfifff", b"bolt", 0.5, 1, 0.25, -0.5, 1.0)
 NUT = struct.pack("<50sfifff", b"nut", 1.0, 2, 1.0, 2.0, 3.0)
@@ -37,20 +38,20 @@ NAN = struct.pack("<50sfifff", b"nan", 0.5, 1, 0.25, float("nan"), 1.0)
 each_way = pytest.mark.parametrize("together", [True, False], ids=["together", "alone"])
 
 
-async def say(camera: SmartCamera, box: HandmadeCamera, *frames: bytes, together: bool) -> None:
+async def say(camera: Camera, box: HandmadeCamera, *frames: bytes, together: bool) -> None:
     """Send frames in one write, or each in a delivery of its own; all are heard then."""
     heard = camera.statistics().frames_received
     for data in [b"".join(frames)] if together else frames:
         box.send(data)
         heard += len(box.split(data))
         await until(lambda: camera.statistics().frames_received == heard)  # noqa: B023
-        link: Any = camera._connection.link
+        link: Any = inside(camera)._connection.link
         await until(lambda: not link._chunks)  # noqa: B023
 
 
-def bursts(camera: SmartCamera) -> list[int]:
+def bursts(camera: Camera) -> list[int]:
     """Return where the sizes of the bursts that come will stand."""
-    takers, sizes = camera._dispatch._takers, list[int]()
+    takers, sizes = inside(camera)._dispatch._takers, list[int]()
     take = takers[ResultBurst]
 
     def note(burst: ResultBurst, *arguments: Any) -> None:
@@ -78,7 +79,7 @@ def numbered(box: HandmadeCamera, count: int, first: int = 0) -> list[bytes]:
     return [box.result_frame(struct.pack("<i", one)) for one in range(first, first + count)]
 
 
-def fates(camera: SmartCamera) -> dict[str, int]:
+def fates(camera: Camera) -> dict[str, int]:
     """Return what became of the containers; the accounts balance."""
     statistics = camera.statistics()
     balance(statistics)
@@ -272,7 +273,7 @@ async def test_trigger_takes_its_own_from_the_middle_of_bursts(*, together: bool
         box.script[TRIGGER] = lambda _: b""
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER, 2)
-        await until(lambda: not camera._waits._fence_open)
+        await until(lambda: not inside(camera)._waits._fence_open)
         older, own, extra = numbered(box, 2, 1), numbered(box, 1, 100), numbered(box, 3, 200)
         frames = [*older, box.status_frame(RUNNING), *own, *extra, box.status_frame(READY)]
         await say(camera, box, *frames, together=together)
@@ -327,7 +328,7 @@ async def test_triggers_of_several_results_take_as_many_of_a_burst(*, together: 
         box.script[TRIGGER] = lambda _: b""
         triggering = asyncio.create_task(camera.trigger(results_per_trigger=3))
         await box.wait_for(TRIGGER)
-        await until(lambda: not camera._waits._fence_open)
+        await until(lambda: not inside(camera)._waits._fence_open)
         results = camera.results()
         await say(camera, box, box.status_frame(RUNNING), *numbered(box, 5), together=together)
         own = await triggering
@@ -459,9 +460,9 @@ async def test_bursts_of_many_reads_all_come_in_order() -> None:
 # ---------------------------------------------------------------------- a trigger's deadline
 
 
-def at_the_deadline(camera: SmartCamera, then: Callable[[], object]) -> None:
+def at_the_deadline(camera: Camera, then: Callable[[], object]) -> None:
     """Have something happen in the same turn of the loop, right behind the trigger's deadline."""
-    alarm = camera._results._timer
+    alarm = inside(camera)._results._timer
     expire = alarm._callback
 
     def both() -> None:
@@ -471,9 +472,9 @@ def at_the_deadline(camera: SmartCamera, then: Callable[[], object]) -> None:
     alarm._callback = both
 
 
-def hear(camera: SmartCamera, data: bytes) -> None:
+def hear(camera: Camera, data: bytes) -> None:
     """Have the client's link read bytes at once."""
-    link: Any = camera._connection.link
+    link: Any = inside(camera)._connection.link
     link.get_buffer(-1)[: len(data)] = data
     link.buffer_updated(len(data))
 
@@ -499,7 +500,7 @@ async def test_deadline_and_cancellation_in_one_turn_of_the_loop_are_one_end(fir
         box.script[TRIGGER] = lambda _: b""
         triggering = asyncio.create_task(camera.trigger(timeout=60))
         await box.wait_for(TRIGGER)
-        expire = camera._results._timer._callback
+        expire = inside(camera)._results._timer._callback
 
         def at_once(cancel: Callable[[], object]) -> None:
             if first == "deadline":
@@ -531,7 +532,7 @@ async def test_trigger_whose_deadline_passes_while_the_camera_takes_no_bytes_end
         error = await gone(camera.trigger(input=bytes(1 << 25), timeout=SHORT))
         assert isinstance(error, TriggerTimeoutError)
         assert error.waited == pytest.approx(SHORT, abs=0.02)
-        assert camera._results.correlation.pending is None
+        assert inside(camera)._results.correlation.pending is None
         await say(camera, box, box.result_frame(b"older"), together=True)
         assert fates(camera) == {"streamed": 1}  # the trigger has not reached the camera
         assert len(await queued(results)) == 1
@@ -543,9 +544,9 @@ async def test_deadline_then_cancellation_of_a_trigger_that_is_stuck_are_one_end
     async with by_hand(close_timeout=SHORT) as (box, camera):
         box.stop_reading()
         triggering = asyncio.create_task(camera.trigger(input=bytes(1 << 25), timeout=60))
-        await until(lambda: camera._results.correlation.pending)
+        await until(lambda: inside(camera)._results.correlation.pending)
         await steps(3)
-        camera._results._timer._callback()
+        inside(camera)._results._timer._callback()
         await steps(1)
         await cancelled(triggering)
         del triggering
@@ -558,6 +559,6 @@ async def test_closed_client_leaves_no_timer_of_a_trigger() -> None:
     async with by_hand() as (_, camera):
         await camera.trigger(timeout=60)
         await camera.trigger(timeout=90)
-        alarm = camera._results._timer
+        alarm = inside(camera)._results._timer
         assert alarm._timer is not None
     assert alarm._timer is None

@@ -15,13 +15,14 @@ from smartcam import ConnectionClosedError, NotRunningError
 from smartcam._client.correlation import Progress, _Owed
 from smartcam.emulator import EmulatedCamera
 from tests.client.clientkit import balance
+from tests.insides import inside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from smartcam import SmartCamera
+    from smartcam import Camera
 
-    Call = Callable[[SmartCamera], Coroutine[Any, Any, object]]
+    Call = Callable[[Camera], Coroutine[Any, Any, object]]
 
 COUNTER = {
     "layout": "n: int32 @sequence",
@@ -36,23 +37,23 @@ MOST_STEPS = 300
 """Bound of a sweep; the longest call takes about a fifth of it."""
 
 
-async def in_application(camera: SmartCamera) -> None:
+async def in_application(camera: Camera) -> None:
     async with camera.application(3):
         await asyncio.sleep(0)
 
 
-async def in_application_that_fails(camera: SmartCamera) -> None:
+async def in_application_that_fails(camera: Camera) -> None:
     with contextlib.suppress(ZeroDivisionError):
         async with camera.application(3):
             raise ZeroDivisionError
 
 
-async def two_triggers(camera: SmartCamera) -> None:
+async def two_triggers(camera: Camera) -> None:
     await camera.trigger(timeout=5)
     await camera.trigger(3)
 
 
-async def trigger_after_an_error(camera: SmartCamera) -> object:
+async def trigger_after_an_error(camera: Camera) -> object:
     await camera.request(0x40)
     return await camera.trigger()
 
@@ -62,12 +63,12 @@ async def next_of(stream: Any) -> object:
         return await anext(stream)
 
 
-async def next_result(camera: SmartCamera) -> object:
+async def next_result(camera: Camera) -> object:
     waiting = camera.next_result()
     return (await asyncio.gather(waiting, camera.trigger()))[0]
 
 
-async def next_in_streams(camera: SmartCamera) -> object:
+async def next_in_streams(camera: Camera) -> object:
     return await asyncio.gather(
         next_of(camera.results()),
         next_of(camera.statuses()),
@@ -76,7 +77,7 @@ async def next_in_streams(camera: SmartCamera) -> object:
     )
 
 
-async def next_in_streams_of_bid(camera: SmartCamera) -> object:
+async def next_in_streams_of_bid(camera: Camera) -> object:
     """Without events: what has ended before the status is asked for has changed nothing."""
     return await asyncio.gather(
         next_of(camera.results()), next_of(camera.statuses()), camera.trigger()
@@ -130,7 +131,7 @@ def emulator(
     )
 
 
-def connect(box: EmulatedCamera, application: int | None = None) -> SmartCamera:
+def connect(box: EmulatedCamera, application: int | None = None) -> Camera:
     return smartcam.connect(
         box.url, application=application, interpret_as="n: int32 @sequence", request_timeout=1.0
     )
@@ -152,7 +153,7 @@ async def cancel_after(count: int, call: Coroutine[Any, Any, object]) -> bool:
     return over
 
 
-async def works(camera: SmartCamera, box: EmulatedCamera) -> None:
+async def works(camera: Camera, box: EmulatedCamera) -> None:
     """Assert that a trigger gets its own result and that both sides agree on everything."""
     result = await camera.trigger(7, timeout=5)
     assert result.application == 7
@@ -223,9 +224,9 @@ async def test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_res
                 return
 
 
-def _owe(camera: SmartCamera) -> None:
+def _owe(camera: Camera) -> None:
     """Have the client owe a result, as after a trigger that was given up."""
-    camera._results.correlation._owed.append(_Owed("late", None, 1, Progress(begun=True)))
+    inside(camera)._results.correlation._owed.append(_Owed("late", None, 1, Progress(begun=True)))
 
 
 @pytest.mark.parametrize("dialect", ["handbook", "bid"])

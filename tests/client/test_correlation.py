@@ -22,6 +22,7 @@ from smartcam._client.correlation import (
 from smartcam._client.interpretation import MAX_NUMBER, Interpretation
 from smartcam.protocols.messages import ResultContainer
 from tests.client.correlation_line import READY, WORKING, Line, ready, shown
+from tests.insides import inside
 
 OURS = Match("triggered")
 HELD = Match("held")
@@ -893,7 +894,7 @@ def test_number_the_user_has_set_that_a_trigger_without_a_number_took_is_not_tak
 
 def test_two_clients_begin_at_different_numbers() -> None:
     cameras = [smartcam.connect("bvs://127.0.0.1") for _ in range(5)]
-    first = {one._results.correlation.take_number(MAX_NUMBER)[0] for one in cameras}
+    first = {inside(one)._results.correlation.take_number(MAX_NUMBER)[0] for one in cameras}
     assert len(first) > 1
 
 

@@ -42,10 +42,10 @@ from tests.handmade import Peer, scripted
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
 
-    from smartcam import SmartCamera
+    from smartcam import Camera
     from smartcam.observers import TraceEntry
 
-    Call = Callable[[SmartCamera], Coroutine[Any, Any, object]]
+    Call = Callable[[Camera], Coroutine[Any, Any, object]]
 
 AT_ONCE = {"load_time": 0, "acquisition_time": 0, "processing_time": 0}
 JOBS: list[dict[str, Any]] = [
@@ -84,7 +84,7 @@ SECOND = 1.0  # that an acquisition of 20slow.job takes
 @contextlib.asynccontextmanager
 async def insight(
     query: str = "?cells=A1", *, box: dict[str, Any] | None = None, **options: Any
-) -> AsyncIterator[tuple[EmulatedInSight, SmartCamera]]:
+) -> AsyncIterator[tuple[EmulatedInSight, Camera]]:
     """An emulated camera on a clock that stands still, and a client in a session with it.
 
     It does not reconnect by default.
@@ -108,7 +108,7 @@ def said(emulator: EmulatedInSight) -> list[str]:
     return [entry.text for entry in emulator.log if entry.direction == "in"]
 
 
-async def slow_trigger(emulator: EmulatedInSight, camera: SmartCamera) -> asyncio.Task[Any]:
+async def slow_trigger(emulator: EmulatedInSight, camera: Camera) -> asyncio.Task[Any]:
     """Trigger the slow job; returns when the camera has begun its run."""
     count = sum(line == "SW8" for line in said(emulator)) + 1
     task = asyncio.ensure_future(camera.trigger())
@@ -781,12 +781,12 @@ MOST_STEPS = 300
 """Bound of a sweep."""
 
 
-async def in_application(camera: SmartCamera) -> None:
+async def in_application(camera: Camera) -> None:
     async with camera.application(12):
         await asyncio.sleep(0)
 
 
-async def stop_and_start(camera: SmartCamera) -> None:
+async def stop_and_start(camera: Camera) -> None:
     await camera.stop()
     await camera.start()
 

@@ -15,11 +15,11 @@ import smartcam
 from smartcam import (
     ApplicationChanged,
     Backoff,
+    Camera,
     ConnectionLostError,
     Disconnected,
     Reconnected,
     ResponseTimeoutError,
-    SmartCamera,
     Status,
 )
 from tests.client.camera_by_hand import (
@@ -37,6 +37,7 @@ from tests.client.camera_by_hand import (
     HandmadeCamera,
 )
 from tests.client.clientkit import SHORT, by_hand, gone, quiet, steps, until
+from tests.insides import inside
 
 LIVENESS, HALF = 1000.0, 500.0
 """Seconds of the time that leaps: a Query after half of it, the end after all of it."""
@@ -55,10 +56,10 @@ TRANSPORTS = pytest.mark.parametrize("transport", ["tcp", "udp"])
 class LeapingTime:
     """The loop's time, which leaps to where :meth:`at` says: seconds since the camera was heard."""
 
-    def __init__(self, camera: SmartCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
         loop = asyncio.get_running_loop()
         self._real = loop.time
-        self._begin = camera._connection.require_link().heard_at
+        self._begin = inside(camera)._connection.require_link().heard_at
         self._ahead = 0.0
         monkeypatch.setattr(loop, "time", lambda: self._real() + self._ahead)
 
@@ -71,7 +72,7 @@ class LeapingTime:
 @contextlib.asynccontextmanager
 async def leaping(
     monkeypatch: pytest.MonkeyPatch, *, box: dict[str, Any] | None = None, **options: Any
-) -> AsyncIterator[tuple[HandmadeCamera, SmartCamera, LeapingTime]]:
+) -> AsyncIterator[tuple[HandmadeCamera, Camera, LeapingTime]]:
     """A handmade camera and a client, whose time leaps from then on."""
     options = {"liveness_timeout": LIVENESS, "switch_timeout": SWITCHING, **options}
     async with by_hand(box=box, **options) as (made, camera):
@@ -84,9 +85,9 @@ def queries(box: HandmadeCamera) -> int:
     return box.ids.count(QUERY) - 1
 
 
-async def heard(camera: SmartCamera, box: HandmadeCamera, data: bytes) -> None:
+async def heard(camera: Camera, box: HandmadeCamera, data: bytes) -> None:
     """Send bytes and wait until the client has them."""
-    link = camera._connection.require_link()
+    link = inside(camera)._connection.require_link()
     before = link.machine.counters.bytes_received
     box.send(data)
     await until(lambda: link.machine.counters.bytes_received == before + len(data))
@@ -100,7 +101,7 @@ async def test_silent_camera_is_found_without_any_call(transport: str) -> None:
     async with by_hand(box={"transport": transport}, liveness_timeout=2 * SHORT) as (box, camera):
         events = camera.events()
         box.script[QUERY] = quiet
-        begin = camera._connection.require_link().heard_at
+        begin = inside(camera)._connection.require_link().heard_at
         async with asyncio.timeout(5):
             event = await anext(events)
         waited = asyncio.get_running_loop().time() - begin
@@ -165,7 +166,7 @@ async def test_answer_keeps_the_link(transport: str, monkeypatch: pytest.MonkeyP
         for count in range(1, 6):
             await time.at(count * (HALF + JUST))
             await box.wait_for(QUERY, count + 1)
-            await until(lambda: not camera._waits.answers)
+            await until(lambda: not inside(camera)._waits.answers)
         await time.at(5 * (HALF + JUST) + HALF - JUST)
         assert camera.connected
         assert queries(box) == 5
@@ -238,12 +239,15 @@ async def test_answer_within_the_same_tick_of_a_coarse_clock_keeps_the_link(
 ) -> None:
     """Windows' clock ticks every 16 ms: question and answer then have the same time."""
     async with leaping(monkeypatch) as (box, camera, time):
-        loop, heard_at = asyncio.get_running_loop(), camera._connection.require_link().heard_at
+        loop, heard_at = (
+            asyncio.get_running_loop(),
+            inside(camera)._connection.require_link().heard_at,
+        )
         with monkeypatch.context() as standing:
             standing.setattr(loop, "time", lambda: heard_at + HALF)
             await steps(100)
             assert queries(box) == 1
-            assert camera._connection.require_link().heard_at == heard_at + HALF
+            assert inside(camera)._connection.require_link().heard_at == heard_at + HALF
         await time.at(LIVENESS)
         assert camera.connected
         await time.at(LIVENESS + JUST)
@@ -321,7 +325,7 @@ async def test_trigger_without_a_result_is_no_silence(monkeypatch: pytest.Monkey
         for count in range(1, 8):
             await time.at(count * (HALF + JUST))
             await box.wait_for(QUERY, count + 1)
-            await until(lambda: not camera._waits.answers)
+            await until(lambda: not inside(camera)._waits.answers)
         box.send(box.result_frame() + box.status_frame(READY))
         assert (await triggering).raw == b"found"
 
@@ -386,7 +390,7 @@ async def test_load_that_is_over_is_asked_after_again(monkeypatch: pytest.Monkey
         await time.at(1200.0)
         await heard(camera, box, box.status_frame(READY))
         await box.wait_for(QUERY, 2)  # which application is active now?
-        await until(lambda: not camera._waits.answers)
+        await until(lambda: not inside(camera)._waits.answers)
         await time.at(1200.0 + HALF - JUST)
         assert queries(box) == 1
         await time.at(1200.0 + HALF)
@@ -451,8 +455,8 @@ async def test_one_timer_is_set_in_each_session_and_none_between() -> None:
         assert len(looks()) == 1
 
 
-def option(camera: SmartCamera, level: int, name: str) -> int:
-    transport = camera._connection.require_link()._transport
+def option(camera: Camera, level: int, name: str) -> int:
+    transport = inside(camera)._connection.require_link()._transport
     found: int = transport.get_extra_info("socket").getsockopt(level, getattr(socket, name))
     return found
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import smartcam
-from smartcam import ConnectionLostError, FrameError, ResponseTimeoutError, Result, SmartCamera
+from smartcam import Camera, ConnectionLostError, FrameError, ResponseTimeoutError, Result
 from smartcam._client.link import Link
 from smartcam.protocols._framed import frame_age
 from smartcam.testing import LinkProxy
@@ -55,7 +55,7 @@ SEGMENT = 1460
 @contextlib.asynccontextmanager
 async def through_proxy(
     **options: Any,
-) -> AsyncIterator[tuple[HandmadeCamera, LinkProxy, SmartCamera]]:
+) -> AsyncIterator[tuple[HandmadeCamera, LinkProxy, Camera]]:
     """A handmade camera, a proxy, and a client in a session through it."""
     async with (
         HandmadeCamera() as box,
@@ -91,7 +91,7 @@ async def next_of(results: Any) -> Result:
         return result
 
 
-def has_received(camera: SmartCamera, count: int) -> bool:
+def has_received(camera: Camera, count: int) -> bool:
     return camera.statistics().received == count
 
 
@@ -239,7 +239,7 @@ async def speaking(box: HandmadeCamera, data: bytes) -> AsyncIterator[None]:
         await asyncio.wait({task})
 
 
-async def lost(camera: SmartCamera) -> str:
+async def lost(camera: Camera) -> str:
     """Wait until the link is lost; return the text of the broken frame's error."""
     async with asyncio.timeout(SOON):
         error = await gone(asyncio.create_task(camera.wait_status(lambda _: False, SOON)))

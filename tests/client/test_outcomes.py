@@ -14,6 +14,7 @@ import pytest
 import smartcam
 from smartcam import (
     Backoff,
+    Camera,
     CameraBusyError,
     CameraFaultError,
     CommandRejectedError,
@@ -26,7 +27,6 @@ from smartcam import (
     NotRunningError,
     OvertriggeredError,
     Result,
-    SmartCamera,
     SmartCamError,
     Status,
     StatusChanged,
@@ -78,50 +78,50 @@ class Witness(smartcam.Observer):
 # ---------------------------------------------------------------------- the closed list, by hand
 
 
-async def plain(_: Any, camera: SmartCamera) -> object:
+async def plain(_: Any, camera: Camera) -> object:
     return await camera.trigger(timeout=SOON)
 
 
-async def short(_: Any, camera: SmartCamera) -> object:
+async def short(_: Any, camera: Camera) -> object:
     return await camera.trigger(timeout=SHORT)
 
 
-async def with_input(_: Any, camera: SmartCamera) -> object:
+async def with_input(_: Any, camera: Camera) -> object:
     return await camera.trigger(input=b"part", timeout=SOON)
 
 
-async def without_patience(_: Any, camera: SmartCamera) -> object:
+async def without_patience(_: Any, camera: Camera) -> object:
     return await camera.trigger(when_busy="refuse", timeout=SOON)
 
 
-async def of_a_number(_: Any, camera: SmartCamera) -> object:
+async def of_a_number(_: Any, camera: Camera) -> object:
     return await camera.trigger(interpret_as="n: int32", timeout=SOON)
 
 
-async def in_application_99(_: Any, camera: SmartCamera) -> object:
+async def in_application_99(_: Any, camera: Camera) -> object:
     return await camera.trigger(99, timeout=SOON)
 
 
-async def while_the_link_is_lost(box: HandmadeCamera, camera: SmartCamera) -> object:
+async def while_the_link_is_lost(box: HandmadeCamera, camera: Camera) -> object:
     triggering = asyncio.create_task(camera.trigger(timeout=SOON))
     await box.wait_for(TRIGGER)
     box.hang_up()
     return await triggering
 
 
-async def while_it_is_closed(box: HandmadeCamera, camera: SmartCamera) -> object:
+async def while_it_is_closed(box: HandmadeCamera, camera: Camera) -> object:
     triggering = asyncio.create_task(camera.trigger(timeout=SOON))
     await box.wait_for(TRIGGER)
     await camera.close()
     return await triggering
 
 
-async def after_it_was_closed(_: Any, camera: SmartCamera) -> object:
+async def after_it_was_closed(_: Any, camera: Camera) -> object:
     await camera.close()
     return await camera.trigger(timeout=SOON)
 
 
-async def after_it_was_taken(box: HandmadeCamera, camera: SmartCamera) -> object:
+async def after_it_was_taken(box: HandmadeCamera, camera: Camera) -> object:
     for _ in range(2):  # lost, and lost again right after the reconnect
         await camera.wait_connected(SOON)
         waiting = asyncio.create_task(camera.wait_status(lambda _: False))
@@ -141,7 +141,7 @@ class Outcome:
     at_trigger: Any = None  # what the camera does; as ever where it is None
     status: int = READY  # the camera's at first
     options: dict[str, Any] = field(default_factory=dict[str, Any])  # of the client
-    play: Callable[[HandmadeCamera, SmartCamera], Awaitable[object]] = plain  # what the user does
+    play: Callable[[HandmadeCamera, Camera], Awaitable[object]] = plain  # what the user does
 
 
 SILENT = answers()
@@ -239,7 +239,7 @@ class Stage:
 
     emulator: EmulatedCamera
     clock: ManualClock
-    camera: SmartCamera
+    camera: Camera
 
     async def begin(self, **options: Any) -> asyncio.Task[Any]:
         """Trigger, and wait until the camera inspects."""

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import smartcam
-from smartcam import CameraEvent, InterpretationError, Result, SmartCamera, SmartCamError, Status
+from smartcam import Camera, CameraEvent, InterpretationError, Result, SmartCamError, Status
 from smartcam._client import handshake, link
 from smartcam._client.doorbell import Doorbell
 from smartcam._client.link import LARGEST_CHUNK
@@ -165,7 +165,7 @@ async def test_predicate_that_raises_tells_its_caller(kind: type[BaseException])
 
 async def test_account_balances_while_an_interpreter_runs() -> None:
     seen: list[int] = []
-    cameras: list[SmartCamera] = []
+    cameras: list[Camera] = []
 
     def look(reader: object) -> int:
         statistics = cameras[0].statistics()

@@ -52,19 +52,20 @@ from tests.client.clientkit import (
     steps,
     until,
 )
+from tests.insides import inside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from smartcam import SmartCamera
+    from smartcam import Camera
 
-    Wait = Callable[[SmartCamera], Coroutine[Any, Any, object]]
+    Wait = Callable[[Camera], Coroutine[Any, Any, object]]
 
 
 # ---------------------------------------------------------------------- who waits is told
 
 
-async def inside_application(camera: SmartCamera) -> None:
+async def inside_application(camera: Camera) -> None:
     async with camera.application(3):
         await camera.wait_status(lambda _: False)
 
@@ -223,7 +224,7 @@ async def test_trigger_is_never_sent_again_by_itself(transport: str) -> None:
         box.script[TRIGGER] = quiet
         triggering = asyncio.create_task(camera.trigger(input=b"part"))
         await box.wait_for(TRIGGER)
-        camera._connection.require_link().abort(ConnectionResetError("pulled"))
+        inside(camera)._connection.require_link().abort(ConnectionResetError("pulled"))
         with pytest.raises(ConnectionLostError, match="pulled"):
             await triggering
         await camera.wait_connected(SOON)
@@ -247,7 +248,7 @@ async def test_dialect_found_out_once_is_kept() -> None:
     async with EmulatedCamera(dialect="thesis") as emulator:
         url = emulator.url.partition("?")[0]
         async with smartcam.connect(url, connect_timeout=1.0, reconnect=FAST) as camera:
-            camera._connection.require_link().abort(ConnectionResetError("pulled"))
+            inside(camera)._connection.require_link().abort(ConnectionResetError("pulled"))
             await until(lambda: camera.statistics().sessions == 2)
             assert camera.url == emulator.url
         # what the other dialect says makes no frame here
@@ -274,7 +275,9 @@ async def test_old_link_is_over_before_the_camera_hears_the_next_connect() -> No
                 elif reason == "broken":
                     box.send(b"no frame at all")
                 else:
-                    camera._connection.require_link().give_up(ConnectionResetError("pulled"))
+                    inside(camera)._connection.require_link().give_up(
+                        ConnectionResetError("pulled")
+                    )
                 await until(lambda: camera.statistics().sessions > sessions)  # noqa: B023
         assert open_at_connect == [1, 1, 1, 1]
 
@@ -486,7 +489,7 @@ def test_reconnect_that_is_no_policy_is_refused() -> None:
 # ---------------------------------------------------------------------- closing meanwhile
 
 
-async def closed_at_once(camera: SmartCamera) -> None:
+async def closed_at_once(camera: Camera) -> None:
     async with asyncio.timeout(0.5):
         await camera.close()
     for call in (camera.trigger, camera.wait_connected):
@@ -514,7 +517,7 @@ async def test_close_while_it_connects_is_immediate() -> None:
 
 async def test_close_while_a_command_of_before_still_has_the_turn_is_immediate() -> None:
     async with by_hand(reconnect=FAST) as (box, camera):
-        async with camera._lock.hold(SOON):
+        async with inside(camera)._lock.hold(SOON):
             await lose(box, camera)
             with pytest.raises(ResponseTimeoutError):
                 await camera.wait_connected(SHORT)  # the next session waits for it
@@ -525,7 +528,7 @@ async def test_close_while_a_command_of_before_still_has_the_turn_is_immediate()
 
 async def test_next_session_waits_for_a_command_of_before_not_for_ever() -> None:
     async with by_hand(reconnect=FAST, switch_timeout=SHORT) as (box, camera):
-        async with camera._lock.hold(SOON):
+        async with inside(camera)._lock.hold(SOON):
             await lose(box, camera)
             await camera.wait_connected(SOON)
         assert box.connections == 2

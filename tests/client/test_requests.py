@@ -11,12 +11,12 @@ import pytest
 
 import smartcam
 from smartcam import (
+    Camera,
     ConnectionLostError,
     InterpretationError,
     LocalProtocolError,
     RemoteProtocolError,
     ResponseTimeoutError,
-    SmartCamera,
     Status,
 )
 from smartcam.protocols import messages as m
@@ -37,6 +37,7 @@ from tests.client.camera_by_hand import (
     words,
 )
 from tests.client.clientkit import SHORT, by_hand, cancelled, emulated, quiet, steps, until
+from tests.insides import inside
 from tests.timed_loop import spend
 
 UNKNOWN = 0x77
@@ -159,7 +160,7 @@ async def test_reboot_is_one_frame() -> None:
         assert await box.wait_for(REBOOT) == b""
 
 
-CALLS: list[Callable[[SmartCamera], Coroutine[Any, Any, object]]] = [
+CALLS: list[Callable[[Camera], Coroutine[Any, Any, object]]] = [
     lambda camera: camera.set_input(bytes(1 << 25)),
     lambda camera: camera.trigger(input=bytes(1 << 25), timeout=SHORT),
 ]
@@ -167,7 +168,7 @@ CALLS: list[Callable[[SmartCamera], Coroutine[Any, Any, object]]] = [
 
 @pytest.mark.parametrize("call", CALLS, ids=["set_input", "trigger"])
 async def test_camera_that_takes_no_bytes_is_a_timeout(
-    call: Callable[[SmartCamera], Coroutine[Any, Any, object]],
+    call: Callable[[Camera], Coroutine[Any, Any, object]],
 ) -> None:
     async with by_hand(request_timeout=SHORT, close_timeout=SHORT) as (box, camera):
         box.stop_reading()
@@ -372,9 +373,11 @@ async def test_answer_that_nobody_asked_for_is_counted_only() -> None:
 async def test_answer_of_another_kind_than_asked_for_is_an_error() -> None:
     async with by_hand() as (_, camera):
         asking = asyncio.create_task(camera.query_application())
-        await until(lambda: m.QueryAnswer in camera._waits.answers)
-        camera._waits.answers[m.QueryAnswer].set_result(m.SwitchAnswer(code=0, application=1))
-        del camera._waits.answers[m.QueryAnswer]
+        await until(lambda: m.QueryAnswer in inside(camera)._waits.answers)
+        inside(camera)._waits.answers[m.QueryAnswer].set_result(
+            m.SwitchAnswer(code=0, application=1)
+        )
+        del inside(camera)._waits.answers[m.QueryAnswer]
         with pytest.raises(RemoteProtocolError, match="QueryAnswer was expected"):
             await asking
 

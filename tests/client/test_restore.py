@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from smartcam import (
+    Camera,
     CommandRejectedError,
     ConnectionLostError,
     NotRunningError,
-    SmartCamera,
     Status,
     WrongApplicationError,
 )
@@ -56,19 +56,19 @@ async def test_run_state_is_left_alone_without_restore() -> None:
         assert box.since(mark) == OPENING
 
 
-async def named_by_connect(_: SmartCamera) -> None:
+async def named_by_connect(_: Camera) -> None:
     pass
 
 
-async def named_by_switch(camera: SmartCamera) -> None:
+async def named_by_switch(camera: Camera) -> None:
     await camera.switch_application(3)
 
 
-async def stopped(camera: SmartCamera) -> None:
+async def stopped(camera: Camera) -> None:
     await camera.stop()
 
 
-async def stopped_and_started(camera: SmartCamera) -> None:
+async def stopped_and_started(camera: Camera) -> None:
     await camera.stop()
     await camera.start()
 
@@ -84,7 +84,7 @@ async def stopped_and_started(camera: SmartCamera) -> None:
 )
 @pytest.mark.parametrize("found", [(1, READY), (1, 0), (7, READY), (7, 0), (3, 0)])
 async def test_restore_has_back_what_was_wanted_before_the_next_command(
-    name: Callable[[SmartCamera], Coroutine[Any, Any, None]],
+    name: Callable[[Camera], Coroutine[Any, Any, None]],
     application: int,
     running: bool,
     found: tuple[int, int],

@@ -13,6 +13,7 @@ import pytest
 import smartcam
 from smartcam import (
     ApplicationChanged,
+    Camera,
     CameraEvent,
     CommandRejectedError,
     ConfigurationError,
@@ -24,7 +25,6 @@ from smartcam import (
     FrameError,
     LocalProtocolError,
     ResponseTimeoutError,
-    SmartCamera,
     Status,
     StatusChanged,
 )
@@ -46,6 +46,7 @@ from tests.client.camera_by_hand import (
     Peer,
 )
 from tests.client.clientkit import SHORT, by_hand, cancelled, emulated, gone, steps, until
+from tests.insides import inside
 
 TCP_DIALECTS = ["handbook", "thesis"]
 
@@ -375,7 +376,7 @@ async def test_status_that_did_not_change_is_no_event() -> None:
 
 # ---------------------------------------------------------------------- the link is lost
 
-WAITERS: dict[str, Callable[[SmartCamera], Coroutine[Any, Any, object]]] = {
+WAITERS: dict[str, Callable[[Camera], Coroutine[Any, Any, object]]] = {
     "trigger": lambda camera: camera.trigger(),
     "trigger in line": lambda camera: camera.trigger(),
     "wait_status": lambda camera: camera.wait_status(lambda _: False),
@@ -428,7 +429,7 @@ async def test_error_raised_again_and_again_does_not_grow() -> None:
         assert len(sizes) == 1
 
 
-async def _traceback_size(camera: SmartCamera) -> int:
+async def _traceback_size(camera: Camera) -> int:
     size, error = 0, await gone(camera.trigger())
     traceback = error.__traceback__ if error is not None else None
     while traceback is not None:
@@ -472,7 +473,7 @@ async def test_supervisor_that_fails_tells_everybody(
     async with by_hand() as (box, camera):
         waiting = asyncio.create_task(camera.wait_status(lambda _: False))
         await steps(1)
-        monkeypatch.setattr(camera._dispatch, "dispatch", _fail)
+        monkeypatch.setattr(inside(camera)._dispatch, "dispatch", _fail)
         box.report(RUNNING)
         error = await gone(waiting)
         assert isinstance(error, ConnectionLostError)

@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam import (
+    Camera,
     ConfigurationError,
     ConnectionLostError,
     InterpretationError,
     ResponseTimeoutError,
     Result,
-    SmartCamera,
     Status,
     StatusChanged,
     SubscriberOverflowError,
@@ -40,6 +40,7 @@ from tests.client.camera_by_hand import (
     HandmadeCamera,
 )
 from tests.client.clientkit import SHORT, balance, by_hand, cancelled, emulated, steps, until
+from tests.insides import inside
 
 
 class Failing(Interpreter):
@@ -49,7 +50,7 @@ class Failing(Interpreter):
         raise KeyError(len(reader))
 
 
-def account(camera: SmartCamera) -> SubscriberStatistics:
+def account(camera: Camera) -> SubscriberStatistics:
     """Return the account of the only subscriber."""
     (one,) = camera.statistics().subscribers
     return one
@@ -404,7 +405,9 @@ async def test_next_result_cancelled_in_the_same_step_takes_nothing() -> None:
         first, second = (asyncio.create_task(camera.next_result()) for _ in range(2))
         await steps(2)
         first.cancel()
-        camera._dispatch.dispatch(Chunk(0.0, [m.ResultContainer(application=7, data=b"one")]))
+        inside(camera)._dispatch.dispatch(
+            Chunk(0.0, [m.ResultContainer(application=7, data=b"one")])
+        )
         assert (await second).raw == b"one"
         assert first.cancelled()
 
@@ -433,7 +436,7 @@ GOOD, GARBAGE, WRONG = struct.pack("<i", 5), b"?", struct.pack("<i", 6)
 class Story:
     """Plays what happens to a camera, and says by rules of its own what the account must be."""
 
-    def __init__(self, box: HandmadeCamera, camera: SmartCamera) -> None:
+    def __init__(self, box: HandmadeCamera, camera: Camera) -> None:
         self.box = box
         self.camera = camera
         self.fates: collections.Counter[str] = collections.Counter()

@@ -11,13 +11,13 @@ import pytest
 
 import smartcam
 from smartcam import (
+    Camera,
     CommandRejectedError,
     ConfigurationError,
     ConnectionClosedError,
     ConnectionLostError,
     InterpretationError,
     ResponseTimeoutError,
-    SmartCamera,
     Status,
     TriggerTimeoutError,
     WrongApplicationError,
@@ -580,22 +580,22 @@ async def test_application_used_by_two_tasks_does_not_mix_them_up() -> None:
 # ---------------------------------------------------------------------- closing on the way back
 
 
-async def left_by_error(camera: SmartCamera) -> None:
+async def left_by_error(camera: Camera) -> None:
     async with camera.application(21):
         raise ValueError("the user's own")
 
 
-async def left_by_timeout(camera: SmartCamera) -> None:
+async def left_by_timeout(camera: Camera) -> None:
     await camera.trigger(21, timeout=0.0)
 
 
-async def left_by_interpretation(camera: SmartCamera) -> None:
+async def left_by_interpretation(camera: Camera) -> None:
     await camera.trigger(21, interpret_as="n: int32")
 
 
 @pytest.mark.parametrize("leave", [left_by_error, left_by_timeout, left_by_interpretation])
 async def test_close_waits_for_the_way_back(
-    leave: Callable[[SmartCamera], Awaitable[None]],
+    leave: Callable[[Camera], Awaitable[None]],
 ) -> None:
     async with EmulatedCamera(applications=QUICK) as emulator:
         with pytest.raises((ValueError, TriggerTimeoutError)):

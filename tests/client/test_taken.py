@@ -36,9 +36,9 @@ from tests.client.clientkit import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from smartcam import SmartCamera
+    from smartcam import Camera
 
-    Wait = Callable[[SmartCamera], Coroutine[Any, Any, object]]
+    Wait = Callable[[Camera], Coroutine[Any, Any, object]]
 
 # ---------------------------------------------------------------------- another client
 
@@ -52,7 +52,7 @@ FREE = {
 }
 
 
-async def taken(*cameras: SmartCamera) -> tuple[SmartCamera, SmartCamera]:
+async def taken(*cameras: Camera) -> tuple[Camera, Camera]:
     """Wait until one of two clients has stopped; return it and the one that has the camera."""
     waiting = {asyncio.create_task(_until_over(one)): one for one in cameras}
     done, left = await asyncio.wait(waiting, timeout=2 * SOON, return_when=asyncio.FIRST_COMPLETED)
@@ -64,7 +64,7 @@ async def taken(*cameras: SmartCamera) -> tuple[SmartCamera, SmartCamera]:
     return stopped_one, other
 
 
-async def _until_over(camera: SmartCamera) -> None:
+async def _until_over(camera: Camera) -> None:
     with contextlib.suppress(ConnectionTakenError):
         async for _ in camera.events():
             pass

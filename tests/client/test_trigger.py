@@ -59,6 +59,7 @@ from tests.client.clientkit import (
     steps,
     until,
 )
+from tests.insides import inside
 from tests.timed_loop import spend
 
 BEGUN = m.StatusReport(status=Status.RUNNING, endian=0)
@@ -577,9 +578,11 @@ async def test_result_that_comes_while_its_caller_is_being_cancelled_is_late() -
         trigger, box.script[TRIGGER] = box.script[TRIGGER], quiet
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER)
-        await until(lambda: not camera._waits._fence_open)
+        await until(lambda: not inside(camera)._waits._fence_open)
         triggering.cancel()
-        camera._dispatch.dispatch(Chunk(0.0, [m.ResultContainer(application=7, data=b"late")]))
+        inside(camera)._dispatch.dispatch(
+            Chunk(0.0, [m.ResultContainer(application=7, data=b"late")])
+        )
         await asyncio.wait({triggering})
         assert triggering.cancelled()
         assert camera.statistics().late == 1
@@ -594,11 +597,13 @@ async def test_result_that_comes_before_its_caller_is_cancelled_owes_nothing() -
         trigger, box.script[TRIGGER] = box.script[TRIGGER], quiet
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER)
-        await until(lambda: not camera._waits._fence_open)
-        camera._dispatch.dispatch(
+        await until(lambda: not inside(camera)._waits._fence_open)
+        inside(camera)._dispatch.dispatch(
             Chunk(0.0, [BEGUN, m.ResultContainer(application=7, data=b"ours")])
         )
-        camera._dispatch.dispatch(Chunk(0.0, [m.StatusReport(status=Status(READY), endian=0)]))
+        inside(camera)._dispatch.dispatch(
+            Chunk(0.0, [m.StatusReport(status=Status(READY), endian=0)])
+        )
         await cancelled(triggering)
         box.script[TRIGGER] = trigger
         mark = len(box.ids)
@@ -614,7 +619,7 @@ async def test_result_at_the_very_deadline_is_returned(waiting: str) -> None:
         chunk = Chunk(0.0, [BEGUN, m.ResultContainer(application=7, data=b"just")])
         deadline = loop.time() + SHORT
         task = asyncio.ensure_future(getattr(camera, waiting)(timeout=SHORT))
-        loop.call_at(deadline - 0.001, camera._dispatch.dispatch, chunk)
+        loop.call_at(deadline - 0.001, inside(camera)._dispatch.dispatch, chunk)
         await steps(5)
         spend(SHORT)  # both timers are due in the loop's next step
         assert (await task).raw == b"just"

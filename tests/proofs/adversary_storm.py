@@ -27,7 +27,7 @@ from typing import Any
 
 import smartcam
 from smartcam import exceptions
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.models import Statistics
 from tests.client.camera_by_hand import NUMBER, RESULT, TRIGGER
 from tests.client.line_camera import APPLICATIONS, LAYOUTS, LineCamera, Run, Step
@@ -309,14 +309,14 @@ class AdversaryStorm(Storm[Adversary]):
             account = client.statistics()
         self._audit(account, heard=last and not drops, first_session=first_session)
 
-    async def _caller(self, client: SmartCamera, until: int) -> None:
+    async def _caller(self, client: Camera, until: int) -> None:
         while self.figures.calls < until and not self._ended.is_set():
             self.figures.calls += 1
             await self._call(client)
             if self.happens(0.4):  # what is on the line comes before the next one goes out
                 await asyncio.sleep(self._chance.uniform(0, self._way))
 
-    async def _call(self, client: SmartCamera) -> None:
+    async def _call(self, client: Camera) -> None:
         self._unrest()
         chance, variant = self._chance, self.variant
         patient = min(5.0, 0.5 + 40 * self._way)
@@ -342,7 +342,7 @@ class AdversaryStorm(Storm[Adversary]):
             self.keep_pace(outcome)
         await self._come_back(client, outcome)
 
-    async def _come_back(self, client: SmartCamera, outcome: str) -> None:
+    async def _come_back(self, client: Camera, outcome: str) -> None:
         """Do what somebody does who wants to go on."""
         if outcome == "NotRunningError":
             await asyncio.sleep(self._way)
@@ -356,7 +356,7 @@ class AdversaryStorm(Storm[Adversary]):
             except exceptions.LinkError:
                 self._ended.set()
 
-    async def _hear_the_rest(self, client: SmartCamera) -> None:
+    async def _hear_the_rest(self, client: Camera) -> None:
         """Have every container that was sent."""
         await self._calm()
         await self.quiet()

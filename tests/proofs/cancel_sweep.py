@@ -24,13 +24,14 @@ from datetime import datetime
 from typing import Any, Literal, NamedTuple
 
 import smartcam
-from smartcam import Backoff, LinkError, ResponseTimeoutError, SmartCamera, Status
+from smartcam import Backoff, Camera, LinkError, ResponseTimeoutError, Status
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator._bvs.device import Mode
 from smartcam.emulator._generators import Run
 from smartcam.protocols import messages as m
 from smartcam.streams import Subscription
 from tests.client.clientkit import balance
+from tests.insides import inside
 from tests.timed_loop import TimedLoop
 
 STEP = 0.001
@@ -89,7 +90,7 @@ class Bench(NamedTuple):
     """One camera and one client."""
 
     box: EmulatedCamera
-    camera: SmartCamera
+    camera: Camera
     wire: Wire
 
     @property
@@ -352,7 +353,7 @@ def calls_over(wire: Wire) -> list[str]:
 
 def missing_calls() -> set[str]:
     """Return the coroutines of client and subscription that no call is about."""
-    found = {*_coroutines(SmartCamera), *_coroutines(Subscription)}
+    found = {*_coroutines(Camera), *_coroutines(Subscription)}
     return found - {name for call in CALLS.values() for name in call.covers}
 
 
@@ -484,7 +485,7 @@ def _box(wire: Wire, *, running: bool) -> EmulatedCamera:
     return box
 
 
-def _client(url: str, wire: Wire, options: dict[str, Any]) -> SmartCamera:
+def _client(url: str, wire: Wire, options: dict[str, Any]) -> Camera:
     return smartcam.connect(
         url,
         interpret_as=NUMBERED if wire.numbered else PLAIN,
@@ -522,16 +523,16 @@ async def _check_state(bench: Bench, call: Call) -> None:
     while device.processing or device.mode in {Mode.SWITCHING, Mode.REBOOTING}:  # noqa: ASYNC110
         await asyncio.sleep(0)
     await camera.wait_connected()
-    async with camera._lock.hold(BOUND):  # behind every way back
-        active = await camera._commands.query(camera._connection.deadline(BOUND))
+    async with inside(camera)._lock.hold(BOUND):  # behind every way back
+        active = await inside(camera)._commands.query(inside(camera)._connection.deadline(BOUND))
     assert active == camera.active_application == device.active_application
     assert active in call.homes
-    assert camera._state.wanted.application in {None, active}
+    assert inside(camera)._state.wanted.application in {None, active}
     if not camera.capabilities.status_by_itself:
         await camera.query_status()
     bits = bench.box.spoken.status_bits
     assert camera.status == bits.read(bits.write(device.status))
-    while not camera._waits.answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
+    while not inside(camera)._waits.answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
         await asyncio.sleep(0)
 
 
@@ -575,11 +576,11 @@ def _expected(kind: type[BaseException]) -> Iterator[None]:
     raise AssertionError(f"no {kind.__name__} came")
 
 
-def _check_waiters(camera: SmartCamera) -> None:
+def _check_waiters(camera: Camera) -> None:
     """Assert that nobody is left who waits, and no turn is held."""
-    lock, listeners = camera._lock, camera._listeners
-    assert camera._results.correlation.pending is None
-    assert not camera._waits.statuses
+    lock, listeners = inside(camera)._lock, camera._listeners
+    assert inside(camera)._results.correlation.pending is None
+    assert not inside(camera)._waits.statuses
     assert not [future for future in listeners._next_results if not future.done()]
     assert not lock._leaving
     assert not lock._lock.locked()
@@ -591,7 +592,7 @@ def _check_waiters(camera: SmartCamera) -> None:
     ]
 
 
-async def _check_closed(camera: SmartCamera) -> None:
+async def _check_closed(camera: Camera) -> None:
     """Assert that a client whose opening or closing was cancelled is closed."""
     assert not camera.connected
     with _expected(smartcam.ConnectionClosedError):
@@ -606,7 +607,7 @@ async def _check_nothing_left(bench: Bench) -> None:
             while box.has_session or box.links:  # noqa: ASYNC110 - a state of the camera
                 await asyncio.sleep(0)
     assert not [t for t in asyncio.all_tasks() if t.get_name().startswith("smartcam[")]
-    session = camera._supervisor.session
+    session = inside(camera)._supervisor.session
     assert session is None or session.link._transport.is_closing()
     balance(camera.statistics())
 

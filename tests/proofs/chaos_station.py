@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 import smartcam
 from smartcam import exceptions
 from smartcam.backoff import Backoff
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.models import Result, Statistics
 from smartcam.streams import Subscription
 from smartcam.testing import LinkProxy
@@ -253,7 +253,7 @@ class Station:
                     self.watch.complain(f"{self.name}: result {run} came behind {last}")
                 last = run
 
-    async def _finish(self, client: SmartCamera) -> None:
+    async def _finish(self, client: Camera) -> None:
         """Have everything mended, and hear all that was sent."""
         heal(self)
         for _ in range(20):
@@ -283,7 +283,7 @@ class Station:
 
     # ------------------------------------------------------------------ what it does
 
-    async def _act(self, client: SmartCamera) -> bool:
+    async def _act(self, client: Camera) -> bool:
         """Do one thing by chance; False where the client is of no more use."""
         actions = (self._trigger, self._cancelled, self._elsewhere, self._visit, self._switch)
         others = (self._input, self._clock, self._flow, self._next, self._stop_start, self._ask)
@@ -295,7 +295,7 @@ class Station:
             return True
         return await self._recover(client, error)
 
-    async def _recover(self, client: SmartCamera, error: BaseException) -> bool:
+    async def _recover(self, client: Camera, error: BaseException) -> bool:
         match error:
             case exceptions.ConnectionTakenError() | exceptions.ConnectionClosedError():
                 self.watch.counts["taken"] += 1
@@ -357,7 +357,7 @@ class Station:
         ]
         self.watch.complain("\n    ".join([f"{self.name}: {text}", *recent]))
 
-    async def _number(self, client: SmartCamera) -> BaseException | None:
+    async def _number(self, client: Camera) -> BaseException | None:
         """Set the number of the next run, by which its trigger is known; else the client does."""
         if not self.sets_number:
             return None
@@ -367,7 +367,7 @@ class Station:
 
     async def _triggered(
         self,
-        client: SmartCamera,
+        client: Camera,
         what: str,
         bound: float,
         cancel_after: float | None = None,
@@ -414,24 +414,24 @@ class Station:
                 self.watch.counts["wrong"] += 1
                 complain(f"{what}: inspected input {value.token}, not {token}")
 
-    async def _trigger(self, client: SmartCamera) -> BaseException | None:
+    async def _trigger(self, client: Camera) -> BaseException | None:
         timeout = self._chance.choice([0.03, 0.1, 0.3])
         return await self._triggered(client, "trigger", timeout, timeout=timeout)
 
-    async def _cancelled(self, client: SmartCamera) -> BaseException | None:
+    async def _cancelled(self, client: Camera) -> BaseException | None:
         when = self._chance.uniform(0, 0.03)
         return await self._triggered(
             client, "trigger to cancel", 0.3, cancel_after=when, timeout=0.3
         )
 
-    async def _elsewhere(self, client: SmartCamera) -> BaseException | None:
+    async def _elsewhere(self, client: Camera) -> BaseException | None:
         # there, the result, and back, which may have to wait for another one that goes back
         bound = 3 * TIMES["switch"] + 0.3
         return await self._triggered(
             client, "trigger elsewhere", bound, application=OTHER, timeout=0.3
         )
 
-    async def _visit(self, client: SmartCamera) -> BaseException | None:
+    async def _visit(self, client: Camera) -> BaseException | None:
         async def visit() -> None:
             async with client.application(OTHER):
                 error = await self._triggered(client, "trigger there", 0.3, timeout=0.3)
@@ -440,12 +440,12 @@ class Station:
 
         return await self._bounded("application", visit(), 4 * TIMES["switch"])
 
-    async def _switch(self, client: SmartCamera) -> BaseException | None:
+    async def _switch(self, client: Camera) -> BaseException | None:
         application = self._chance.choice([TRIGGERED, OTHER, READING])
         switch = client.switch_application(application, timeout=1.0)
         return await self._bounded("switch_application", switch, 1.0)
 
-    async def _input(self, client: SmartCamera) -> BaseException | None:
+    async def _input(self, client: Camera) -> BaseException | None:
         if client.active_application != READING:
             switch = client.switch_application(READING, timeout=1.0)
             error = await self._bounded("switch_application", switch, 1.0)
@@ -454,14 +454,14 @@ class Station:
         token = self._chance.randrange(1, 1 << 31).to_bytes(4, "little")
         return await self._triggered(client, "trigger input", 0.3, input=token, timeout=0.3)
 
-    async def _clock(self, client: SmartCamera) -> BaseException | None:
+    async def _clock(self, client: Camera) -> BaseException | None:
         setting = client.set_clock(datetime(2020, 5, 17, 8, 0, 0))  # noqa: DTZ001
         error = await self._bounded("set_clock", setting, TIMES["request"])
         if error is not None:
             return error
         return await self._bounded("get_clock", client.get_clock(), TIMES["request"])
 
-    async def _flow(self, client: SmartCamera) -> BaseException | None:
+    async def _flow(self, client: Camera) -> BaseException | None:
         """Let the application that runs free run for a moment, then have the usual one."""
         switch = client.switch_application(FREE, timeout=1.0)
         error = await self._bounded("switch_application", switch, 1.0)
@@ -473,18 +473,18 @@ class Station:
         back = client.switch_application(TRIGGERED, timeout=1.0)
         return await self._bounded("switch_application", back, 1.0) or error
 
-    async def _next(self, client: SmartCamera) -> BaseException | None:
+    async def _next(self, client: Camera) -> BaseException | None:
         """Wait for the result of a run that somebody else triggers."""
         task = asyncio.create_task(_next_result(client, 0.1))
         await asyncio.sleep(0)  # it has subscribed
         self.external_trigger()
         return await self._bounded("next_result", task, 0.1)
 
-    async def _stop_start(self, client: SmartCamera) -> BaseException | None:
+    async def _stop_start(self, client: Camera) -> BaseException | None:
         error = await self._bounded("stop", client.stop(timeout=0.5), 0.5)
         return error or await self._bounded("start", client.start(timeout=0.5), 0.5)
 
-    async def _ask(self, client: SmartCamera) -> BaseException | None:
+    async def _ask(self, client: Camera) -> BaseException | None:
         waiting = client.wait_ready(timeout=0.2)
         error = await self._bounded("wait_ready", waiting, 0.2)
         asking = client.query_application()
@@ -504,6 +504,6 @@ def free_port(transport: str) -> int:
             return port
 
 
-async def _next_result(client: SmartCamera, timeout: float) -> Result:
+async def _next_result(client: Camera, timeout: float) -> Result:
     """Return the next result; it subscribes at once, which a lost link forbids."""
     return await client.next_result(timeout=timeout)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal
 import smartcam
 from smartcam import (
     Backoff,
+    Camera,
     CameraEvent,
     Connected,
     ConnectionTakenError,
@@ -22,7 +23,6 @@ from smartcam import (
     Observer,
     Reconnected,
     Result,
-    SmartCamera,
     Status,
     StatusChanged,
 )
@@ -36,6 +36,7 @@ from smartcam.protocols._bvs import ResultCode
 from smartcam.settings import CameraOptions
 from smartcam.streams import Subscription
 from tests.client.clientkit import balance
+from tests.insides import inside
 from tests.proofs.books import LINK_LOST, TRIGGER_OUTCOMES
 from tests.protocols.camera_model import CameraModel, Options, Program
 from tests.timed_loop import TimedLoop
@@ -186,7 +187,7 @@ class Witness(Observer):
     """Sees which call sends a trigger, over which link, and what happens to the links."""
 
     loop: asyncio.AbstractEventLoop
-    camera: SmartCamera | None = None
+    camera: Camera | None = None
     peers: list[str] = field(default_factory=list[str])
     received_before: int = 0
     sends: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
@@ -206,7 +207,7 @@ class Witness(Observer):
         assert self.camera is not None
         self.events.append((self.loop.time(), event))
         if isinstance(event, Connected | Reconnected):
-            session = self.camera._supervisor.session
+            session = inside(self.camera)._supervisor.session
             assert session is not None
             host, port = session.link._transport.get_extra_info("sockname")
             self.peers.append(f"{host}:{port}")
@@ -228,7 +229,7 @@ class ClientJudge:
         self.calls: list[Call] = []  # those that have not ended yet
         self.count = 0
         self.numbers = 0
-        self.camera: SmartCamera | None = None
+        self.camera: Camera | None = None
         self.witness: Witness | None = None
         self.streams: list[Subscription[Result]] = []
         self.taken: dict[int, list[int]] = {}  # numbers of the results that each stream gave
@@ -308,7 +309,7 @@ class ClientJudge:
         """There is a client, and another has not taken its camera."""
         if self.camera is None:
             return False
-        return not isinstance(self.camera._waits.end, ConnectionTakenError)
+        return not isinstance(inside(self.camera)._waits.end, ConnectionTakenError)
 
     @property
     def can_call(self) -> bool:
@@ -431,7 +432,7 @@ class ClientJudge:
             return False
         camera = self.camera
         # a way back that failed is told to the next command
-        return camera is not None and camera.connected and camera._lock._failed is None
+        return camera is not None and camera.connected and inside(camera)._lock._failed is None
 
     def _agrees(self) -> bool:
         """Assert that the client knows the camera's state; whether there is a session."""
@@ -447,7 +448,7 @@ class ClientJudge:
         assert active == camera.active_application == device.active_application
         bits = self.box.spoken.status_bits
         assert camera.status == bits.read(bits.write(device.status))
-        assert not camera._waits.answers
+        assert not inside(camera)._waits.answers
         return True
 
     def _settle_calls(self) -> None:
@@ -545,7 +546,7 @@ class ClientJudge:
         receivers = [name for name in ours if name.endswith(".receive")]
         jobs = [name for name in ours if name not in {*supervisors, *receivers}]
         assert self.camera is not None
-        ended = isinstance(self.camera._waits.end, ConnectionTakenError)
+        ended = isinstance(inside(self.camera)._waits.end, ConnectionTakenError)
         assert len(supervisors) == (0 if ended else 1)
         assert len(receivers) <= len(supervisors)
         assert len(jobs) <= MOST_CALLS + 1

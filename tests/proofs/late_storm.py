@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import smartcam
 from smartcam import exceptions
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.models import Result, Statistics, Status
 from smartcam.streams import Subscription
 from tests.client.clientkit import Sending, TriggerEar
@@ -239,7 +239,7 @@ class LateStorm(Storm[LateVariant]):
             assert isinstance(self.camera, LineCamera)
             self.camera.sensor()
 
-    async def _call(self, client: SmartCamera) -> None:
+    async def _call(self, client: Camera) -> None:
         self.figures.calls += 1
         call = self.figures.calls
         self._pace = self._scale * self._chance.uniform(*PATIENCE)
@@ -316,7 +316,7 @@ def _is_idle(status: Status) -> bool:
 
 
 @contextlib.asynccontextmanager
-async def _listening(client: SmartCamera) -> AsyncIterator[None]:
+async def _listening(client: Camera) -> AsyncIterator[None]:
     """Have a subscriber that reads along."""
 
     async def read(stream: Subscription[Result]) -> None:

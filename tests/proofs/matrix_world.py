@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 
 import smartcam
 from smartcam.backoff import Backoff
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.models import Result
 from smartcam.protocols._bvs import BVS, ResultCode
 from smartcam.protocols._framed.dialect import FramedDialect
@@ -146,9 +146,9 @@ class BenchBase:
         self.taken_in = 0  # how often such a value was told
         self._url = url
         self.ear = ClientEar()
-        self.camera: SmartCamera = self._connect()
+        self.camera: Camera = self._connect()
 
-    def _connect(self) -> SmartCamera:
+    def _connect(self) -> Camera:
         bounds = self.bounds
         self.ear = ClientEar()
         return smartcam.connect(

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import smartcam
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.observers import TraceEntry
@@ -127,21 +127,21 @@ async def test_trigger_that_the_camera_refused_may_be_sent_again() -> None:
 
 
 async def test_trigger_that_is_sent_twice_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    trigger = SmartCamera.trigger
+    trigger = Camera.trigger
 
-    async def twice(camera: SmartCamera, *arguments: Any, **options: Any) -> object:
+    async def twice(camera: Camera, *arguments: Any, **options: Any) -> object:
         await trigger(camera, *arguments, **options)
         return await trigger(camera, *arguments, **options)
 
-    monkeypatch.setattr(SmartCamera, "trigger", twice)
+    monkeypatch.setattr(Camera, "trigger", twice)
     assert "one call sent 2 triggers, 0 were refused" in await judged(CUT)
 
 
 async def test_clock_that_is_not_the_cameras_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def get_clock(_: SmartCamera) -> datetime:
+    async def get_clock(_: Camera) -> datetime:
         return datetime(2000, 1, 1)  # noqa: DTZ001 - it has no zone
 
-    monkeypatch.setattr(SmartCamera, "get_clock", get_clock)
+    monkeypatch.setattr(Camera, "get_clock", get_clock)
     assert "clock 2000-01-01" in await judged(CUT, "query")
 
 

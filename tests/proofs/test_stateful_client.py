@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from smartcam import Result, Status, UnsupportedError
+from tests.insides import inside
 from tests.proofs.books import TRIGGER_OUTCOMES
 from tests.proofs.client_judge import (
     COMMAND_ERRORS,
@@ -393,14 +394,14 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         assert camera is not None
         if not self._is_alone() or not self._agrees():
             return
-        assert not camera._waits.statuses
-        assert not camera._lock._lock.locked()
+        assert not inside(camera)._waits.statuses
+        assert not inside(camera)._lock._lock.locked()
         takes_one = device.running and device.applications[device.active_application].triggered
         if takes_one and Status.SYSTEM_ERROR not in device.status:
             self._begin_trigger(5.0)
             task = self.calls[-1].task
             self.run(asyncio.wait({task}))
-            if camera._state.wanted.application in {None, camera.active_application}:
+            if inside(camera)._state.wanted.application in {None, camera.active_application}:
                 assert task.exception() is None, repr(task.exception())
 
     @precondition(lambda self: self.is_alive)
@@ -419,7 +420,10 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         assert camera is not None
         if not self._is_alone() or not self._agrees():
             return
-        expected, runs = camera._state.wanted.application, camera._state.wanted.running
+        expected, runs = (
+            inside(camera)._state.wanted.application,
+            inside(camera)._state.wanted.running,
+        )
         before = (device.active_application, device.running, expected)
         allowed = [before]
         if camera.settings.restore and ending == "lost":
@@ -439,7 +443,11 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         self._settle_calls()
         assert not self.calls
         if camera.connected and self._agrees():
-            after = (device.active_application, device.running, camera._state.wanted.application)
+            after = (
+                device.active_application,
+                device.running,
+                inside(camera)._state.wanted.application,
+            )
             assert after in allowed, (allowed, after)
 
     @invariant()

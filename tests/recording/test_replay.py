@@ -58,9 +58,7 @@ def sent(emulator: EmulatedCamera) -> list[tuple[float, bytes]]:
     ]
 
 
-async def trigger(
-    emulator: ReplayedCamera, camera: smartcam.SmartCamera, clock: ManualClock
-) -> Any:
+async def trigger(emulator: ReplayedCamera, camera: smartcam.Camera, clock: ManualClock) -> Any:
     """Trigger, let 1 s pass, return the result's bytes."""
     count = sum(isinstance(entry.message, m.Trigger) for entry in emulator.log)
     task = asyncio.create_task(camera.trigger(timeout=2))

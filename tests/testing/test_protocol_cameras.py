@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from smartcam.client import SmartCamera
+from smartcam.camera import Camera
 from smartcam.exceptions import SmartCamError
 from smartcam.models import Status
 from smartcam.testing import CameraKind, CameraSuite, LiveCamera
@@ -34,7 +34,7 @@ HANDBOOK, BID = (
     next(camera_kind for camera_kind in BVS_WORLDS if camera_kind.name == name)
     for name in ("handbook over tcp", "bid over tcp")
 )
-TRIGGER = SmartCamera.trigger
+TRIGGER = Camera.trigger
 
 # ---------------------------------------------------------------------- what is wrong
 
@@ -48,23 +48,23 @@ def gives(value: object) -> Any:
     return method
 
 
-def unbalanced(camera: SmartCamera, _statistics: Any = SmartCamera.statistics) -> Any:
+def unbalanced(camera: Camera, _statistics: Any = Camera.statistics) -> Any:
     found = _statistics(camera)
     return dataclasses.replace(found, received=found.received + 1)
 
 
-async def counting(camera: SmartCamera, *args: Any, **options: Any) -> Any:
+async def counting(camera: Camera, *args: Any, **options: Any) -> Any:
     """Trigger once too often."""
     await TRIGGER(camera, *args, **options)
     return await TRIGGER(camera, *args, **options)
 
 
-async def patient(camera: SmartCamera, *_: Any, **__: Any) -> Any:
+async def patient(camera: Camera, *_: Any, **__: Any) -> Any:
     """Wait for the result, whatever was asked for."""
     return await TRIGGER(camera)
 
 
-async def stubborn(camera: SmartCamera, *args: Any, **options: Any) -> Any:
+async def stubborn(camera: Camera, *args: Any, **options: Any) -> Any:
     """Go on when cancelled."""
     with contextlib.suppress(asyncio.CancelledError):
         await TRIGGER(camera, *args, **options)
@@ -90,7 +90,7 @@ NOBODY = property(lambda _: False)
 def patched(**methods: Any) -> Callable[[pytest.MonkeyPatch], CameraKind]:
     def patch(monkeypatch: pytest.MonkeyPatch) -> CameraKind:
         for name, method in methods.items():
-            monkeypatch.setattr(SmartCamera, name, method)
+            monkeypatch.setattr(Camera, name, method)
         return HANDBOOK
 
     return patch

@@ -29,7 +29,7 @@ from tests.web.sitekit import TOKEN, Caller, Listener, Raw, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
 
 CHECK = "ok: bool, width: real32"
 APPLICATIONS = (
@@ -50,7 +50,7 @@ SUM = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", 
 class World(NamedTuple):
     """A camera at the wire, its site, and who calls it."""
 
-    camera: SmartCamera[Any]
+    camera: Camera[Any]
     site: LiveSite
     caller: Caller
 

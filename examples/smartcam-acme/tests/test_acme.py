@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 import pytest
 from acme_camera import ACME, RUNNING, AcmeCamera, measured
 
-from smartcam import SmartCamera
+from smartcam import Camera
 from smartcam.exceptions import FrameError, TriggerTimeoutError, UnsupportedError
 from smartcam.protocols import messages as m
 from smartcam.registry import PROTOCOLS
@@ -93,7 +93,7 @@ class TestAcme(ProtocolSuite):
 )
 @pytest.mark.asyncio
 async def test_trigger_gives_what_was_measured(
-    camera: SmartCamera, emulated_camera: ThreadedCamera
+    camera: Camera, emulated_camera: ThreadedCamera
 ) -> None:
     result = await camera.trigger()
     assert (result.application, result.value.x, result.value.name) == (7, 0.0125, "bolt")
@@ -105,6 +105,6 @@ async def test_trigger_gives_what_was_measured(
 
 @pytest.mark.smartcam(protocol="acme", faults=[{"kind": "drop", "on": "Trigger"}])
 @pytest.mark.asyncio
-async def test_lost_trigger_is_an_error(camera: SmartCamera) -> None:
+async def test_lost_trigger_is_an_error(camera: Camera) -> None:
     with pytest.raises(TriggerTimeoutError):
         await camera.trigger(timeout=0.2)

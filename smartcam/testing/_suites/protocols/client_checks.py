@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
     from typing import Concatenate, ParamSpec, TypeVar
 
-    from smartcam.client import SmartCamera
+    from smartcam.camera import Camera
     from smartcam.models import Statistics
     from smartcam.testing._suites.protocols.cameras_under_test import CameraKind, LiveCamera
 
@@ -74,7 +74,7 @@ def needs(camera_kind: CameraKind, *applications: int) -> None:
         pytest.skip(f"{camera_kind} has no application {', '.join(map(str, missing))}")
 
 
-def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> SmartCamera:
+def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> Camera:
     """Return a client that reads numbers, and does not reconnect."""
     options = {"reconnect": None, "interpret_as": camera_kind.numbers, **options}
     return smartcam.connect(live.url, **options)
@@ -83,7 +83,7 @@ def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> SmartCa
 @contextlib.asynccontextmanager
 async def visiting(
     camera_kind: CameraKind, **options: Any
-) -> AsyncIterator[tuple[LiveCamera, SmartCamera]]:
+) -> AsyncIterator[tuple[LiveCamera, Camera]]:
     """A camera that is up, and a client in a session with it."""
     if "application" in options:
         needs(camera_kind, options["application"])
@@ -91,7 +91,7 @@ async def visiting(
         yield live, camera
 
 
-async def number(camera: SmartCamera, application: int | None = None, **options: Any) -> int:
+async def number(camera: Camera, application: int | None = None, **options: Any) -> int:
     """Trigger and return the number that came."""
     options.setdefault("timeout", SOON)
     result = await camera.trigger(application, **options)
@@ -105,7 +105,7 @@ async def until(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0)
 
 
-async def refused(camera: SmartCamera, call: Coroutine[Any, Any, object]) -> None:
+async def refused(camera: Camera, call: Coroutine[Any, Any, object]) -> None:
     """See that the dialect cannot do it, that the error says so, and that the session goes on."""
     dialect = re.escape(camera.capabilities.dialect)
     abilities = re.escape(", ".join(camera.capabilities.names))

@@ -34,7 +34,7 @@ from smartcam.testing._suites.protocols.client_checks import (
 from smartcam.testing._suites.protocols.parameters import Parameters
 
 if TYPE_CHECKING:
-    from smartcam import SmartCamera
+    from smartcam import Camera
     from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
 
 FAST = Backoff(initial=0.01, factor=2, maximum=0.1, jitter=0.0)
@@ -180,7 +180,7 @@ class SessionChecks(Parameters):
             balance(second.statistics())
 
 
-def is_taken(camera: SmartCamera) -> bool:
+def is_taken(camera: Camera) -> bool:
     """Whether a client has given up because another one has the camera."""
     try:
         camera.next_result().close()

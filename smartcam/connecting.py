@@ -1,0 +1,113 @@
+"""From an address to a camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from smartcam.client import SmartCamera
+from smartcam.settings import CameraSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import Literal, Unpack
+
+    from smartcam.camera import Camera
+    from smartcam.interpreters._base import AnySpec, TypedSpec
+    from smartcam.models import Localization
+    from smartcam.observers import Observer
+    from smartcam.settings import CameraOptions, OtherOptions
+
+__all__ = ["connect"]
+
+T = TypeVar("T")
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: None = None,
+    **options: Unpack[OtherOptions],
+) -> Camera[bytes]: ...
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: Literal["localizations"],
+    **options: Unpack[OtherOptions],
+) -> Camera[list[Localization]]: ...
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: AnySpec,
+    **options: Unpack[OtherOptions],
+) -> Camera[Any]: ...
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    interpret_as: TypedSpec[T],
+    **options: Unpack[OtherOptions],
+) -> Camera[T]: ...
+
+
+@overload
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    **options: Unpack[CameraOptions],
+) -> Camera[Any]: ...
+
+
+def connect(
+    url: str,
+    *,
+    model: str | None = None,
+    observers: Iterable[Observer] = (),
+    **options: Unpack[CameraOptions],
+) -> Camera[Any]:
+    """Return a camera to be opened with ``async with`` (or ``await``).
+
+    Args:
+        url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
+            pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
+        model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
+        observers: see frames, events, results and errors:
+            :class:`~smartcam.Observer`.
+        **options: ``name``, ``application``, ``interpret_as``, ``calibration``, ``y_down``,
+            ``lenient``, ``connect_timeout``, ``connect_attempts``, ``switch_timeout``,
+            ``request_timeout``, ``close_timeout``, ``liveness_timeout``, ``reconnect``,
+            ``restore``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
+
+    With ``calibration`` the value of every result is a list of localizations in the robot's frame,
+    as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
+    an observer. It gets what ``interpret_as`` gives, turned to y up with ``y_down``; the headers'
+    frame is the camera's ``name``, which a calibration with a ``camera_frame`` wants to be that.
+    No value passes without it. One that is no list of localizations, or that the calibration
+    refuses, is an :exc:`~smartcam.InterpretationError` with the cause chained; an
+    interpreter whose values never are localizations (raw, record, table, strings50) is a
+    ConfigurationError at once. A mapping from application id takes another calibration for each,
+    and None for those whose values are to stay as they are; an application that it lacks is an
+    error, too.
+
+    Raises:
+        ConfigurationError: an address or option cannot work; nothing was tried.
+    """
+    return SmartCamera(CameraSettings.make(url, model, options), observers=observers)
