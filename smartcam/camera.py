@@ -73,7 +73,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         self._observed = bool(self._observers)
         self._interpretations: dict[str, Interpretation] = {}  # by their text
         self._counters = ClientCounters()
-        self._listeners = Listeners(settings.name, self._observers)
+        self._listeners = self._make_listeners()
         self._default = self._interpretation(settings.interpret_as)
 
     # ------------------------------------------------------------------ what each kind does its way
@@ -708,6 +708,9 @@ class Camera(abc.ABC, Generic[ValueT]):
         """
 
     # ------------------------------------------------------------------ small helpers
+
+    def _make_listeners(self) -> Listeners:
+        return Listeners(self.settings.name, self._observers)
 
     def _interpretation(self, spec: object) -> Interpretation:
         known = self._interpretations.get(spec) if isinstance(spec, str) else None

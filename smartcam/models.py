@@ -375,6 +375,8 @@ class ApplicationChanged(CameraEvent):
 class SubscriberStatistics:
     """Account of one subscriber: ``offered == taken + dropped + queued``.
 
+    What a camera sent while it was subscribed is ``offered + missed``.
+
     Attributes:
         name: what is subscribed to: ``results``, ``statuses`` or ``events``.
         policy: what happens when the queue is full: ``drop_oldest`` or ``error``.
@@ -383,6 +385,8 @@ class SubscriberStatistics:
         dropped: items lost to the policy or to ``min_interval``.
         queued: items waiting.
         queued_bytes: bytes of their containers; 0 for statuses and events.
+        missed: items that a fleet's camera sent and that did not come, since the program was cut
+            off from its agent for longer than that keeps them; 0 for a camera at the wire.
     """
 
     name: str
@@ -392,6 +396,7 @@ class SubscriberStatistics:
     dropped: int
     queued: int
     queued_bytes: int = 0
+    missed: int = 0
 
 
 @dataclass(frozen=True, slots=True)

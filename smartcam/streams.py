@@ -6,6 +6,7 @@ import asyncio
 import collections
 import enum
 import itertools
+import math
 import sys
 import weakref
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
@@ -93,6 +94,8 @@ class Queue(Generic[T]):
         # taking costs nothing. A parcel came together: number of its last item, items, bytes.
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
         self._bytes = 0  # of all parcels, of which some may be of items that are gone
+        self._missed = 0
+        self.since: float = -math.inf  # when it subscribed, on the clock of what it is offered
         self._evicted = 0  # those dropped that were queued before: only these have numbers
 
     @property
@@ -111,6 +114,7 @@ class Queue(Generic[T]):
             dropped=self._dropped,
             queued=len(self._items),
             queued_bytes=self._bytes,
+            missed=self._missed,
         )
 
     def close(self) -> None:
@@ -194,6 +198,11 @@ class Queue(Generic[T]):
             if size:
                 self._add_parcel(len(items), size)
             self._ready.set()
+
+    def miss(self, count: int) -> None:
+        """Count items that were sent and cannot come any more."""
+        if not self._ended:
+            self._missed += count
 
     def end(self, error: SmartCamError | None) -> None:
         """End the stream after what is queued; the first reason stays."""
@@ -330,9 +339,11 @@ class BatchSubscription(Queue[T]):
 class Subscribers(Generic[T]):
     """The queues that are offered something; one that nobody refers to any more is gone."""
 
-    __slots__ = ("references",)
+    __slots__ = ("horizon", "references")
 
     def __init__(self) -> None:
+        # what is offered now is as old as this; who subscribed later is passed over
+        self.horizon = math.inf
         # empty where nobody is subscribed: looked at for every message
         self.references: tuple[weakref.ref[Queue[T]], ...] = ()
 
@@ -349,5 +360,5 @@ class Subscribers(Generic[T]):
     def __iter__(self) -> Iterator[Queue[T]]:
         for reference in self.references:
             queue = reference()
-            if queue is not None:
+            if queue is not None and queue.since <= self.horizon:
                 yield queue

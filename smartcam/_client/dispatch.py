@@ -134,7 +134,7 @@ class Dispatch:
         if status != before and self._listeners.sees_events:
             event = StatusChanged(camera=self._name, at=at, status=status, previous=before)
             self._listeners.publish(event)
-        if self._listeners.statuses.references:
+        if self._listeners.hears_statuses:
             self._listeners.offer_status(status, now)
         if self._waits.statuses:
             self._waits.show(status)

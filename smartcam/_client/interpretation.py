@@ -133,6 +133,13 @@ class Interpretation:
         way = self._way(application)
         return way.numbering if way is not None else None
 
+    def numbered_layouts(self) -> str | dict[int, str] | None:
+        """Return the texts of the layouts that have a number in them, as ``interpret_as`` has."""
+        if self._one is not None:
+            return _numbered(self._one)
+        texts = {key: _numbered(way) for key, way in self._by_application.items()}
+        return {key: text for key, text in texts.items() if text is not None} or None
+
     def number(self, container: ResultContainer, endian: int) -> int | None:
         """Return a container's sequence number, None where it has none or does not fit."""
         way = self._way(container.application)
@@ -401,6 +408,11 @@ class _ApplicationReader(NamedTuple):
     simple: PlainInterpreter | None
     sequenced: bool
     numbering: Numbering | None
+
+
+def _numbered(way: _ApplicationReader) -> str | None:
+    layout = way.interpreter.layout
+    return None if way.numbering is None or layout is None else layout.text
 
 
 def _way(interpreter: Interpreter) -> _ApplicationReader:

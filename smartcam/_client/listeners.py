@@ -73,6 +73,11 @@ class Listeners:
         return any(not future.done() for future in self._next_results)
 
     @property
+    def hears_statuses(self) -> bool:
+        """Whether a status would be handed to anybody."""
+        return bool(self.statuses.references)
+
+    @property
     def watches_status(self) -> bool:
         """Whether somebody subscribed to statuses or events."""
         streams: list[Queue[Any]] = [*self.statuses, *self.events]

@@ -1,0 +1,1 @@
+"""Cameras of a plant, shared by many programs."""

@@ -1,0 +1,301 @@
+"""An agent: it has the sessions with its cameras, and does what programs call for.
+
+Each call has a number of its program's, and is done once however often it arrives; one that comes
+after its deadline is not done at all. Every call is a task of the agent's, which ends with its
+deadline, with the program's cancellation, and with the program itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import (
+    ConnectionLostError,
+    LocalProtocolError,
+    ProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+    UnsupportedError,
+)
+from smartcam.fleet._calls import ACTIONS, Action, Call, now
+from smartcam.fleet._errors import to_fields
+from smartcam.fleet._host import Host
+from smartcam.fleet._shared import Owner
+from smartcam.fleet._wire import Message, decode, encode
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import Self
+
+    from smartcam.fleet._bus import Bus, Handle
+    from smartcam.fleet._keys import Keys
+    from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+MOST_PROGRAMS = 4096
+MOST_CALLS = 256
+"""Calls of one program that may be under way at a time."""
+
+KNOWN_CALLS = 4096
+"""Numbers of calls that are remembered for each program; older ones are not done any more."""
+
+MARGIN, MOST_MARGIN = 0.1, 0.1
+"""Share of a call's time, and seconds, that its answer has for its way."""
+
+FIRST_TRY = 30.0
+"""Seconds that the first try to reach a camera is waited for at the start."""
+
+
+@dataclass(eq=False)
+class Guest:
+    """A program that calls.
+
+    Attributes:
+        number: by which results say whose they are.
+        tasks: its calls under way.
+        entered: what its temporary switches go back to.
+    """
+
+    number: int
+    tasks: dict[int, asyncio.Task[None]] = field(default_factory=dict[int, "asyncio.Task[None]"])
+    entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
+    _known: set[int] = field(default_factory=set[int])
+    _floor: int = 0
+
+    def is_new(self, call: int) -> bool:
+        """Whether a call has not been seen; it is known from now on."""
+        if call <= self._floor or call in self._known:
+            return False
+        self._known.add(call)
+        if len(self._known) > KNOWN_CALLS:
+            kept = sorted(self._known)[KNOWN_CALLS // 2 :]
+            self._floor = kept[0] - 1
+            self._known = set(kept)
+        return True
+
+
+class Agent:
+    """Shares cameras over a bus.
+
+    Args:
+        name: of the agent.
+        keys: of the fleet.
+        bus: an end of its own.
+        cameras: options of the client of each camera, by the camera's name.
+        history: results that are kept for each camera, and their bytes.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        keys: Keys,
+        bus: Bus,
+        cameras: dict[str, CameraSettings],
+        *,
+        history: tuple[int, int] = (10_000, 1 << 24),
+    ) -> None:
+        self.name = name
+        self.epoch: int = time.time_ns()
+        self._keys, self._bus = keys, bus
+        self._cameras, self._history = cameras, history
+        self.hosts: dict[str, Host] = {}
+        self._programs: dict[str, Guest] = {}
+        self._numbers = 0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._declared: list[Handle] = []
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus, and begin to have sessions with the cameras.
+
+        Raises:
+            ConnectFailedError: there is no bus within ``timeout`` seconds.
+            ConfigurationError: an option of a camera cannot work.
+        """
+        await self._bus.open(timeout)
+        keys, bus, declared = self._keys, self._bus, self._declared
+        try:
+            declared.append(bus.watch(keys.program("*"), self._on_program))
+            for name, settings in self._cameras.items():
+                host = Host(name, settings, bus, keys, self.epoch, self._history)
+                self.hosts[name] = host
+                declared.append(bus.subscribe(keys.call(name), self._hear_calls(host)))
+                self._start(host.run(), f"smartcam.fleet.{name}")
+            async with asyncio.timeout(FIRST_TRY):
+                await asyncio.gather(*(host.tried(FIRST_TRY) for host in self.hosts.values()))
+            declared.append(bus.be_present(keys.agent(self.name)))
+            declared.extend(bus.be_present(keys.camera(self.name, name)) for name in self.hosts)
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def close(self) -> None:
+        """Leave the bus, end calls and sessions; bounded. Idempotent."""
+        declared, self._declared = self._declared, []
+        for handle in declared:
+            handle.close()
+        for program in [*self._programs]:
+            self._forget(program, going_back=False)
+        for task in tuple(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        closing = (host.close() for host in self.hosts.values())
+        await asyncio.gather(*closing, return_exceptions=True)
+        await self._bus.close()
+
+    def _start(self, work: Any, name: str) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    # ------------------------------------------------------------------ programs
+
+    def _on_program(self, key: str, present: bool) -> None:
+        if not present:
+            self._forget(self._keys.tail(key, "presence/program")[-1])
+
+    def _forget(self, program: str, *, going_back: bool = True) -> None:
+        """End all that a program has here: it is gone."""
+        guest = self._programs.pop(program, None)
+        if guest is None:
+            return
+        for task in guest.tasks.values():
+            task.cancel()
+        for host in self.hosts.values():
+            host.gate.forget(program)
+        if going_back:
+            for camera, before in guest.entered.values():
+                camera.leave(before)
+
+    def _guest(self, program: str) -> Guest:
+        known = self._programs.get(program)
+        if known is None:
+            if len(self._programs) >= MOST_PROGRAMS:
+                raise LocalProtocolError(f"{self.name}: {MOST_PROGRAMS} programs are here already")
+            self._numbers += 1
+            known = self._programs[program] = Guest(self._numbers)
+        return known
+
+    # ------------------------------------------------------------------ calls
+
+    def _hear_calls(self, host: Host) -> Any:
+        def hear(key: str, payload: bytes) -> None:
+            try:
+                self._on_call(host, decode(payload, f"a call to {host.name}"))
+            except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
+                logger.warning("%s ! a call that cannot be read: %s", host.name, exc)
+
+        return hear
+
+    def _on_call(self, host: Host, message: Message) -> None:
+        fields = message.fields
+        program, number = str(fields["program"]), int(fields["call"])
+        if "cancel" in fields:
+            self._cancel(host, program, int(fields["cancel"]))
+            return
+        said = str(fields["do"])
+        action = ACTIONS.get(said)
+        if said == "hello":
+            guest = self._guest(program)
+        else:
+            known = self._programs.get(program)
+            if known is None or fields.get("epoch") != self.epoch:
+                stranger = ConnectionLostError(
+                    f"{host.name}: the agent {self.name} was restarted, or took this program for "
+                    f"gone; {said} was not done"
+                )
+                self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
+                return
+            guest = known
+        if not guest.is_new(number):
+            return  # it is done, or under way: a double
+        error: SmartCamError | None = None
+        timeout = float(fields.get("deadline", now() + 1.0)) - now()
+        if action is None:
+            error = UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
+        elif timeout < 0:
+            error = _late(said, f"{host.name}: {said} came after its deadline; it was not done")
+        elif len(guest.tasks) >= MOST_CALLS:
+            error = LocalProtocolError(
+                f"{host.name}: {MOST_CALLS} calls of this program are under way"
+            )
+        if error is not None or action is None:
+            self._reply(program, number, {"error": to_fields(error or UnsupportedError(said))})
+            return
+        arguments: Any = fields.get("arguments", {})
+        timeout -= min(MARGIN * timeout, MOST_MARGIN)
+        owner = Owner(guest.number, number)
+        call = Call(host, program, owner, arguments, message.blobs, timeout, guest.entered)
+        task = self._start(self._do(action, said, call), f"smartcam.fleet.{host.name}.{said}")
+        guest.tasks[number] = task
+        task.add_done_callback(lambda _: guest.tasks.pop(number, None))
+
+    def _cancel(self, host: Host, program: str, number: int) -> None:
+        guest = self._programs.get(program)
+        if guest is None:
+            return
+        guest.is_new(number)  # if it comes yet, it comes too late
+        task = guest.tasks.get(number)
+        if task is not None:
+            task.cancel()
+        host.gate.release((program, number))
+        entered = guest.entered.pop((host.name, number), None)
+        if entered is not None:  # it was done, and its program does not know
+            camera, before = entered
+            camera.leave(before)
+
+    async def _do(self, action: Action, said: str, call: Call) -> None:
+        """Do a call, and reply; a program that has cancelled gets none."""
+        host = call.host
+        begun = now()
+        try:
+            async with contextlib.AsyncExitStack() as stack:
+                if action.command:
+                    await stack.enter_async_context(host.gate.command(call.program, call.timeout))
+                fields, blobs = await action.do(
+                    call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
+                )
+        except TimeoutError as exc:
+            error: BaseException = exc
+            if not isinstance(exc, SmartCamError):
+                holder = host.gate.holder
+                error = _late(
+                    said,
+                    f"{host.name}: reserved by {holder}, which did not let go within "
+                    f"{call.timeout:.3g} s; {said} was not done",
+                )
+            reply: dict[str, Any] = {"error": to_fields(error)}
+            blobs = []
+        except Exception as exc:
+            if not isinstance(exc, SmartCamError):
+                logger.exception("%s ! %s failed", host.name, said)
+            reply, blobs = {"error": to_fields(exc)}, []
+        else:
+            reply = {"answer": fields}
+        host.flush()
+        reply |= {"states": host.states.following, "results": host.results.following}
+        self._reply(call.program, call.owner.call, reply, blobs)
+
+    def _reply(
+        self, program: str, number: int, fields: dict[str, Any], blobs: list[bytes] | None = None
+    ) -> None:
+        said = {"call": number, "epoch": self.epoch, "clock": now(), **fields}
+        self._bus.put(self._keys.reply(program), encode(said, blobs or ()))
+
+    def settings(self) -> Iterable[CameraSettings]:
+        """Return the options of its cameras' clients."""
+        return self._cameras.values()
+
+
+def _late(said: str, text: str) -> SmartCamError:
+    return TriggerTimeoutError(text) if said == "trigger" else ResponseTimeoutError(text)

@@ -1,0 +1,328 @@
+"""The bus of a fleet: programs and agents say things under keys, and hear what others say.
+
+A key is chunks joined by ``/``; in a pattern ``*`` is one chunk and ``**`` any number of them. What
+one says comes to each who hears, in the order of saying, or not at all: a bus may lose, and never
+waits for anybody. So whoever needs to know numbers what it says.
+
+:class:`MemoryBus` is the one inside a process; :mod:`smartcam.fleet._zenoh` has the one between
+them. Everything here belongs to one event loop, and every callback runs in it.
+"""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+from smartcam.fleet._keys import meets
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Self
+
+
+class Handle(abc.ABC):
+    """Something that lasts until it is closed."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """End it; idempotent."""
+
+
+class Publisher(Handle):
+    """What is said under one key, again and again."""
+
+    @property
+    @abc.abstractmethod
+    def heard(self) -> bool:
+        """Whether anybody hears it, as far as is known."""
+
+    @abc.abstractmethod
+    def put(self, payload: bytes) -> None:
+        """Say it; never blocks."""
+
+
+class Bus(abc.ABC):
+    """One end of a bus: a program's, or an agent's."""
+
+    @abc.abstractmethod
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus.
+
+        Raises:
+            ConnectFailedError: there is none within ``timeout`` seconds.
+        """
+
+    @abc.abstractmethod
+    async def close(self) -> None:
+        """Leave it; what was declared is gone with it. Idempotent."""
+
+    @abc.abstractmethod
+    def put(self, key: str, payload: bytes) -> None:
+        """Say something that somebody waits for; never blocks."""
+
+    @abc.abstractmethod
+    def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
+        """Return what says things under ``key``; ``on_heard`` is told when that changes."""
+
+    @abc.abstractmethod
+    def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
+        """Have ``hear(key, payload)`` called for what is said under ``pattern``."""
+
+    @abc.abstractmethod
+    def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
+        """Have ``answer(question)`` called for what is asked under ``pattern``."""
+
+    @abc.abstractmethod
+    async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
+        """Return what all answer who are asked, as far as it came within ``timeout`` seconds."""
+
+    @abc.abstractmethod
+    def be_present(self, key: str) -> Handle:
+        """Have all know that this end is there, until it is not."""
+
+    @abc.abstractmethod
+    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+        """Have ``see(key, present)`` called for who is there, and who comes and goes."""
+
+
+class Question(abc.ABC):
+    """What somebody asks.
+
+    Attributes:
+        key: what is asked; a pattern, perhaps.
+        payload: what comes with it.
+    """
+
+    key: str
+    payload: bytes
+
+    @abc.abstractmethod
+    def reply(self, key: str, payload: bytes) -> None:
+        """Answer; several times if there is more than one key to answer for."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """There is nothing more to say. Idempotent."""
+
+
+# ---------------------------------------------------------------------- inside a process
+
+
+class MemoryBus:
+    """A bus inside this process, for ends in one event loop.
+
+    ``MemoryBus().end()`` gives an end. Deliveries are calls of the event loop, in order.
+    """
+
+    def __init__(self) -> None:
+        self.ends: list[MemoryEnd] = []
+
+    def end(self) -> MemoryEnd:
+        """Return an end that is not open yet."""
+        return MemoryEnd(self)
+
+
+class _Declared(Handle):
+    """What an end has declared under a pattern."""
+
+    def __init__(self, place: list[_Declared], pattern: str, call: Callable[..., None]) -> None:
+        self.pattern = pattern
+        self.call = call
+        self._place = place
+        self._after: Callable[[], None] = _nothing
+        place.append(self)
+
+    def then(self, after: Callable[[], None]) -> Self:
+        """Have ``after`` called once it is closed."""
+        self._after = after
+        return self
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is."""
+        return self not in self._place
+
+    def close(self) -> None:
+        if not self.closed:
+            self._place.remove(self)
+            self._after()
+
+
+class MemoryEnd(Bus):
+    """One end of a :class:`MemoryBus`."""
+
+    def __init__(self, bus: MemoryBus) -> None:
+        self._bus = bus
+        self.heard: list[_Declared] = []
+        self.answered: list[_Declared] = []
+        self.watched: list[_Declared] = []
+        self.present: list[_Declared] = []
+        self.publishers: list[_MemoryPublisher] = []
+
+    @property
+    def attached(self) -> bool:
+        """Whether it is on the bus now: open, and not cut off."""
+        return self in self._bus.ends
+
+    async def open(self, timeout: float) -> Self:
+        self._loop = asyncio.get_running_loop()
+        self.attach()
+        return self
+
+    async def close(self) -> None:
+        self.detach()
+        for place in (self.heard, self.answered, self.watched, self.present):
+            place.clear()
+
+    def attach(self) -> None:
+        """Come to the bus, or back to it."""
+        if not self.attached:
+            self._bus.ends.append(self)
+            self._tell_presence(True)
+            self._tell_heard()
+
+    def detach(self) -> None:
+        """Be cut off from it, as by a broken cable: both sides see the other go."""
+        if self.attached:
+            self._tell_presence(False)
+            self._bus.ends.remove(self)
+            self._tell_heard()
+
+    def put(self, key: str, payload: bytes) -> None:
+        for end in self._others():
+            for one in end.matching(end.heard, key):
+                self._loop.call_soon(_call, one, key, payload)
+
+    def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
+        return _MemoryPublisher(self, self.publishers, key, on_heard)
+
+    def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
+        made = _Declared(self.heard, pattern, hear).then(self._tell_heard)
+        self._tell_heard()
+        return made
+
+    def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
+        return _Declared(self.answered, pattern, answer)
+
+    async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
+        questions = [
+            (one, _MemoryQuestion(pattern, payload))
+            for end in self._others()
+            for one in end.answered
+            if meets(one.pattern, pattern)
+        ]
+        for one, question in questions:
+            self._loop.call_soon(_call, one, question)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                for _, question in questions:
+                    await question.done.wait()
+        return [answer for _, question in questions for answer in question.answers]
+
+    def be_present(self, key: str) -> Handle:
+        made = _Declared(self.present, key, _nothing)
+        self._tell(key, True)
+        return made.then(lambda: self._tell(key, False))
+
+    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+        made = _Declared(self.watched, pattern, see)
+        for end in self._others():
+            for one in end.present:
+                if meets(made.pattern, one.pattern):
+                    self._loop.call_soon(_call, made, one.pattern, True)
+        return made
+
+    # ------------------------------------------------------------------ among ends
+
+    def _others(self) -> list[MemoryEnd]:
+        """Return the ends that hear this one: all on the bus, itself too."""
+        return list(self._bus.ends) if self.attached else []
+
+    def _tell_presence(self, present: bool) -> None:
+        """Tell all what of this end is there or not, and this one what of all."""
+        for end in self._others():
+            for one in end.present:
+                if end is not self:
+                    for watch in self.matching(self.watched, one.pattern):
+                        self._loop.call_soon(_call, watch, one.pattern, present)
+        for one in self.present:
+            self._tell(one.pattern, present)
+
+    def _tell(self, key: str, present: bool) -> None:
+        for end in self._others():
+            for one in end.matching(end.watched, key):
+                self._loop.call_soon(_call, one, key, present)
+
+    def _tell_heard(self) -> None:
+        for end in self._bus.ends:
+            for one in end.publishers:
+                one.look()
+
+    def is_heard(self, key: str) -> bool:
+        """Whether anybody hears what this end says under ``key``."""
+        return any(end.matching(end.heard, key) for end in self._others())
+
+    @staticmethod
+    def matching(place: list[_Declared], key: str) -> list[_Declared]:
+        """Return what of ``place`` is meant by ``key``."""
+        return [one for one in place if meets(one.pattern, key)]
+
+
+class _MemoryPublisher(Publisher):
+    def __init__(
+        self,
+        end: MemoryEnd,
+        place: list[_MemoryPublisher],
+        key: str,
+        on_heard: Callable[[bool], None] | None,
+    ) -> None:
+        self._end, self._place, self._key = end, place, key
+        self._on_heard = on_heard
+        self._heard = False
+        place.append(self)
+        self.look()
+
+    @property
+    def heard(self) -> bool:
+        return self._heard
+
+    def look(self) -> None:
+        """See whether anybody hears."""
+        heard = self._end.is_heard(self._key)
+        if heard != self._heard:
+            self._heard = heard
+            if self._on_heard is not None:
+                self._on_heard(heard)
+
+    def put(self, payload: bytes) -> None:
+        self._end.put(self._key, payload)
+
+    def close(self) -> None:
+        if self in self._place:
+            self._place.remove(self)
+
+
+class _MemoryQuestion(Question):
+    def __init__(self, key: str, payload: bytes) -> None:
+        self.key, self.payload = key, payload
+        self.answers: list[tuple[str, bytes]] = []
+        self.done = asyncio.Event()
+
+    def reply(self, key: str, payload: bytes) -> None:
+        if not self.done.is_set():
+            self.answers.append((key, payload))
+
+    def close(self) -> None:
+        self.done.set()
+
+
+def _call(one: _Declared, *arguments: object) -> None:
+    """Call back what is still wanted; an error in it is nobody else's."""
+    if not one.closed:
+        one.call(*arguments)
+
+
+def _nothing(*_: object) -> None:
+    pass

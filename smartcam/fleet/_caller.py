@@ -1,0 +1,338 @@
+"""How a fleet's camera calls its agent: who that is, whether it is there, what its clock says."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import (
+    ConnectFailedError,
+    ConnectionClosedError,
+    ConnectionLostError,
+    LinkError,
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.fleet._errors import from_fields
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from smartcam.fleet._bus import Handle
+    from smartcam.fleet._program import Program
+    from smartcam.fleet._wire import Message
+    from smartcam.protocols._framed.machine import Counters
+
+DRIFT = 1e-4
+"""How far two clocks go apart at most: seconds in a second."""
+
+HELLO_TIMEOUT = 2.0
+"""Seconds for the answer to a hello; then it is said again, as long as the agent is there."""
+
+
+class Met:
+    """An agent that has answered.
+
+    Attributes:
+        agent: its name.
+        epoch: which start of it.
+        hello: what it said of the camera.
+    """
+
+    def __init__(self, agent: str, epoch: int, hello: dict[str, Any]) -> None:
+        self.agent, self.epoch, self.hello = agent, epoch, hello
+
+
+class Caller:
+    """Calls one camera's agent.
+
+    Args:
+        name: the camera's, for texts.
+        camera: the camera's name in the fleet.
+        program: whose calls they are.
+        counters: count the messages.
+        on_met: is told of an agent that has answered, before anything else is called.
+        on_lost: is told why it is gone.
+
+    Attributes:
+        met: the agent, None while there is none.
+        last: the same; after a loss the one of before.
+        trouble: why there is none.
+        end: why there will be none any more.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        camera: str,
+        program: Program,
+        counters: Counters,
+        on_met: Callable[[Met], None],
+        on_lost: Callable[[LinkError], None],
+    ) -> None:
+        self.name, self.camera, self.program = name, camera, program
+        self.counters = counters
+        self.met: Met | None = None
+        self.last: Met | None = None
+        self.trouble: LinkError | None = None
+        self.end: LinkError | None = None
+        self._on_met, self._on_lost = on_met, on_lost
+        self._agents: dict[str, None] = {}
+        self._stirred = asyncio.Event()
+        self._watch: Handle | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._ahead = 0.0  # the agent's clock is at least so far ahead of the loop's
+        self._measured = 0.0
+        self._waiting: list[asyncio.Future[None]] = []
+
+    # ------------------------------------------------------------------ life
+
+    def open(self) -> None:
+        """Look for the agent from now on."""
+        keys, bus = self.program.keys, self.program.bus
+        self._watch = bus.watch(keys.camera("*", self.camera), self._on_presence)
+        self._task = asyncio.get_running_loop().create_task(
+            self._attend(), name=f"smartcam.fleet.{self.camera}"
+        )
+
+    async def close(self, error: LinkError | None = None) -> None:
+        """Look for it no more. Idempotent."""
+        self.finish(error or ConnectionClosedError(f"{self.name}: closed"))
+        if self._watch is not None:
+            self._watch.close()
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+    def finish(self, error: LinkError) -> None:
+        """There will be no agent any more."""
+        if self.end is None:
+            self.end = error
+        self.met = None
+        self.program.fail(self, lambda: self._again(error))
+        self._wake()
+
+    async def wait_met(self, deadline: float) -> Met:
+        """Return the agent once it has answered.
+
+        Raises:
+            TimeoutError: it has not by ``deadline`` (loop time).
+            LinkError: there will be none.
+        """
+        loop = asyncio.get_running_loop()
+        async with asyncio.timeout_at(deadline):
+            while self.met is None:
+                if self.end is not None:
+                    raise self._again(self.end)
+                waiting: asyncio.Future[None] = loop.create_future()
+                self._waiting.append(waiting)
+                await waiting
+        return self.met
+
+    def _wake(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for one in waiting:
+            if not one.done():
+                one.set_result(None)
+
+    # ------------------------------------------------------------------ the agent
+
+    def require(self) -> Met:
+        """Return the agent.
+
+        Raises:
+            ConnectionLostError: it is away.
+            ConnectionClosedError: not opened, or closed.
+        """
+        if self.met is not None:
+            return self.met
+        if self.end is not None:
+            raise self._again(self.end)
+        if self.trouble is not None:
+            raise self._again(self.trouble)
+        raise ConnectionClosedError(f"{self.name}: not connected: open it first")
+
+    @staticmethod
+    def _again(error: LinkError) -> LinkError:
+        """Return an error of its own for whom it is raised, with the first one behind it."""
+        again = type(error)(str(error), host=error.host, port=error.port)
+        again.__cause__ = error
+        return again
+
+    def _on_presence(self, key: str, present: bool) -> None:
+        agent = self.program.keys.tail(key, "presence/camera")[0]
+        if present:
+            self._agents[agent] = None
+        else:
+            self._agents.pop(agent, None)
+            if self.met is not None and self.met.agent == agent:
+                self.lose(f"the agent {agent} is gone, or the way to it")
+        self._stirred.set()
+
+    def lose(self, why: str) -> None:
+        """The agent is gone: every call under way ends, and nobody knows what became of it."""
+        if self.met is None:
+            return
+        self.met = None
+        error = self.trouble = ConnectionLostError(f"{self.name}: {why}")
+        self.program.fail(self, lambda: self._again(_unknown(error)))
+        self._stirred.set()
+        self._on_lost(error)
+
+    async def _attend(self) -> None:
+        """Meet the agent whenever there is one."""
+        while True:
+            await self._stirred.wait()
+            self._stirred.clear()
+            if self.met is not None or not self._agents:
+                continue
+            if len(self._agents) > 1:
+                self.trouble = ConnectionLostError(
+                    f"{self.name}: {len(self._agents)} agents say that they have this camera: "
+                    f"{', '.join(sorted(self._agents))}; which one is meant cannot be known"
+                )
+                continue
+            (agent,) = self._agents
+            try:
+                await self._meet(agent)
+            except SmartCamError as error:
+                self.trouble = ConnectionLostError(f"{self.name}: {error}")
+                if agent in self._agents:
+                    await asyncio.sleep(HELLO_TIMEOUT / 10)
+                    self._stirred.set()
+
+    async def _meet(self, agent: str) -> None:
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        reply = await self._exchange("hello", begun + HELLO_TIMEOUT, {}, (), None, None)
+        fields = reply.fields
+        try:
+            epoch, clock = int(fields["epoch"]), float(fields["clock"])
+            hello = dict(fields["answer"])
+        except (KeyError, TypeError, ValueError) as exc:
+            raise RemoteProtocolError(f"the agent {agent} says no proper hello: {exc}") from exc
+        self._ahead, self._measured = clock - loop.time(), loop.time()
+        if agent in self._agents:
+            self.met = self.last = Met(agent, epoch, hello)
+            self.trouble = None
+            self._on_met(self.met)
+            self._wake()
+
+    # ------------------------------------------------------------------ the clock
+
+    def sample(self, clock: float) -> None:
+        """The agent said just now what its clock was when it spoke."""
+        now = asyncio.get_running_loop().time()
+        least = self._ahead - DRIFT * (now - self._measured)
+        self._ahead, self._measured = max(least, clock - now), now
+
+    def clock(self, at: float) -> float:
+        """Return what the agent's clock says at a time of the loop's: that, or a little more."""
+        return at + self._ahead - DRIFT * max(0.0, at - self._measured)
+
+    # ------------------------------------------------------------------ calls
+
+    async def call(
+        self,
+        do: str,
+        deadline: float,
+        arguments: dict[str, Any] | None = None,
+        blobs: Sequence[bytes] = (),
+        number: int | None = None,
+    ) -> Message:
+        """Have something done by the agent; return its reply.
+
+        Args:
+            do: what.
+            deadline: loop time.
+            arguments: by name.
+            blobs: byte strings that belong to it.
+            number: of the call; the next one by default.
+
+        Raises:
+            SmartCamError: as the agent says; or the agent is gone, or silent.
+
+        Cancellation: the agent is told.
+        """
+        met = self.require()
+        reply = await self._exchange(do, deadline, arguments or {}, blobs, number, met)
+        self.sample(float(reply.fields.get("clock", -1e300)))
+        return reply
+
+    async def _exchange(
+        self,
+        do: str,
+        deadline: float,
+        arguments: dict[str, Any],
+        blobs: Sequence[bytes],
+        number: int | None,
+        met: Met | None,
+    ) -> Message:
+        program = self.program
+        begun = asyncio.get_running_loop().time()
+        number = number or program.next_call()
+        fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments}
+        if met is not None:
+            fields |= {"epoch": met.epoch, "deadline": self.clock(deadline)}
+        waiting = program.expect(number, self)
+        try:
+            self.counters.bytes_sent += program.send(self.camera, fields, blobs)
+            self.counters.frames_sent += 1
+            async with asyncio.timeout_at(deadline):
+                reply = await waiting
+        except TimeoutError as exc:
+            if waiting.done() and not waiting.cancelled():
+                reply = waiting.result()
+            else:
+                self._cancel(number)
+                raise self._silence(do, deadline - begun) from exc
+        except asyncio.CancelledError:
+            self._cancel(number)
+            raise
+        finally:
+            program.forget(number)
+        self.counters.frames_received += 1
+        if reply.fields.get("stranger") and self.met is met and met is not None:
+            self.lose(f"the agent {met.agent} was restarted, or took this program for gone")
+        if "error" in reply.fields:
+            raise from_fields(reply.fields["error"])
+        return reply
+
+    def tell(self, do: str, arguments: dict[str, Any]) -> None:
+        """Have something done without waiting for it, if there is an agent."""
+        if self.met is None:
+            return
+        number = self.program.next_call()
+        fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments}
+        self.program.send(self.camera, {**fields, "epoch": self.met.epoch})
+
+    def _cancel(self, number: int) -> None:
+        self.program.send(self.camera, {"call": self.program.next_call(), "cancel": number})
+
+    def _silence(self, do: str, waited: float) -> SmartCamError:
+        agent = self.met.agent if self.met is not None else "agent"
+        if do == "trigger":
+            return TriggerTimeoutError(
+                f"{self.name}: the {agent} said nothing within {waited:.3g} s; whether the camera "
+                "was triggered is unknown",
+                waited=waited,
+            )
+        return ResponseTimeoutError(
+            f"{self.name}: the {agent} said nothing to {do} within {waited:.3g} s; whether it was "
+            "done is unknown",
+            waited=waited,
+        )
+
+
+def _unknown(error: LinkError) -> LinkError:
+    return ConnectionLostError(f"{error}; whether what was under way was done is unknown")
+
+
+def connect_failed(name: str, url: str, why: str, host: str, port: int) -> ConnectFailedError:
+    """Return the error of a camera that cannot be had."""
+    return ConnectFailedError(f"{name}: {url}: {why}", host=host, port=port, attempts=(why,))

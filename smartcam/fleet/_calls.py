@@ -1,0 +1,263 @@
+"""What programs may call at an agent: each call's name, whether it is a command, what it does."""
+
+from __future__ import annotations
+
+import time
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._client.triggering import TriggerRequest
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._shared import Carrier, Owner
+from smartcam.fleet._wire import encode_runs
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.fleet._host import Host
+
+Answer = tuple[dict[str, Any], list[bytes]]
+NOTHING: Answer = ({}, [])
+MOST_FILLED = 1 << 20
+"""Bytes of results, or states, that one reply brings."""
+
+
+class Call(NamedTuple):
+    """A call under way.
+
+    Attributes:
+        host: the camera that it is for.
+        program: who calls.
+        owner: the same as numbers.
+        arguments: what is said, by name.
+        blobs: byte strings that came with it.
+        timeout: seconds that it may take.
+        entered: applications to go back to of this program's temporary switches, by their call.
+    """
+
+    host: Host
+    program: str
+    owner: Owner
+    arguments: dict[str, Any]
+    blobs: list[bytes]
+    timeout: float
+    entered: dict[tuple[str, int], Any]
+
+    def argument(self, name: str, *kinds: type) -> Any:
+        """Return an argument; None where it is not said.
+
+        Raises:
+            ConfigurationError: it is of another kind.
+        """
+        value = self.arguments.get(name)
+        good = isinstance(value, kinds) and (not isinstance(value, bool) or bool in kinds)
+        if value is None or good:
+            return value
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise ConfigurationError(f"{self.host.name}: {name} is {value!r:.80}, no {wanted}")
+
+    def wanted(self, name: str, *kinds: type) -> Any:
+        """Return an argument that has to be there."""
+        value = self.argument(name, *kinds)
+        if value is None:
+            raise ConfigurationError(f"{self.host.name}: {name} is missing")
+        return value
+
+
+class Action(NamedTuple):
+    """What a call does; a command waits while another program has the camera reserved."""
+
+    do: Callable[[Call], Awaitable[Answer]]
+    command: bool = True
+
+
+async def _trigger(call: Call) -> Answer:
+    layouts = call.argument("layouts", str, dict)
+    if isinstance(layouts, dict):
+        layouts = {int(key): text for key, text in layouts.items()}
+    data = call.blobs[0] if call.blobs else None
+    wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
+    request = TriggerRequest(Carrier(call.owner, layouts), data, wanted, wait)
+    outcomes = call.host.outcomes
+    runs = outcomes[call.owner] = []
+    try:
+        await call.host.require().trigger_for(
+            request, call.argument("application", int), call.argument("expected", int), call.timeout
+        )
+    finally:
+        del outcomes[call.owner]
+    return {}, [encode_runs(0, call.host.results.following, runs)]
+
+
+async def _switch_application(call: Call) -> Answer:
+    camera = call.host.require()
+    await camera.switch_application(call.wanted("application", int, str), timeout=call.timeout)
+    return {"application": camera.active_application}, []
+
+
+async def _ensure(call: Call) -> Answer:
+    await call.host.require().ensure(call.wanted("application", int), call.timeout)
+    return NOTHING
+
+
+async def _enter(call: Call) -> Answer:
+    before = await call.host.require().enter(call.wanted("application", int), call.timeout)
+    call.entered[call.host.name, call.owner.call] = (call.host.camera, before)
+    return {"before": before.application, "wanted": before.wanted.application}, []
+
+
+async def _leave(call: Call) -> Answer:
+    found = call.entered.pop((call.host.name, call.wanted("entered", int)), None)
+    if found is not None:
+        camera, before = found
+        await camera.leave_and_wait(before)
+    return NOTHING
+
+
+async def _start(call: Call) -> Answer:
+    await call.host.require().start(timeout=call.timeout)
+    return NOTHING
+
+
+async def _stop(call: Call) -> Answer:
+    await call.host.require().stop(timeout=call.timeout)
+    return NOTHING
+
+
+async def _query_application(call: Call) -> Answer:
+    return {"application": await call.host.require().query_application(timeout=call.timeout)}, []
+
+
+async def _query_status(call: Call) -> Answer:
+    return {"status": int(await call.host.require().query_status(timeout=call.timeout))}, []
+
+
+async def _wait_ready(call: Call) -> Answer:
+    return {"status": int(await call.host.require().wait_ready(timeout=call.timeout))}, []
+
+
+async def _reset_errors(call: Call) -> Answer:
+    return {"status": int(await call.host.require().reset_errors(timeout=call.timeout))}, []
+
+
+async def _read_image(call: Call) -> Answer:
+    return {}, [await call.host.require().read_image(timeout=call.timeout)]
+
+
+async def _get_clock(call: Call) -> Answer:
+    return {"clock": (await call.host.require().get_clock(timeout=call.timeout)).isoformat()}, []
+
+
+async def _set_clock(call: Call) -> Answer:
+    text = call.wanted("when", str)
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError as exc:
+        raise ConfigurationError(f"{call.host.name}: {text!r:.80} is no time") from exc
+    await call.host.require().set_clock(when)
+    return NOTHING
+
+
+async def _set_input(call: Call) -> Answer:
+    await call.host.require().set_input(call.blobs[0] if call.blobs else b"")
+    return NOTHING
+
+
+async def _set_sequence_number(call: Call) -> Answer:
+    await call.host.require().set_sequence_number(call.wanted("number", int))
+    return NOTHING
+
+
+async def _reboot(call: Call) -> Answer:
+    await call.host.require().reboot()
+    return NOTHING
+
+
+async def _request(call: Call) -> Answer:
+    answer = await call.host.require().request(
+        call.wanted("message_id", int, str),
+        call.blobs[0] if call.blobs else b"",
+        answered=call.argument("answered", bool),
+        timeout=call.timeout,
+    )
+    return {}, [] if answer is None else [answer]
+
+
+async def _refresh(call: Call) -> Answer:
+    await call.host.require().refresh(call.timeout)
+    return NOTHING
+
+
+async def _reserve(call: Call) -> Answer:
+    reservation = (call.program, call.owner.call)
+    await call.host.gate.reserve(call.program, reservation, call.timeout)
+    return NOTHING
+
+
+async def _release(call: Call) -> Answer:
+    call.host.gate.release((call.program, call.wanted("reservation", int)))
+    return NOTHING
+
+
+async def _hello(call: Call) -> Answer:
+    host = call.host
+    return {
+        **host.about(),
+        **host.state(),
+        "program": call.owner.program,
+        "results": host.results.following,
+        "states": host.states.following,
+    }, []
+
+
+async def _find(call: Call) -> Answer:
+    """Say which result came first since a time of the agent's clock."""
+    results = call.host.results
+    since = float(call.wanted("since", int, float))
+    return {"first": results.first_since(since), "following": results.following}, []
+
+
+async def _results(call: Call) -> Answer:
+    part = call.host.results.part(call.wanted("first", int), MOST_FILLED)
+    return {"first": part.first, "following": part.following}, [
+        encode_runs(0, part.following, part.data)
+    ]
+
+
+async def _states(call: Call) -> Answer:
+    part = call.host.states.part(call.wanted("first", int), MOST_FILLED)
+    return {"first": part.first, "following": part.following}, part.data
+
+
+ACTIONS: dict[str, Action] = {
+    "hello": Action(_hello, command=False),
+    "find": Action(_find, command=False),
+    "results": Action(_results, command=False),
+    "states": Action(_states, command=False),
+    "refresh": Action(_refresh, command=False),
+    "reserve": Action(_reserve, command=False),
+    "release": Action(_release, command=False),
+    "query_application": Action(_query_application, command=False),
+    "query_status": Action(_query_status, command=False),
+    "wait_ready": Action(_wait_ready, command=False),
+    "read_image": Action(_read_image, command=False),
+    "get_clock": Action(_get_clock, command=False),
+    "leave": Action(_leave, command=False),
+    "trigger": Action(_trigger),
+    "switch_application": Action(_switch_application),
+    "ensure": Action(_ensure),
+    "enter": Action(_enter),
+    "start": Action(_start),
+    "stop": Action(_stop),
+    "reset_errors": Action(_reset_errors),
+    "set_clock": Action(_set_clock),
+    "set_input": Action(_set_input),
+    "set_sequence_number": Action(_set_sequence_number),
+    "reboot": Action(_reboot),
+    "request": Action(_request),
+}
+
+
+def now() -> float:
+    """Return the agent's clock, seconds; only differences mean anything."""
+    return time.monotonic()

@@ -1,0 +1,560 @@
+"""A camera that an agent shares, as a program uses it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from smartcam.camera import DEFAULT_RECONNECT_TIMEOUT, Camera
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectionClosedError,
+    ConnectionLostError,
+    LinkError,
+    LocalProtocolError,
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+)
+from smartcam.fleet._caller import Caller, Met, connect_failed
+from smartcam.fleet._receiver import FleetListeners, Own, Receiver
+from smartcam.fleet._wire import decode_runs
+from smartcam.models import (
+    ApplicationChanged,
+    Capabilities,
+    Connected,
+    Disconnected,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+    ValueT,
+)
+from smartcam.protocols._framed.machine import Counters
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Callable, Iterable, Sequence
+    from typing import Self
+
+    from smartcam._client.interpretation import Interpretation
+    from smartcam._client.listeners import Listeners
+    from smartcam._client.triggering import TriggerRequest
+    from smartcam.fleet._program import Program
+    from smartcam.fleet._wire import Message
+    from smartcam.observers import Observer
+    from smartcam.settings import CameraSettings
+
+REACH_TIMEOUT = 0.5
+"""Seconds that what was said before a reply is waited for; it comes before, unless it was lost."""
+
+
+class FleetCamera(Camera[ValueT]):
+    """A camera that an agent of a fleet shares with other programs.
+
+    It is made by :func:`smartcam.connect` with a fleet URL, and by a
+    :class:`~smartcam.fleet.Fleet`. Commands are the agent's to do, each once; results are read
+    here.
+
+    The link may be the one to the agent: one that is lost is a
+    :exc:`~smartcam.ConnectionLostError` that names it. A call that was under way then may have been
+    done or not, which nobody knows.
+
+    Args:
+        settings: validated options; those of the session with the camera are the agent's.
+        camera: its name in the fleet.
+        program: an end of the bus.
+        shared: others use that end, too; it is not closed with the camera.
+        observers: see what happens.
+    """
+
+    def __init__(
+        self,
+        settings: CameraSettings,
+        camera: str,
+        program: Program,
+        *,
+        shared: bool = False,
+        observers: Iterable[Observer] = (),
+    ) -> None:
+        self._agents_layout: Any = None  # how to read results where this program does not say
+        super().__init__(settings, observers=observers)
+        self._camera_name, self._program, self._shared = camera, program, shared
+        self._wire = Counters()
+        self._caller = Caller(
+            settings.name, camera, program, self._wire, self._on_met, self._on_lost
+        )
+        self._expected = settings.application
+        self._receiver = Receiver(
+            settings.name,
+            camera,
+            self._caller,
+            self._listeners,
+            self._counters,
+            lambda: self._default,
+            self._on_state,
+            lambda: self._expected,
+        )
+        self._opened = False
+        self._sessions = 0
+        self._linked = False  # the agent has a session with the camera
+        self._status: Status | None = None
+        self._heard_status = False  # in this session
+        self._active: int | None = None
+        self._trouble: LinkError | None = None
+        self._closed: LinkError | None = None
+        self._watching: set[asyncio.Queue[Status | LinkError]] = set()
+
+    _listeners: FleetListeners
+
+    def _make_listeners(self) -> Listeners:
+        return FleetListeners(self.settings.name, self._observers)
+
+    def _interpretation(self, spec: object) -> Interpretation:
+        if spec is None:
+            spec = self._agents_layout
+            if spec is None and self.settings.calibration is not None and not self._met_once:
+                spec = "localizations"  # until the agent has said what it is
+        return super()._interpretation(spec)
+
+    @property
+    def _met_once(self) -> bool:
+        return hasattr(self, "_opened") and self._opened
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self) -> Self:
+        if self._opened or self._closed is not None:
+            raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
+        self._opened = True
+        deadline = self._deadline(self.settings.connect_timeout)
+        try:
+            if not self._shared:
+                await self._program.open(self.settings.connect_timeout)
+            self._receiver.open()
+            self._caller.open()
+            await self._come(deadline)
+            if self._observed:
+                self._listens(self._listeners.results)
+            if self.settings.application is not None:
+                application = self.settings.application
+                await self._do("ensure", self.settings.switch_timeout, application=application)
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def _come(self, deadline: float) -> None:
+        """Wait for an agent that has a session with the camera."""
+        address, waited = self.settings.address, self.settings.connect_timeout
+        why = f"no agent of the fleet has this camera, or none answered within {waited:g} s"
+        try:
+            await self._caller.wait_met(deadline)
+        except TimeoutError as exc:
+            if self._caller.trouble is not None:
+                why = str(self._caller.trouble)
+            raise connect_failed(self.name, self.url, why, address.host, address.port) from exc
+        if not self._linked:
+            why = str(self._trouble)
+            raise connect_failed(
+                self.name, self.url, why, address.host, address.port
+            ) from self._trouble
+
+    async def close(self) -> None:
+        self._finish(ConnectionClosedError(f"{self.name}: closed"))
+        await self._receiver.close()
+        await self._caller.close()
+        if not self._shared:
+            await self._program.close()
+
+    def _finish(self, error: LinkError) -> None:
+        """There will be no session any more."""
+        if self._closed is not None:
+            return
+        self._closed = error
+        wanted = isinstance(error, ConnectionClosedError)
+        if self._linked:
+            self._linked = False
+            self._publish_end(str(error), expected=wanted)
+        self._counters.end()
+        self._fail(error)
+        self._listeners.end(None if wanted else error)
+
+    async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
+        deadline = self._deadline(timeout)
+        if not self._opened and self._closed is None:
+            raise ConnectionClosedError(f"{self.name}: not connected: open it first")
+        queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
+        self._watching.add(queue)
+        try:
+            async with asyncio.timeout_at(deadline):
+                while not self.connected:
+                    if self._closed is not None:
+                        raise self._again(self._closed)
+                    await queue.get()
+        except TimeoutError as exc:
+            raise ResponseTimeoutError(
+                f"{self.name}: no session within {timeout:g} s: {self._trouble}", waited=timeout
+            ) from exc
+        finally:
+            self._watching.discard(queue)
+
+    # ------------------------------------------------------------------ hooks
+
+    def _require_session(self) -> Met:
+        if self._closed is not None:
+            raise self._again(self._closed)
+        met = self._caller.require()
+        if not self._linked:
+            raise self._again(self._trouble or ConnectionLostError(f"{self.name}: not connected"))
+        return met
+
+    @staticmethod
+    def _again(error: LinkError) -> LinkError:
+        again = type(error)(str(error), host=error.host, port=error.port)
+        again.__cause__ = error
+        return again
+
+    def _deadline(self, timeout: float) -> float:
+        if not 0 <= timeout < math.inf:
+            raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
+        return asyncio.get_running_loop().time() + timeout
+
+    def _listens(self, subscribers: object) -> None:
+        if subscribers is not self._listeners.results or self._closed is not None:
+            return
+        if not self._opened:
+            return  # open() sees to it
+        since = self._caller.clock(asyncio.get_running_loop().time())
+        for stream in self._listeners.results:
+            if stream.since == -math.inf:
+                stream.since = since
+        for future in self._listeners.unmarked():
+            self._listeners.waits_since(future, since)
+        self._receiver.want_results(since)
+
+    def _over(self) -> tuple[SmartCamError | None] | None:
+        if self._closed is None:
+            return None
+        return (None if isinstance(self._closed, ConnectionClosedError) else self._closed,)
+
+    # ------------------------------------------------------------------ what comes
+
+    def _on_met(self, met: Met) -> None:
+        """An agent has answered: this is what the camera is now."""
+        hello = met.hello
+        new = met.epoch != self._receiver.epoch
+        layout = hello.get("interpret_as")
+        if self.settings.interpret_as is None and layout is not None:
+            if isinstance(layout, dict):
+                layout = {int(key): value for key, value in layout.items()}
+            if layout != self._agents_layout:
+                self._agents_layout = layout
+        if self.settings.interpret_as is None:
+            self._default = self._interpretation(None)
+        self._receiver.meet(met)
+        if new or not self._linked:
+            self._on_state({"kind": "Hello", **hello})
+        if self._listeners.hears_results:
+            self._listens(self._listeners.results)
+
+    def _on_lost(self, error: LinkError) -> None:
+        """The agent is gone."""
+        self._receiver.lose()
+        self._lose(error)
+
+    def _lose(self, error: LinkError) -> None:
+        self._trouble = error
+        if not self._linked:
+            return
+        self._linked = self._heard_status = False
+        self._counters.note_loss(error)
+        self._publish_end(str(error), expected=False)
+        self._fail(error)
+        if self.settings.reconnect is None:
+            self._finish(error)
+            self._caller.finish(error)
+
+    def _publish_end(self, reason: str, *, expected: bool) -> None:
+        self._listeners.publish(
+            Disconnected(camera=self.name, at=datetime.now(UTC), reason=reason, expected=expected)
+        )
+
+    def _fail(self, error: LinkError) -> None:
+        """Tell who waits that there is no session."""
+        self._listeners.fail(self._again(error))
+        for queue in self._watching:
+            queue.put_nowait(error)
+
+    def _on_state(self, said: dict[str, Any]) -> None:
+        """Something happened to the camera; this is what it is now."""
+        at = _time(said)
+        linked = bool(said.get("connected"))
+        if not linked:
+            why = said.get("reason") or said.get("event", {}).get("reason") or said.get("failure")
+            self._lose(
+                ConnectionLostError(f"{self.name}: the agent has no session with the camera: {why}")
+            )
+        elif not self._linked:
+            self._begin_session(said, at)
+        status, application = said.get("status"), said.get("application")
+        if application is not None and application != self._active:
+            previous, self._active = self._active, int(application)
+            self._listeners.publish(
+                ApplicationChanged(
+                    camera=self.name, at=at, application=self._active, previous=previous
+                )
+            )
+        if status is not None and linked:
+            self._take_status(Status(int(status)), at, said["kind"])
+
+    def _begin_session(self, said: dict[str, Any], at: datetime) -> None:
+        self._linked, self._trouble = True, None
+        self._counters.begin(self._wire if not self._sessions else Counters())
+        self._sessions += 1
+        event = Connected if self._sessions == 1 else Reconnected
+        self._listeners.publish(event(camera=self.name, at=at, url=self.url))
+        for queue in self._watching:
+            if self._status is not None:
+                queue.put_nowait(self._status)
+
+    def _take_status(self, status: Status, at: datetime, kind: str) -> None:
+        previous = self._status if self._heard_status else None
+        self._status = status
+        if kind == "Status":
+            self._listeners.offer_status(status, asyncio.get_running_loop().time())
+        elif status == previous:
+            return
+        self._heard_status = True
+        if status != previous:
+            self._listeners.publish(
+                StatusChanged(camera=self.name, at=at, status=status, previous=previous)
+            )
+        for queue in self._watching:
+            queue.put_nowait(status)
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def url(self) -> str:
+        return self.settings.address.url
+
+    @property
+    def connected(self) -> bool:
+        return self._linked and self._caller.met is not None
+
+    @property
+    def status(self) -> Status:
+        if self._status is None:
+            raise self._again(
+                self._closed or ConnectionClosedError(f"{self.name}: not connected: open it first")
+            )
+        return self._status
+
+    @property
+    def active_application(self) -> int | None:
+        return self._active
+
+    @property
+    def protocol_version(self) -> int | None:
+        return self._hello.get("protocol_version")
+
+    @property
+    def capabilities(self) -> Capabilities:
+        said = self._hello.get("capabilities")
+        if said is None:
+            raise ConnectionClosedError(f"{self.name}: not connected: open it first")
+        known = Capabilities.__dataclass_fields__
+        return Capabilities(**{key: value for key, value in said.items() if key in known})
+
+    @property
+    def _hello(self) -> dict[str, Any]:
+        met = self._caller.last
+        return met.hello if met is not None else {}
+
+    # ------------------------------------------------------------------ calls
+
+    async def _do(
+        self,
+        do: str,
+        timeout: float | None,
+        blobs: Sequence[bytes] = (),
+        call: int | None = None,
+        **arguments: Any,
+    ) -> Message:
+        """Have the agent do something; what it said before its reply is taken first."""
+        limit = self.settings.request_timeout if timeout is None else timeout
+        deadline = self._deadline(limit)
+        self._require_session()
+        reply = await self._caller.call(do, deadline, arguments, blobs, call)
+        await self._reach(reply, deadline)
+        return reply
+
+    async def _reach(self, reply: Message, deadline: float) -> None:
+        soon = min(deadline, asyncio.get_running_loop().time() + REACH_TIMEOUT)
+        for kind in ("states", "results"):
+            number = reply.fields.get(kind)
+            if isinstance(number, int):
+                await self._receiver.reach(kind, number, soon)
+
+    async def _trigger(
+        self, application: int | None, request: TriggerRequest, timeout: float
+    ) -> list[Result]:
+        expected = application if application is not None else self._expected
+        interpretation = request.interpretation
+        number = self._program.next_call()
+        own = self._receiver.own[number] = Own(interpretation, expected)
+        try:
+            reply = await self._do(
+                "trigger",
+                timeout,
+                [] if request.input_data is None else [request.input_data],
+                number,
+                application=application,
+                expected=expected,
+                layouts=interpretation.numbered_layouts(),
+                results=request.results,
+                wait=request.wait,
+            )
+            if len(reply.blobs) != 1:
+                raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
+            return self._receiver.outcomes(own, decode_runs(reply.blobs[0], "a trigger's results"))
+        finally:
+            del self._receiver.own[number]
+
+    async def switch_application(
+        self, application: int | str, *, timeout: float | None = None
+    ) -> None:
+        limit = self.settings.switch_timeout if timeout is None else timeout
+        reply = await self._do("switch_application", limit, application=application)
+        self._expected = reply.fields["answer"]["application"]
+
+    @contextlib.asynccontextmanager
+    async def application(self, application: int) -> AsyncGenerator[Self]:
+        limit = self.settings.switch_timeout
+        number = self._program.next_call()
+        await self._do("enter", limit, call=number, application=application)
+        before, self._expected = self._expected, application
+        try:
+            yield self
+        except BaseException:
+            self._expected = before
+            self._caller.tell("leave", {"entered": number})
+            raise
+        self._expected = before
+        await self._do("leave", limit, entered=number)
+
+    @contextlib.asynccontextmanager
+    async def reserve(self, timeout: float = 10.0) -> AsyncGenerator[Self]:
+        """Keep the commands of other programs out as long as the body runs.
+
+        They wait within their own timeouts, and then fail naming this program. It ends with the
+        body, or with this program: killed, or cut off, within the lease of the engine. The tasks of
+        this program use the camera as before, and may reserve it, too.
+
+        Args:
+            timeout: seconds until it has to be ours. Whoever came before is waited for.
+
+        Raises:
+            ResponseTimeoutError: somebody else has it; says who.
+            ConnectionLostError: the agent is away, or was restarted meanwhile.
+
+        Cancellation: safe; it is given back.
+        """
+        number = self._program.next_call()
+        await self._do("reserve", timeout, call=number)
+        try:
+            yield self
+        finally:
+            self._caller.tell("release", {"reservation": number})
+
+    async def start(self, *, timeout: float = 10.0) -> None:
+        await self._do("start", timeout)
+
+    async def stop(self, *, timeout: float = 10.0) -> None:
+        await self._do("stop", timeout)
+
+    async def query_application(self, *, timeout: float | None = None) -> int:
+        return int((await self._do("query_application", timeout)).fields["answer"]["application"])
+
+    async def query_status(self, *, timeout: float | None = None) -> Status:
+        return await self._status_of("query_status", timeout)
+
+    async def reset_errors(self, *, timeout: float | None = None) -> Status:
+        return await self._status_of("reset_errors", timeout)
+
+    async def wait_ready(self, timeout: float = 10.0) -> Status:
+        return await self._status_of("wait_ready", timeout)
+
+    async def _status_of(self, do: str, timeout: float | None) -> Status:
+        return Status(int((await self._do(do, timeout)).fields["answer"]["status"]))
+
+    async def wait_status(
+        self, predicate: Callable[[Status], bool], timeout: float = 10.0
+    ) -> Status:
+        deadline = self._deadline(timeout)
+        self._require_session()
+        queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
+        self._watching.add(queue)
+        try:
+            await self._do("refresh", timeout)
+            present = self.status
+            if queue.empty():
+                queue.put_nowait(present)
+            async with asyncio.timeout_at(deadline):
+                while True:
+                    status = await queue.get()
+                    if isinstance(status, LinkError):
+                        raise self._again(status)
+                    if predicate(status):
+                        return status
+        except TimeoutError as exc:
+            if isinstance(exc, SmartCamError):
+                raise
+            raise ResponseTimeoutError(
+                f"{self.name}: the status wanted did not come within {timeout:g} s; "
+                f"status: {self.status}",
+                waited=timeout,
+            ) from exc
+        finally:
+            self._watching.discard(queue)
+
+    async def read_image(self, *, timeout: float | None = None) -> bytes:
+        return (await self._do("read_image", timeout)).blobs[0]
+
+    async def get_clock(self, *, timeout: float | None = None) -> datetime:
+        reply = await self._do("get_clock", timeout)
+        return datetime.fromisoformat(reply.fields["answer"]["clock"])
+
+    async def set_clock(self, when: datetime) -> None:
+        await self._do("set_clock", None, when=when.isoformat())
+
+    async def set_input(self, data: bytes) -> None:
+        await self._do("set_input", None, [bytes(data)])
+
+    async def set_sequence_number(self, number: int) -> None:
+        await self._do("set_sequence_number", None, number=number)
+
+    async def reboot(self) -> None:
+        await self._do("reboot", None)
+
+    async def request(
+        self,
+        message_id: int | str,
+        payload: bytes = b"",
+        *,
+        answered: bool | None = None,
+        timeout: float | None = None,
+    ) -> bytes | None:
+        arguments: dict[str, Any] = {"message_id": message_id, "answered": answered}
+        reply = await self._do("request", timeout, [bytes(payload)], **arguments)
+        return reply.blobs[0] if reply.blobs else None
+
+
+def _time(said: dict[str, Any]) -> datetime:
+    try:
+        return datetime.fromisoformat(said["event"]["at"])
+    except (KeyError, TypeError, ValueError):
+        return datetime.now(UTC)

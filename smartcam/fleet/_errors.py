@@ -1,0 +1,64 @@
+"""Errors on their way over the bus: their kind, text and attributes, and what caused them."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import smartcam.exceptions
+from smartcam.exceptions import ConnectionLostError, RemoteProtocolError, SmartCamError
+from smartcam.models import jsonable
+
+MAX_CHAIN = 8
+"""Causes behind causes that cross."""
+
+
+def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
+    """Return an error as JSON. One that is not smartcam's own crosses as the nearest that is."""
+    known = next(
+        kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _KINDS or kind is object
+    )
+    fields: dict[str, Any] = {"kind": known, "text": str(error)}
+    if known == "object":
+        fields = {"kind": "SmartCamError", "text": f"{type(error).__name__}: {error}"}
+    attributes = {name: jsonable(value) for name, value in vars(error).items() if name[0] != "_"}
+    if attributes:
+        fields["attributes"] = attributes
+    if error.__cause__ is not None and depth:
+        fields["cause"] = to_fields(error.__cause__, depth - 1)
+    return fields
+
+
+def from_fields(fields: Any) -> SmartCamError:
+    """Return the error that is said by ``fields``."""
+    if not isinstance(fields, dict):
+        return RemoteProtocolError(f"the agent's error is none: {fields!r:.80}")
+    said = cast("dict[str, Any]", fields)
+    kind = _KINDS.get(str(said.get("kind")), SmartCamError)
+    error = kind(str(said.get("text", "")))
+    attributes: Any = said.get("attributes")
+    if isinstance(attributes, dict):
+        for name, value in cast("dict[str, Any]", attributes).items():
+            if name in vars(error):  # the kind's own, with their defaults
+                setattr(error, name, _like(getattr(error, name), value))
+    if "cause" in said:
+        error.__cause__ = from_fields(said["cause"])
+    return error
+
+
+def _like(default: object, value: Any) -> Any:
+    """Return a value of JSON as what stands there by default: it has no tuples."""
+    return tuple(value) if isinstance(default, tuple) and isinstance(value, list) else value
+
+
+_KINDS: dict[str, type[SmartCamError]] = {
+    name: getattr(smartcam.exceptions, name)
+    for name in smartcam.exceptions.__all__
+    if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
+}
+
+
+def agent_lost(agent: str, doing: str) -> ConnectionLostError:
+    """Return the error of a call whose agent went away: nobody knows what it still did."""
+    return ConnectionLostError(
+        f"{agent}: the agent went away during {doing}; whether the camera did it is unknown"
+    )

@@ -1,0 +1,273 @@
+"""A camera at its agent: the session with it, what it said last, and who may command it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client.interpretation import Interpretation
+from smartcam.exceptions import (
+    ConnectionClosedError,
+    ConnectionLostError,
+    SmartCamError,
+)
+from smartcam.fleet._gate import Gate
+from smartcam.fleet._log import Log
+from smartcam.fleet._shared import SharedCamera, Tap
+from smartcam.fleet._wire import (
+    CURRENT,
+    OWNED,
+    WITH_CELLS,
+    Run,
+    encode,
+    encode_runs,
+    timestamp,
+)
+from smartcam.models import StatusChanged, jsonable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.fleet._bus import Bus, Publisher
+    from smartcam.fleet._keys import Keys
+    from smartcam.fleet._shared import Carried, Owner
+    from smartcam.models import CameraEvent, Result, Status
+    from smartcam.settings import CameraSettings
+
+MOST_STATES = 1000
+MOST_STATE_BYTES = 1 << 19
+REMINDERS = (0.05, 0.2, 1.0, 5.0)
+"""Seconds behind the last results after which their numbers are told again: the last of them may
+have been lost on the way, and nothing else would tell."""
+
+
+class Host:
+    """One camera of an agent.
+
+    Args:
+        name: in the fleet.
+        settings: of the client that has the session.
+        bus: where it is said what comes.
+        keys: of the fleet.
+        epoch: of the agent.
+        history: results that are kept, and their bytes.
+
+    Attributes:
+        gate: whose commands may pass.
+        results: the last results.
+        states: the last things that happened.
+        outcomes: the runs of triggers under way, by whose they are; for who has put a list there.
+        failure: why there is no session yet, None where there is or was one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        settings: CameraSettings,
+        bus: Bus,
+        keys: Keys,
+        epoch: int,
+        history: tuple[int, int],
+    ) -> None:
+        self.name = name
+        self.settings = settings
+        self.gate = Gate()
+        self.results = Log(*history)
+        self.states = Log(MOST_STATES, MOST_STATE_BYTES)
+        self.outcomes: dict[Owner, list[bytes]] = {}
+        self.failure: SmartCamError | None = None
+        self._epoch = epoch
+        Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
+        self._camera = self._make()
+        self._states_out: Publisher = bus.publisher(keys.states(name))
+        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
+        self._fresh: list[bytes] = []  # runs that are not said yet
+        self._fresh_states: list[bytes] = []
+        self._flushing = False
+        self._reminder: asyncio.TimerHandle | None = None
+        self._opened = asyncio.Event()
+
+    @property
+    def camera(self) -> SharedCamera:
+        """The client that has the session."""
+        return self._camera
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a session."""
+        return self._camera.connected
+
+    def _make(self) -> SharedCamera:
+        return SharedCamera(self.settings, Tap(self._on_results, self._on_status, self._on_event))
+
+    # ------------------------------------------------------------------ life
+
+    async def run(self) -> None:
+        """Have a session, as soon as there is a camera; ends when there will be none."""
+        backoff = self.settings.reconnect
+        delays = iter(()) if backoff is None else backoff.delays()
+        try:
+            while True:
+                try:
+                    await self._camera.open()
+                except (SmartCamError, OSError) as error:
+                    self._fail(error)
+                    delay = next(delays, None)
+                    if delay is None or backoff is None or not backoff.transient(error):
+                        return
+                    await asyncio.sleep(delay)
+                    self._camera = self._make()
+                else:
+                    self.failure = None
+                    return
+        finally:
+            self._opened.set()
+
+    async def tried(self, timeout: float) -> None:
+        """Wait until the first try has come to an end, well or not; bounded."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await self._opened.wait()
+
+    async def close(self) -> None:
+        """End the session with Disconnect; bounded."""
+        await self._camera.close()
+        if self._reminder is not None:
+            self._reminder.cancel()
+        self._states_out.close()
+        self._results_out.close()
+
+    def _fail(self, error: BaseException) -> None:
+        if not isinstance(error, SmartCamError):
+            error = ConnectionLostError(f"{self.name}: {error}")
+        self.failure = error
+        self._opened.set()
+        self._say({"kind": "Absent", "reason": str(error)})
+
+    def require(self) -> SharedCamera:
+        """Return the camera.
+
+        Raises:
+            LinkError: there is no session, and why.
+        """
+        if self.failure is not None:
+            raise ConnectionLostError(
+                f"{self.name}: the agent has no session with the camera: {self.failure}"
+            ) from self.failure
+        return self._camera
+
+    # ------------------------------------------------------------------ what the camera is
+
+    def state(self) -> dict[str, Any]:
+        """Return what every state message says of the camera."""
+        camera = self._camera
+        try:
+            status: int | None = int(camera.status)
+        except (ConnectionClosedError, SmartCamError):
+            status = None
+        return {
+            "connected": camera.connected,
+            "status": status,
+            "endian": camera.endian,
+            "application": camera.active_application,
+        }
+
+    def about(self) -> dict[str, Any]:
+        """Return what else there is to know of it."""
+        camera = self._camera
+        fields: dict[str, Any] = {"camera": self.name, "url": camera.url, "camera_name": ""}
+        fields["protocol_version"] = camera.protocol_version
+        fields["failure"] = None if self.failure is None else str(self.failure)
+        fields["interpret_as"] = jsonable(self.settings.interpret_as)
+        with contextlib.suppress(SmartCamError):
+            fields["capabilities"] = jsonable(camera.capabilities)
+        return fields
+
+    # ------------------------------------------------------------------ what comes
+
+    def _on_status(self, status: Status) -> None:
+        self._say({"kind": "Status"})
+
+    def _on_event(self, event: CameraEvent) -> None:
+        if isinstance(event, StatusChanged):
+            return  # a status tells that
+        fields: dict[str, Any] = jsonable(event)
+        del fields["camera"]
+        self._say({"kind": type(event).__name__, "event": fields})
+
+    def _say(self, fields: dict[str, Any]) -> None:
+        """Say what happened, and what the camera is now."""
+        clock = time.monotonic()
+        said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
+        data = json.dumps(said, separators=(",", ":")).encode()
+        self.states.add(1, clock, data)
+        self._fresh_states.append(data)
+        self._flush_soon()
+
+    def _on_results(self, results: Sequence[Result[Carried]], current: bool) -> None:
+        """Keep results that came together, and say them at the end of this turn of the loop."""
+        first = results[0]
+        owner = first.value.owner
+        flags = (CURRENT if current else 0) | (OWNED if first.triggered_at is not None else 0)
+        cells = first.value.cells
+        clock = time.monotonic()
+        run = Run(
+            self.results.following,
+            first.application,
+            self._camera.endian,
+            flags | (WITH_CELLS if cells else 0),
+            owner.program,
+            owner.call,
+            clock,
+            first.received_at.timestamp(),
+            timestamp(first.triggered_at),
+            timestamp(None) if first.latency is None else first.latency,
+            [one.raw for one in results],
+            cells,
+        )
+        data = run.encode()
+        self.results.add(len(run.payloads), clock, data)
+        if owner in self.outcomes:
+            self.outcomes[owner].append(data)
+        if self._results_out.heard:
+            self._fresh.append(data)
+            self._flush_soon()
+
+    def _flush_soon(self) -> None:
+        if not self._flushing:
+            self._flushing = True
+            asyncio.get_running_loop().call_soon(self.flush)
+
+    def flush(self) -> None:
+        """Say what is not said yet."""
+        self._flushing = False
+        if self._fresh_states:
+            fresh, self._fresh_states = self._fresh_states, []
+            following = self.states.following
+            self._states_out.put(encode({"epoch": self._epoch, "following": following}, fresh))
+        if self._fresh:
+            fresh, self._fresh = self._fresh, []
+            self._results_out.put(encode_runs(self._epoch, self.results.following, fresh))
+            self._remind(0)
+
+    def _on_heard(self, heard: bool) -> None:
+        if heard:
+            self._remind(0)
+
+    def _remind(self, step: int) -> None:
+        """Tell the last number again in a while; after the last reminder, no more."""
+        if self._reminder is not None:
+            self._reminder.cancel()
+            self._reminder = None
+        if step < len(REMINDERS):
+            loop = asyncio.get_running_loop()
+            self._reminder = loop.call_later(REMINDERS[step], self._say_number, step + 1)
+
+    def _say_number(self, step: int) -> None:
+        self._reminder = None
+        if self._results_out.heard:
+            self._results_out.put(encode_runs(self._epoch, self.results.following, []))
+            self._remind(step)

@@ -1,0 +1,210 @@
+"""The camera that an agent shares: a client like any other, whose results stay what came.
+
+What a container holds is for each program to say, so here its value is the container itself; with
+which program's trigger brought it. A layout matters only as far as it has an ``@sequence``.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._client.interpretation import Interpretation, Interpreted
+from smartcam._client.listeners import Listeners
+from smartcam.client import SmartCamera
+from smartcam.exceptions import ResponseTimeoutError, TriggerTimeoutError, WrongApplicationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from datetime import datetime
+
+    from smartcam._client.triggering import TriggerRequest
+    from smartcam.models import CameraEvent, Result, Status
+    from smartcam.protocols.messages import ResultContainer
+    from smartcam.settings import CameraSettings
+
+
+class Owner(NamedTuple):
+    """Whose trigger: the program's number at its agent, and its call's. 0 is nobody."""
+
+    program: int
+    call: int
+
+
+NOBODY = Owner(0, 0)
+
+
+class Carried(NamedTuple):
+    """The value of a result at an agent: whose it is, and the texts it was put together from."""
+
+    owner: Owner
+    cells: bytes
+
+
+class Carrier(Interpretation):
+    """Reads nothing but the number of a container, where ``layouts`` have one.
+
+    Args:
+        owner: whose trigger's results it is for.
+        layouts: a layout with ``@sequence``, or one for each application that has; None for none.
+    """
+
+    def __init__(self, owner: Owner = NOBODY, layouts: Any = None) -> None:
+        super().__init__(layouts, lenient=True, y_down=False)
+        self._carried = Carried(owner, b"")
+
+    def __call__(
+        self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
+    ) -> Interpreted:
+        if container.cells is None and container.fault is None:
+            return Interpreted(self._carried, None, 0)
+        said = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
+        return Interpreted(self._carried._replace(cells=said), None, 0)
+
+    def burst(
+        self,
+        application: int,
+        payloads: list[bytes],
+        endian: int,
+        *,
+        camera: str,
+        number: int,
+        at: datetime,
+    ) -> tuple[Sequence[Any], int]:
+        return [self._carried] * len(payloads), 0
+
+
+class Tap(NamedTuple):
+    """What an agent is told of one of its cameras; each a function."""
+
+    results: Callable[[Sequence[Result[Carried]], bool], None]
+    status: Callable[[Status], None]
+    event: Callable[[CameraEvent], None]
+
+
+class TappedListeners(Listeners):
+    """Hands everything to the agent, too."""
+
+    tap: Tap | None = None
+
+    @property
+    def streams_results(self) -> bool:
+        return not self.observed
+
+    @property
+    def hears_results(self) -> bool:
+        return True
+
+    @property
+    def hears_statuses(self) -> bool:
+        return True
+
+    @property
+    def watches_status(self) -> bool:
+        return True
+
+    def publish(self, event: CameraEvent) -> None:
+        super().publish(event)
+        if self.tap is not None:
+            self.tap.event(event)
+
+    def offer_status(self, status: Status, now: float) -> None:
+        super().offer_status(status, now)
+        if self.tap is not None:
+            self.tap.status(status)
+
+    def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
+        super().offer_burst(results, now, size)
+        if self.tap is not None:
+            self.tap.results(results, True)
+
+    def offer_result(self, result: Result, now: float, *, current: bool) -> None:
+        super().offer_result(result, now, current=current)
+        if self.tap is not None:
+            self.tap.results((result,), current)
+
+
+class SharedCamera(SmartCamera[Carried]):
+    """A camera whose agent shares it.
+
+    Args:
+        settings: validated options; their interpretation is for the programs.
+        tap: is told of everything.
+    """
+
+    def __init__(self, settings: CameraSettings, tap: Tap) -> None:
+        super().__init__(settings)
+        self._listeners.tap = tap
+
+    _listeners: TappedListeners
+
+    def _make_listeners(self) -> Listeners:
+        return TappedListeners(self.settings.name, self._observers)
+
+    def _interpretation(self, spec: object) -> Interpretation:
+        return Carrier()
+
+    @property
+    def endian(self) -> int:
+        """The byte order that its last status told."""
+        return self._state.endian
+
+    @property
+    def expected_application(self) -> int | None:
+        """The application that was asked for last, None where none was."""
+        return self._state.wanted.application
+
+    async def trigger_for(
+        self,
+        request: TriggerRequest,
+        application: int | None,
+        expected: int | None,
+        timeout: float,
+    ) -> list[Result[Carried]]:
+        """Trigger for a program: :meth:`trigger`.
+
+        Args:
+            request: what it is to do.
+            application: have this one running for it.
+            expected: the application that its program counts on, None for any.
+            timeout: seconds.
+        """
+        if application is not None or expected is None:
+            return await self._trigger(application, request, timeout)
+        try:
+            async with self._lock.hold(timeout) as deadline:
+                active = self.active_application
+                if active != expected:
+                    raise WrongApplicationError(
+                        f"{self.name}: application {active} is active, application {expected} was "
+                        "expected: another program has switched; no trigger was sent",
+                        expected=expected,
+                        got=active,
+                    )
+                return await self._triggers.trigger(request, deadline)
+        except ResponseTimeoutError as exc:
+            raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
+
+    async def ensure(self, application: int, timeout: float) -> None:
+        """Have an application running and ready, as ``application=`` does at the start."""
+        async with self._lock.hold(timeout) as deadline:
+            await self._commands.ensure(application, deadline)
+
+    async def enter(self, application: int, timeout: float) -> Any:
+        """Begin what :meth:`application` does; return what :meth:`leave` wants."""
+        async with self._lock.hold(timeout) as deadline:
+            return await self._lock.enter(application, deadline)
+
+    def leave(self, before: Any) -> None:
+        """Have the camera go back, in the background."""
+        self._lock.leave(before)
+
+    async def leave_and_wait(self, before: Any) -> None:
+        """Go back, and wait for it."""
+        await self._lock.leave_and_wait(before)
+
+    async def refresh(self, timeout: float) -> None:
+        """Have the last status be of now."""
+        deadline = self._deadline(timeout)
+        self._require_session()
+        await self._status.refresh(deadline)
