@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from smartcam.client import SmartCamera
-from smartcam.settings import CameraSettings
+from smartcam.settings import FLEET_SCHEMES, CameraSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -88,6 +88,8 @@ def connect(
     Args:
         url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
             pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
+            ``fleet://HOST[:PORT]/CAMERA`` is a camera that an agent shares
+            (:mod:`smartcam.fleet`).
         model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
         observers: see frames, events, results and errors:
             :class:`~smartcam.Observer`.
@@ -110,4 +112,8 @@ def connect(
     Raises:
         ConfigurationError: an address or option cannot work; nothing was tried.
     """
+    if url.strip().partition("://")[0].lower() in FLEET_SCHEMES:
+        from smartcam.fleet._opening import fleet_camera
+
+        return fleet_camera(url, dict(options), observers)
     return SmartCamera(CameraSettings.make(url, model, options), observers=observers)

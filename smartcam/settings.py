@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError
 
 from smartcam._suggestions import did_you_mean
 from smartcam.backoff import Backoff
-from smartcam.exceptions import ConfigurationError, PluginError
+from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from smartcam.protocols._base import Protocol
 
 __all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address"]
+
+FLEET_SCHEMES = ("fleet", "fleet+tls")
+"""Of the addresses of cameras that an agent shares."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -45,6 +48,7 @@ class Address(NamedTuple):
         quirks: pinned deviations from the dialect.
         parameters: what else the URL says, as the protocol understands it: names and values. They
             include ``user`` and ``password`` where the protocol has a login.
+        path: what stands behind the host: a camera's name in a fleet.
     """
 
     protocol: str
@@ -54,6 +58,7 @@ class Address(NamedTuple):
     dialect: str | None = None
     quirks: tuple[str, ...] = ()
     parameters: tuple[tuple[str, str], ...] = ()
+    path: str = ""
 
     @property
     def url(self) -> str:
@@ -65,12 +70,14 @@ class Address(NamedTuple):
             [(key, value) for key, value in said if value and key not in {USER, PASSWORD}],
             safe=",:",
         )
-        return f"{self.scheme}://{user}{host}:{self.port}{'?' if query else ''}{query}"
+        place = f"{user}{host}:{self.port}" if host else ""
+        path = f"/{self.path}" if self.path else ""
+        return f"{self.scheme}://{place}{path}{'?' if query else ''}{query}"
 
     def __repr__(self) -> str:
         """Return all of it but the password, which is not for logs."""
         shown = tuple((key, "***" if key == PASSWORD else value) for key, value in self.parameters)
-        fields = zip(self._fields, (*self[:-1], shown), strict=True)
+        fields = zip(self._fields, self._replace(parameters=shown), strict=True)
         return f"Address({', '.join(f'{name}={value!r}' for name, value in fields)})"
 
 
@@ -185,6 +192,12 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
             if scheme in protocol.schemes:
                 return protocol, url
         schemes = [one for protocol in _protocols() for one in protocol.schemes]
+        if scheme in FLEET_SCHEMES:
+            raise UnsupportedError(
+                f"{_masked(url)} is a camera that an agent of a fleet shares: this wants the "
+                f"address of one at the wire, which begins with {' or '.join(schemes)}"
+            )
+        schemes += FLEET_SCHEMES
         known = ", ".join(f"{one}://" for one in schemes)
         raise ConfigurationError(
             f"camera address {_masked(url)!r}: unknown scheme {scheme!r}; known are {known}"
@@ -290,7 +303,15 @@ class CameraSettings(BaseModel):
         Raises:
             ConfigurationError: names the option, what came and what was expected.
         """
-        address = parse_address(url, model=model)
+        return cls.of(parse_address(url, model=model), options)
+
+    @classmethod
+    def of(cls, address: Address, options: CameraOptions | dict[str, Any]) -> CameraSettings:
+        """Validate options for an address.
+
+        Raises:
+            ConfigurationError: names the option, what came and what was expected.
+        """
         try:
             settings = cls(address=address, **cast("dict[str, Any]", options))
         except ValidationError as exc:
@@ -300,7 +321,8 @@ class CameraSettings(BaseModel):
             raise ConfigurationError(f"connect: {exc}") from exc
         if settings.name:
             return settings
-        return settings.model_copy(update={"name": f"{address.host}:{address.port}"})
+        name = address.path or f"{address.host}:{address.port}"
+        return settings.model_copy(update={"name": name})
 
 
 def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:

@@ -103,6 +103,17 @@ class Queue(Generic[T]):
         """Whether nothing more will come."""
         return self._ended
 
+    @property
+    def waiting(self) -> bool:
+        """Whether something is there to be taken."""
+        return bool(self._items)
+
+    def share(self, ready: asyncio.Event) -> None:
+        """Set this event where something comes, or it ends; for who reads several."""
+        self._ready = ready
+        if self._items or self._ended:
+            ready.set()
+
     def statistics(self) -> SubscriberStatistics:
         """Return the account as it is now."""
         self._weigh()
@@ -343,7 +354,7 @@ class Subscribers(Generic[T]):
 
     def __init__(self) -> None:
         # what is offered now is as old as this; who subscribed later is passed over
-        self.horizon = math.inf
+        self.horizon: float = math.inf
         # empty where nobody is subscribed: looked at for every message
         self.references: tuple[weakref.ref[Queue[T]], ...] = ()
 

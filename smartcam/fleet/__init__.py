@@ -1,1 +1,60 @@
-"""Cameras of a plant, shared by many programs."""
+"""Cameras of a plant, shared by many programs.
+
+A camera takes one client, and the newcomer wins. So one process, the *agent*, has the sessions with
+the cameras and shares them: :func:`serve`, or ``smartcam serve fleet.yaml``. Any number of programs
+use them, each by :func:`smartcam.connect` with a URL such as ``fleet://plant-server/line1/cam3``,
+or all of a fleet together by :func:`open`.
+
+Between processes this needs the extra ``fleet``; :func:`open` with a fleet file has agent and
+cameras in this process, and needs nothing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.fleet._camera import FleetCamera
+    from smartcam.fleet._file import FleetFile, fleet_schema, load_fleet
+    from smartcam.fleet._fleet import (
+        AgentJoined,
+        AgentLeft,
+        CameraJoined,
+        CameraLeft,
+        Fleet,
+        FleetEvent,
+        FleetResults,
+    )
+    from smartcam.fleet._opening import open, serve
+    from smartcam.fleet._server import FleetServer
+
+__all__ = [
+    "AgentJoined",
+    "AgentLeft",
+    "CameraJoined",
+    "CameraLeft",
+    "Fleet",
+    "FleetCamera",
+    "FleetEvent",
+    "FleetFile",
+    "FleetResults",
+    "FleetServer",
+    "fleet_schema",
+    "load_fleet",
+    "open",
+    "serve",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_camera": "FleetCamera",
+            "_file": "FleetFile fleet_schema load_fleet",
+            "_fleet": "AgentJoined AgentLeft CameraJoined CameraLeft Fleet FleetEvent FleetResults",
+            "_opening": "open serve",
+            "_server": "FleetServer",
+        },
+    )

@@ -23,14 +23,15 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
     UnsupportedError,
 )
-from smartcam.fleet._calls import ACTIONS, Action, Call, now
+from smartcam.fleet._calls import ACTIONS, PASSES_GATE, Call, now
 from smartcam.fleet._errors import to_fields
 from smartcam.fleet._host import Host
+from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Owner
 from smartcam.fleet._wire import Message, decode, encode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable
     from typing import Self
 
     from smartcam.fleet._bus import Bus, Handle
@@ -124,13 +125,13 @@ class Agent:
         keys, bus, declared = self._keys, self._bus, self._declared
         try:
             declared.append(bus.watch(keys.program("*"), self._on_program))
+            for command in (True, False):
+                key = keys.call(self.name, "**", command=command)
+                declared.append(bus.subscribe(key, self._hears(command)))
             for name, settings in self._cameras.items():
                 host = Host(name, settings, bus, keys, self.epoch, self._history)
                 self.hosts[name] = host
-                declared.append(bus.subscribe(keys.call(name), self._hear_calls(host)))
                 self._start(host.run(), f"smartcam.fleet.{name}")
-            async with asyncio.timeout(FIRST_TRY):
-                await asyncio.gather(*(host.tried(FIRST_TRY) for host in self.hosts.values()))
             declared.append(bus.be_present(keys.agent(self.name)))
             declared.extend(bus.be_present(keys.camera(self.name, name)) for name in self.hosts)
         except BaseException:
@@ -151,6 +152,10 @@ class Agent:
         closing = (host.close() for host in self.hosts.values())
         await asyncio.gather(*closing, return_exceptions=True)
         await self._bus.close()
+
+    async def wait_tried(self) -> None:
+        """Wait until each camera was tried once, well or not; bounded."""
+        await asyncio.gather(*(host.tried(FIRST_TRY) for host in self.hosts.values()))
 
     def _start(self, work: Any, name: str) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work, name=name)
@@ -188,40 +193,40 @@ class Agent:
 
     # ------------------------------------------------------------------ calls
 
-    def _hear_calls(self, host: Host) -> Any:
+    def _hears(self, command: bool) -> Callable[[str, bytes], None]:
+        """Return what takes calls of one kind: commands, or questions."""
+        root = self._keys.call(self.name, "", command=command)
+
         def hear(key: str, payload: bytes) -> None:
+            name = key.removeprefix(root)
             try:
-                self._on_call(host, decode(payload, f"a call to {host.name}"))
+                message = decode(payload, f"a call to {name}")
+                self._on_call(self.hosts[name], message, command)
             except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
-                logger.warning("%s ! a call that cannot be read: %s", host.name, exc)
+                logger.warning("%s ! a call that cannot be read: %s", name, exc)
 
         return hear
 
-    def _on_call(self, host: Host, message: Message) -> None:
+    def _on_call(self, host: Host, message: Message, command: bool) -> None:
         fields = message.fields
         program, number = str(fields["program"]), int(fields["call"])
         if "cancel" in fields:
             self._cancel(host, program, int(fields["cancel"]))
             return
         said = str(fields["do"])
-        action = ACTIONS.get(said)
-        if said == "hello":
-            guest = self._guest(program)
-        else:
-            known = self._programs.get(program)
-            if known is None or fields.get("epoch") != self.epoch:
-                stranger = ConnectionLostError(
-                    f"{host.name}: the agent {self.name} was restarted, or took this program for "
-                    f"gone; {said} was not done"
-                )
-                self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
-                return
-            guest = known
+        guest = self._guest(program) if said == "hello" else self._programs.get(program)
+        if guest is None or fields.get("epoch", self.epoch) != self.epoch:
+            stranger = ConnectionLostError(
+                f"{host.name}: the agent {self.name} was restarted, or took this program for "
+                f"gone; {said} was not done"
+            )
+            self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
+            return
         if not guest.is_new(number):
             return  # it is done, or under way: a double
-        error: SmartCamError | None = None
         timeout = float(fields.get("deadline", now() + 1.0)) - now()
-        if action is None:
+        error: SmartCamError | None = None
+        if said not in ACTIONS or (said in COMMANDS) != command:
             error = UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
         elif timeout < 0:
             error = _late(said, f"{host.name}: {said} came after its deadline; it was not done")
@@ -229,14 +234,14 @@ class Agent:
             error = LocalProtocolError(
                 f"{host.name}: {MOST_CALLS} calls of this program are under way"
             )
-        if error is not None or action is None:
-            self._reply(program, number, {"error": to_fields(error or UnsupportedError(said))})
+        if error is not None:
+            self._reply(program, number, {"error": to_fields(error)})
             return
-        arguments: Any = fields.get("arguments", {})
         timeout -= min(MARGIN * timeout, MOST_MARGIN)
         owner = Owner(guest.number, number)
+        arguments: Any = fields.get("arguments", {})
         call = Call(host, program, owner, arguments, message.blobs, timeout, guest.entered)
-        task = self._start(self._do(action, said, call), f"smartcam.fleet.{host.name}.{said}")
+        task = self._start(self._do(said, call), f"smartcam.fleet.{host.name}.{said}")
         guest.tasks[number] = task
         task.add_done_callback(lambda _: guest.tasks.pop(number, None))
 
@@ -254,15 +259,15 @@ class Agent:
             camera, before = entered
             camera.leave(before)
 
-    async def _do(self, action: Action, said: str, call: Call) -> None:
+    async def _do(self, said: str, call: Call) -> None:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
         begun = now()
         try:
             async with contextlib.AsyncExitStack() as stack:
-                if action.command:
+                if said in PASSES_GATE:
                     await stack.enter_async_context(host.gate.command(call.program, call.timeout))
-                fields, blobs = await action.do(
+                fields, blobs = await ACTIONS[said](
                     call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
                 )
         except TimeoutError as exc:
@@ -291,10 +296,6 @@ class Agent:
     ) -> None:
         said = {"call": number, "epoch": self.epoch, "clock": now(), **fields}
         self._bus.put(self._keys.reply(program), encode(said, blobs or ()))
-
-    def settings(self) -> Iterable[CameraSettings]:
-        """Return the options of its cameras' clients."""
-        return self._cameras.values()
 
 
 def _late(said: str, text: str) -> SmartCamError:

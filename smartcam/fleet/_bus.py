@@ -83,6 +83,10 @@ class Bus(abc.ABC):
         """Have all know that this end is there, until it is not."""
 
     @abc.abstractmethod
+    async def present(self, pattern: str, timeout: float) -> list[str]:
+        """Return the keys of who is there, as far as it came within ``timeout`` seconds."""
+
+    @abc.abstractmethod
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         """Have ``see(key, present)`` called for who is there, and who comes and goes."""
 
@@ -158,7 +162,7 @@ class MemoryEnd(Bus):
         self.heard: list[_Declared] = []
         self.answered: list[_Declared] = []
         self.watched: list[_Declared] = []
-        self.present: list[_Declared] = []
+        self.present_here: list[_Declared] = []
         self.publishers: list[_MemoryPublisher] = []
 
     @property
@@ -173,7 +177,7 @@ class MemoryEnd(Bus):
 
     async def close(self) -> None:
         self.detach()
-        for place in (self.heard, self.answered, self.watched, self.present):
+        for place in (self.heard, self.answered, self.watched, self.present_here):
             place.clear()
 
     def attach(self) -> None:
@@ -222,14 +226,18 @@ class MemoryEnd(Bus):
         return [answer for _, question in questions for answer in question.answers]
 
     def be_present(self, key: str) -> Handle:
-        made = _Declared(self.present, key, _nothing)
+        made = _Declared(self.present_here, key, _nothing)
         self._tell(key, True)
         return made.then(lambda: self._tell(key, False))
+
+    async def present(self, pattern: str, timeout: float) -> list[str]:
+        found = [one for end in self._others() for one in end.present_here]
+        return [one.pattern for one in found if meets(pattern, one.pattern)]
 
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         made = _Declared(self.watched, pattern, see)
         for end in self._others():
-            for one in end.present:
+            for one in end.present_here:
                 if meets(made.pattern, one.pattern):
                     self._loop.call_soon(_call, made, one.pattern, True)
         return made
@@ -243,11 +251,11 @@ class MemoryEnd(Bus):
     def _tell_presence(self, present: bool) -> None:
         """Tell all what of this end is there or not, and this one what of all."""
         for end in self._others():
-            for one in end.present:
+            for one in end.present_here:
                 if end is not self:
                     for watch in self.matching(self.watched, one.pattern):
                         self._loop.call_soon(_call, watch, one.pattern, present)
-        for one in self.present:
+        for one in self.present_here:
             self._tell(one.pattern, present)
 
     def _tell(self, key: str, present: bool) -> None:

@@ -7,7 +7,6 @@ import contextlib
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import (
-    ConnectFailedError,
     ConnectionClosedError,
     ConnectionLostError,
     LinkError,
@@ -17,6 +16,7 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet._errors import from_fields
+from smartcam.fleet._keys import COMMANDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -209,7 +209,7 @@ class Caller:
     async def _meet(self, agent: str) -> None:
         loop = asyncio.get_running_loop()
         begun = loop.time()
-        reply = await self._exchange("hello", begun + HELLO_TIMEOUT, {}, (), None, None)
+        reply = await self._exchange("hello", begun + HELLO_TIMEOUT, agent)
         fields = reply.fields
         try:
             epoch, clock = int(fields["epoch"]), float(fields["clock"])
@@ -260,7 +260,7 @@ class Caller:
         Cancellation: the agent is told.
         """
         met = self.require()
-        reply = await self._exchange(do, deadline, arguments or {}, blobs, number, met)
+        reply = await self._exchange(do, deadline, met.agent, met, arguments, blobs, number)
         self.sample(float(reply.fields.get("clock", -1e300)))
         return reply
 
@@ -268,20 +268,22 @@ class Caller:
         self,
         do: str,
         deadline: float,
-        arguments: dict[str, Any],
-        blobs: Sequence[bytes],
-        number: int | None,
-        met: Met | None,
+        agent: str,
+        met: Met | None = None,
+        arguments: dict[str, Any] | None = None,
+        blobs: Sequence[bytes] = (),
+        number: int | None = None,
     ) -> Message:
         program = self.program
         begun = asyncio.get_running_loop().time()
         number = number or program.next_call()
-        fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments}
+        key = self._key(agent, do)
+        fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments or {}}
         if met is not None:
             fields |= {"epoch": met.epoch, "deadline": self.clock(deadline)}
         waiting = program.expect(number, self)
         try:
-            self.counters.bytes_sent += program.send(self.camera, fields, blobs)
+            self.counters.bytes_sent += program.send(key, fields, blobs)
             self.counters.frames_sent += 1
             async with asyncio.timeout_at(deadline):
                 reply = await waiting
@@ -289,10 +291,10 @@ class Caller:
             if waiting.done() and not waiting.cancelled():
                 reply = waiting.result()
             else:
-                self._cancel(number)
+                self._cancel(key, number)
                 raise self._silence(do, deadline - begun) from exc
         except asyncio.CancelledError:
-            self._cancel(number)
+            self._cancel(key, number)
             raise
         finally:
             program.forget(number)
@@ -309,10 +311,13 @@ class Caller:
             return
         number = self.program.next_call()
         fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments}
-        self.program.send(self.camera, {**fields, "epoch": self.met.epoch})
+        self.program.send(self._key(self.met.agent, do), {**fields, "epoch": self.met.epoch})
 
-    def _cancel(self, number: int) -> None:
-        self.program.send(self.camera, {"call": self.program.next_call(), "cancel": number})
+    def _cancel(self, key: str, number: int) -> None:
+        self.program.send(key, {"call": self.program.next_call(), "cancel": number})
+
+    def _key(self, agent: str, do: str) -> str:
+        return self.program.keys.call(agent, self.camera, command=do in COMMANDS)
 
     def _silence(self, do: str, waited: float) -> SmartCamError:
         agent = self.met.agent if self.met is not None else "agent"
@@ -331,8 +336,3 @@ class Caller:
 
 def _unknown(error: LinkError) -> LinkError:
     return ConnectionLostError(f"{error}; whether what was under way was done is unknown")
-
-
-def connect_failed(name: str, url: str, why: str, host: str, port: int) -> ConnectFailedError:
-    """Return the error of a camera that cannot be had."""
-    return ConnectFailedError(f"{name}: {url}: {why}", host=host, port=port, attempts=(why,))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Carrier, Owner
 from smartcam.fleet._wire import encode_runs
 
@@ -62,13 +63,6 @@ class Call(NamedTuple):
         if value is None:
             raise ConfigurationError(f"{self.host.name}: {name} is missing")
         return value
-
-
-class Action(NamedTuple):
-    """What a call does; a command waits while another program has the camera reserved."""
-
-    do: Callable[[Call], Awaitable[Answer]]
-    command: bool = True
 
 
 async def _trigger(call: Call) -> Answer:
@@ -229,33 +223,37 @@ async def _states(call: Call) -> Answer:
     return {"first": part.first, "following": part.following}, part.data
 
 
-ACTIONS: dict[str, Action] = {
-    "hello": Action(_hello, command=False),
-    "find": Action(_find, command=False),
-    "results": Action(_results, command=False),
-    "states": Action(_states, command=False),
-    "refresh": Action(_refresh, command=False),
-    "reserve": Action(_reserve, command=False),
-    "release": Action(_release, command=False),
-    "query_application": Action(_query_application, command=False),
-    "query_status": Action(_query_status, command=False),
-    "wait_ready": Action(_wait_ready, command=False),
-    "read_image": Action(_read_image, command=False),
-    "get_clock": Action(_get_clock, command=False),
-    "leave": Action(_leave, command=False),
-    "trigger": Action(_trigger),
-    "switch_application": Action(_switch_application),
-    "ensure": Action(_ensure),
-    "enter": Action(_enter),
-    "start": Action(_start),
-    "stop": Action(_stop),
-    "reset_errors": Action(_reset_errors),
-    "set_clock": Action(_set_clock),
-    "set_input": Action(_set_input),
-    "set_sequence_number": Action(_set_sequence_number),
-    "reboot": Action(_reboot),
-    "request": Action(_request),
+ACTIONS: dict[str, Callable[[Call], Awaitable[Answer]]] = {
+    "hello": _hello,
+    "find": _find,
+    "results": _results,
+    "states": _states,
+    "refresh": _refresh,
+    "reserve": _reserve,
+    "release": _release,
+    "query_application": _query_application,
+    "query_status": _query_status,
+    "wait_ready": _wait_ready,
+    "read_image": _read_image,
+    "get_clock": _get_clock,
+    "leave": _leave,
+    "trigger": _trigger,
+    "switch_application": _switch_application,
+    "ensure": _ensure,
+    "enter": _enter,
+    "start": _start,
+    "stop": _stop,
+    "reset_errors": _reset_errors,
+    "set_clock": _set_clock,
+    "set_input": _set_input,
+    "set_sequence_number": _set_sequence_number,
+    "reboot": _reboot,
+    "request": _request,
 }
+"""What each call does."""
+
+PASSES_GATE = COMMANDS - {"reserve", "release", "leave"}
+"""Commands that wait while another program has the camera reserved."""
 
 
 def now() -> float:

@@ -8,9 +8,11 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from smartcam._client.interpretation import Interpretation
 from smartcam.camera import DEFAULT_RECONNECT_TIMEOUT, Camera
 from smartcam.exceptions import (
     ConfigurationError,
+    ConnectFailedError,
     ConnectionClosedError,
     ConnectionLostError,
     LinkError,
@@ -19,7 +21,7 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     SmartCamError,
 )
-from smartcam.fleet._caller import Caller, Met, connect_failed
+from smartcam.fleet._caller import Caller, Met
 from smartcam.fleet._receiver import FleetListeners, Own, Receiver
 from smartcam.fleet._wire import decode_runs
 from smartcam.models import (
@@ -39,7 +41,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Iterable, Sequence
     from typing import Self
 
-    from smartcam._client.interpretation import Interpretation
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
     from smartcam.fleet._program import Program
@@ -80,6 +81,8 @@ class FleetCamera(Camera[ValueT]):
         observers: Iterable[Observer] = (),
     ) -> None:
         self._agents_layout: Any = None  # how to read results where this program does not say
+        self._unreadable: ConfigurationError | None = None  # that cannot work
+        self._met = False
         super().__init__(settings, observers=observers)
         self._camera_name, self._program, self._shared = camera, program, shared
         self._wire = Counters()
@@ -100,6 +103,7 @@ class FleetCamera(Camera[ValueT]):
         self._opened = False
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
+        self._trying = True  # the agent has not done with the first try
         self._status: Status | None = None
         self._heard_status = False  # in this session
         self._active: int | None = None
@@ -115,29 +119,38 @@ class FleetCamera(Camera[ValueT]):
     def _interpretation(self, spec: object) -> Interpretation:
         if spec is None:
             spec = self._agents_layout
-            if spec is None and self.settings.calibration is not None and not self._met_once:
-                spec = "localizations"  # until the agent has said what it is
-        return super()._interpretation(spec)
+        if self._met:
+            return super()._interpretation(spec)
+        return self._provisional(spec)
 
-    @property
-    def _met_once(self) -> bool:
-        return hasattr(self, "_opened") and self._opened
+    def _provisional(self, spec: object) -> Interpretation:
+        """Return how to read results as long as the agent has not said what it knows.
+
+        Raises:
+            ConfigurationError: that cannot work, whatever it will say.
+        """
+        settings = self.settings
+        if spec is None and settings.calibration is not None:
+            spec = "localizations"
+        said = "y_down" in settings.model_fields_set
+        refused: ConfigurationError | None = None
+        for y_down in [settings.y_down] if said else [False, True]:
+            try:
+                return Interpretation(
+                    spec, lenient=settings.lenient, y_down=y_down, calibration=settings.calibration
+                )
+            except ConfigurationError as exc:
+                refused = refused or exc
+        raise refused or ConfigurationError(f"{self.name}: {spec!r:.80} cannot be read")
 
     # ------------------------------------------------------------------ life
 
     async def open(self) -> Self:
         if self._opened or self._closed is not None:
             raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
-        self._opened = True
-        deadline = self._deadline(self.settings.connect_timeout)
         try:
-            if not self._shared:
-                await self._program.open(self.settings.connect_timeout)
-            self._receiver.open()
-            self._caller.open()
-            await self._come(deadline)
-            if self._observed:
-                self._listens(self._listeners.results)
+            await self.attend(self.settings.connect_timeout)
+            self._check_session()
             if self.settings.application is not None:
                 application = self.settings.application
                 await self._do("ensure", self.settings.switch_timeout, application=application)
@@ -146,21 +159,52 @@ class FleetCamera(Camera[ValueT]):
             raise
         return self
 
-    async def _come(self, deadline: float) -> None:
-        """Wait for an agent that has a session with the camera."""
-        address, waited = self.settings.address, self.settings.connect_timeout
-        why = f"no agent of the fleet has this camera, or none answered within {waited:g} s"
+    async def attend(self, timeout: float) -> None:
+        """Begin to hear of the camera; whether it is there yet or not.
+
+        Args:
+            timeout: seconds for the way to the bus, and for the first answer of an agent.
+        """
+        self._opened = True
+        deadline = self._deadline(timeout)
+        if not self._shared:
+            try:
+                await self._program.open(timeout)
+            except ConnectFailedError as exc:
+                raise self._not_reached(str(exc)) from exc
+        self._receiver.open()
+        self._caller.open()
+        await self._settle(deadline)
+        if self._observed:
+            self._listens(self._listeners.results)
+
+    async def _settle(self, deadline: float) -> None:
+        """Wait until the agent has a session with the camera, or has tried in vain; bounded."""
+        queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
+        self._watching.add(queue)
         try:
-            await self._caller.wait_met(deadline)
-        except TimeoutError as exc:
-            if self._caller.trouble is not None:
-                why = str(self._caller.trouble)
-            raise connect_failed(self.name, self.url, why, address.host, address.port) from exc
-        if not self._linked:
-            why = str(self._trouble)
-            raise connect_failed(
-                self.name, self.url, why, address.host, address.port
-            ) from self._trouble
+            async with asyncio.timeout_at(deadline):
+                while self._caller.met is None or self._trying:
+                    await queue.get()
+        except TimeoutError:
+            pass
+        finally:
+            self._watching.discard(queue)
+
+    def _check_session(self) -> None:
+        """Raise what says why there is no session, or nothing that can be used."""
+        if self._unreadable is not None:
+            raise self._unreadable
+        if not self.connected:
+            trouble = self._caller.trouble or self._trouble
+            waited = self.settings.connect_timeout
+            why = f"no agent of the fleet has this camera, or none answered within {waited:g} s"
+            raise self._not_reached(why if trouble is None else str(trouble)) from trouble
+
+    def _not_reached(self, why: str) -> ConnectFailedError:
+        address = self.settings.address
+        text = f"{self.name}: {self.url}: {why}"
+        return ConnectFailedError(text, host=address.host, port=address.port, attempts=(why,))
 
     async def close(self) -> None:
         self._finish(ConnectionClosedError(f"{self.name}: closed"))
@@ -206,6 +250,8 @@ class FleetCamera(Camera[ValueT]):
     def _require_session(self) -> Met:
         if self._closed is not None:
             raise self._again(self._closed)
+        if self._unreadable is not None:
+            raise self._unreadable
         met = self._caller.require()
         if not self._linked:
             raise self._again(self._trouble or ConnectionLostError(f"{self.name}: not connected"))
@@ -246,19 +292,30 @@ class FleetCamera(Camera[ValueT]):
         """An agent has answered: this is what the camera is now."""
         hello = met.hello
         new = met.epoch != self._receiver.epoch
-        layout = hello.get("interpret_as")
-        if self.settings.interpret_as is None and layout is not None:
-            if isinstance(layout, dict):
-                layout = {int(key): value for key, value in layout.items()}
-            if layout != self._agents_layout:
-                self._agents_layout = layout
-        if self.settings.interpret_as is None:
-            self._default = self._interpretation(None)
+        self._read_as(hello)
         self._receiver.meet(met)
         if new or not self._linked:
             self._on_state({"kind": "Hello", **hello})
         if self._listeners.hears_results:
             self._listens(self._listeners.results)
+
+    def _read_as(self, hello: dict[str, Any]) -> None:
+        """Take over what the agent knows of what results hold, where this program does not say."""
+        settings, layout = self.settings, hello.get("interpret_as")
+        if isinstance(layout, dict):
+            layout = {int(key): value for key, value in layout.items()}
+        said = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
+        changes = {key: on for key, on in said.items() if key not in settings.model_fields_set}
+        fields_set = settings.model_fields_set
+        self.settings = settings.model_copy(update=changes)
+        self.settings.model_fields_set.intersection_update(fields_set)
+        self._agents_layout = layout
+        self._interpretations.clear()
+        self._met, self._unreadable = True, None
+        try:
+            self._default = self._interpretation(settings.interpret_as)
+        except ConfigurationError as exc:
+            self._unreadable = exc
 
     def _on_lost(self, error: LinkError) -> None:
         """The agent is gone."""
@@ -268,6 +325,7 @@ class FleetCamera(Camera[ValueT]):
     def _lose(self, error: LinkError) -> None:
         self._trouble = error
         if not self._linked:
+            self._stir(error)
             return
         self._linked = self._heard_status = False
         self._counters.note_loss(error)
@@ -285,13 +343,20 @@ class FleetCamera(Camera[ValueT]):
     def _fail(self, error: LinkError) -> None:
         """Tell who waits that there is no session."""
         self._listeners.fail(self._again(error))
+        self._stir(error)
+
+    def _stir(self, what: Status | LinkError) -> None:
+        """Give who waits something to look at."""
         for queue in self._watching:
-            queue.put_nowait(error)
+            queue.put_nowait(what)
 
     def _on_state(self, said: dict[str, Any]) -> None:
         """Something happened to the camera; this is what it is now."""
         at = _time(said)
         linked = bool(said.get("connected"))
+        if self._trying and not said.get("trying"):
+            self._stir(self._status or Status(0))
+        self._trying = bool(said.get("trying"))
         if not linked:
             why = said.get("reason") or said.get("event", {}).get("reason") or said.get("failure")
             self._lose(
@@ -316,9 +381,7 @@ class FleetCamera(Camera[ValueT]):
         self._sessions += 1
         event = Connected if self._sessions == 1 else Reconnected
         self._listeners.publish(event(camera=self.name, at=at, url=self.url))
-        for queue in self._watching:
-            if self._status is not None:
-                queue.put_nowait(self._status)
+        self._stir(self._status or Status(0))
 
     def _take_status(self, status: Status, at: datetime, kind: str) -> None:
         previous = self._status if self._heard_status else None
@@ -332,8 +395,7 @@ class FleetCamera(Camera[ValueT]):
             self._listeners.publish(
                 StatusChanged(camera=self.name, at=at, status=status, previous=previous)
             )
-        for queue in self._watching:
-            queue.put_nowait(status)
+        self._stir(status)
 
     # ------------------------------------------------------------------ what is known
 

@@ -125,6 +125,7 @@ class Host:
                     return
         finally:
             self._opened.set()
+            self._say({"kind": "Tried"})
 
     async def tried(self, timeout: float) -> None:
         """Wait until the first try has come to an end, well or not; bounded."""
@@ -153,9 +154,10 @@ class Host:
         Raises:
             LinkError: there is no session, and why.
         """
-        if self.failure is not None:
+        if self.failure is not None or not (self._opened.is_set() or self.connected):
+            why = self.failure or "it tries for the first time"
             raise ConnectionLostError(
-                f"{self.name}: the agent has no session with the camera: {self.failure}"
+                f"{self.name}: the agent has no session with the camera: {why}"
             ) from self.failure
         return self._camera
 
@@ -170,6 +172,7 @@ class Host:
             status = None
         return {
             "connected": camera.connected,
+            "trying": not self._opened.is_set(),
             "status": status,
             "endian": camera.endian,
             "application": camera.active_application,
@@ -182,6 +185,7 @@ class Host:
         fields["protocol_version"] = camera.protocol_version
         fields["failure"] = None if self.failure is None else str(self.failure)
         fields["interpret_as"] = jsonable(self.settings.interpret_as)
+        fields["y_down"], fields["lenient"] = self.settings.y_down, self.settings.lenient
         with contextlib.suppress(SmartCamError):
             fields["capabilities"] = jsonable(camera.capabilities)
         return fields

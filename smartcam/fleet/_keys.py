@@ -6,6 +6,27 @@ from functools import lru_cache
 
 ROOT = "smartcam"
 
+COMMANDS = frozenset(
+    {
+        "trigger",
+        "switch_application",
+        "ensure",
+        "enter",
+        "leave",
+        "start",
+        "stop",
+        "reset_errors",
+        "set_clock",
+        "set_input",
+        "set_sequence_number",
+        "reboot",
+        "request",
+        "reserve",
+        "release",
+    }
+)
+"""Calls that change something, or keep others from doing so; all others are questions."""
+
 
 @lru_cache(maxsize=4096)
 def meets(one: str, other: str) -> bool:
@@ -27,42 +48,45 @@ def _meet(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
 class Keys:
     """The keys of one fleet.
 
+    What is said under which prefix decides who may say it: commands, questions, results, states,
+    presence and what other programs use have prefixes of their own.
+
     Args:
         fleet: its name.
     """
 
     def __init__(self, fleet: str) -> None:
         self.fleet = fleet
-        self._root = f"{ROOT}/{fleet}"
+        self.root: str = f"{ROOT}/{fleet}"
 
     def agent(self, agent: str) -> str:
         """Presence of an agent."""
-        return f"{self._root}/presence/agent/{agent}"
+        return f"{self.root}/presence/agent/{agent}"
 
     def camera(self, agent: str, camera: str) -> str:
         """Presence of a camera: its agent has it, whether it is connected or not."""
-        return f"{self._root}/presence/camera/{agent}/{camera}"
+        return f"{self.root}/presence/camera/{agent}/{camera}"
 
     def program(self, program: str) -> str:
         """Presence of a program that calls."""
-        return f"{self._root}/presence/program/{program}"
+        return f"{self.root}/presence/program/{program}"
 
-    def call(self, camera: str) -> str:
-        """Calls to a camera's agent."""
-        return f"{self._root}/call/{camera}"
+    def call(self, agent: str, camera: str, *, command: bool) -> str:
+        """Calls to a camera's agent: commands, and questions that change nothing."""
+        return f"{self.root}/{'command' if command else 'ask'}/{agent}/{camera}"
 
     def reply(self, program: str) -> str:
         """Replies to a program."""
-        return f"{self._root}/reply/{program}"
+        return f"{self.root}/reply/{program}"
 
     def states(self, camera: str) -> str:
         """What happens to a camera."""
-        return f"{self._root}/states/{camera}"
+        return f"{self.root}/states/{camera}"
 
     def results(self, camera: str) -> str:
         """Results of a camera."""
-        return f"{self._root}/results/{camera}"
+        return f"{self.root}/results/{camera}"
 
     def tail(self, key: str, kind: str) -> list[str]:
         """Return the chunks of ``key`` behind ``kind``, such as ``presence/camera``."""
-        return key.removeprefix(f"{self._root}/{kind}/").split("/")
+        return key.removeprefix(f"{self.root}/{kind}/").split("/")

@@ -11,7 +11,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.exceptions import ConnectionClosedError, ProtocolError
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectFailedError,
+    ConnectionClosedError,
+    ProtocolError,
+)
+from smartcam.fleet._keys import Keys
 from smartcam.fleet._wire import Message, decode, encode
 
 if TYPE_CHECKING:
@@ -20,9 +26,12 @@ if TYPE_CHECKING:
 
     from smartcam.exceptions import SmartCamError
     from smartcam.fleet._bus import Bus, Handle
-    from smartcam.fleet._keys import Keys
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+
+LOOK_AGAIN = 0.1
+"""Seconds between two looks whether an agent has come."""
 
 
 class Pending(NamedTuple):
@@ -37,14 +46,18 @@ class Program:
 
     Args:
         bus: an end of its own.
-        keys: of the fleet.
+        fleet: the name of its fleet; None for the only one that has what is looked for.
+        camera: what is looked for: a camera's name, or a pattern.
 
     Attributes:
         name: which no other program has; it begins with what a person would call it.
+        keys: of the fleet, once it is open.
     """
 
-    def __init__(self, bus: Bus, keys: Keys) -> None:
-        self.bus, self.keys = bus, keys
+    keys: Keys
+
+    def __init__(self, bus: Bus, fleet: str | None, camera: str = "**") -> None:
+        self.bus, self._fleet, self._camera = bus, fleet, camera
         self.name: str = f"{_own_name()}-{secrets.token_hex(6)}"
         self._calls = 0
         self._pending: dict[int, Pending] = {}
@@ -54,14 +67,36 @@ class Program:
         """Come to the bus.
 
         Raises:
-            ConnectFailedError: there is none within ``timeout`` seconds.
+            ConnectFailedError: there is none within ``timeout`` seconds, or no fleet there.
+            ConfigurationError: there are several.
         """
+        deadline = asyncio.get_running_loop().time() + timeout
         await self.bus.open(timeout)
+        self.keys = Keys(self._fleet or await self._find(deadline, timeout))
         self._declared = [
             self.bus.subscribe(self.keys.reply(self.name), self._on_reply),
             self.bus.be_present(self.keys.program(self.name)),
         ]
         return self
+
+    async def _find(self, deadline: float, timeout: float) -> str:
+        """Return the name of the only fleet that has what is looked for."""
+        loop = asyncio.get_running_loop()
+        pattern = Keys("*").camera("*", self._camera)
+        while (left := deadline - loop.time()) > 0:
+            keys = await self.bus.present(pattern, left)
+            found = sorted({key.split("/")[1] for key in keys})
+            if len(found) == 1:
+                return found[0]
+            if found:
+                raise ConfigurationError(
+                    f"{self._camera}: there are several fleets: {', '.join(found)}; say which one "
+                    f"is meant: ?fleet={found[0]}"
+                )
+            await asyncio.sleep(min(LOOK_AGAIN, left))
+        what = "camera" if "*" in self._camera else f"camera {self._camera}"
+        why = f"no agent there has a {what}: none came within {timeout:g} s"
+        raise ConnectFailedError(why, attempts=(why,))
 
     async def close(self) -> None:
         """Leave the bus; calls under way end. Idempotent."""
@@ -78,10 +113,10 @@ class Program:
         self._calls += 1
         return self._calls
 
-    def send(self, camera: str, fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> int:
-        """Say something to a camera's agent; return how many bytes."""
+    def send(self, key: str, fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> int:
+        """Say something to an agent; return how many bytes."""
         payload = encode({"program": self.name, **fields}, blobs)
-        self.bus.put(self.keys.call(camera), payload)
+        self.bus.put(key, payload)
         return len(payload)
 
     def expect(self, number: int, camera: object) -> asyncio.Future[Message]:

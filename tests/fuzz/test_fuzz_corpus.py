@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-import smartcam.emulator._scenario.file as scenario_module
 import smartcam.layout as layout_module
+import smartcam.layout._yaml_files as scenario_module
 from smartcam.emulator import Device
 from smartcam.interpreters._localizations import LocalizationsInterpreter
 from smartcam.layout import Layout

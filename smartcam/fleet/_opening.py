@@ -1,0 +1,109 @@
+"""From a fleet's address or file to what is used: a fleet, an agent, a camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypedDict
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._address import FleetAddress
+from smartcam.fleet._bus import MemoryBus
+from smartcam.fleet._camera import FleetCamera
+from smartcam.fleet._fleet import Fleet
+from smartcam.fleet._program import Program
+from smartcam.fleet._server import FleetServer
+from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.settings import CameraSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+    from typing import Unpack
+
+    from smartcam.backoff import Backoff
+    from smartcam.fleet._file import FleetFile
+    from smartcam.interpreters._base import Spec
+    from smartcam.models import Calibration
+    from smartcam.observers import Observer
+
+
+class FleetOptions(TypedDict, total=False):
+    """Options of all cameras of a fleet, as :class:`~smartcam.settings.CameraSettings` has them."""
+
+    interpret_as: Spec | Mapping[int, Spec]
+    calibration: Calibration | Mapping[int, Calibration | None] | None
+    y_down: bool
+    lenient: bool
+    switch_timeout: float
+    request_timeout: float
+    reconnect: Backoff | None
+
+
+def serve(file: str | Path | FleetFile) -> FleetServer:
+    """Return an agent that shares cameras, to be run by ``async with``.
+
+    ::
+
+        async with smartcam.fleet.serve("fleet.yaml") as server:
+            print(server.urls)
+
+    Args:
+        file: path of a fleet file, or what stands in one.
+
+    Raises:
+        ConfigurationError: the file is wrong; says where.
+        MissingExtraError: the extra ``fleet`` is not installed.
+    """
+    return FleetServer(file)
+
+
+def open(
+    place: str | Path | FleetFile,
+    *,
+    connect_timeout: float = 10.0,
+    **options: Unpack[FleetOptions],
+) -> Fleet:
+    """Return a fleet, to be opened by ``async with``.
+
+    Args:
+        place: the fleet's URL, ``fleet://HOST[:PORT]``; or a fleet file, whose agent and cameras
+            then are in this process, without an engine, for this program only.
+        connect_timeout: seconds for coming to it and meeting its cameras.
+        **options: ``interpret_as``, ``calibration``, ``y_down``, ``lenient``, ``switch_timeout``,
+            ``request_timeout``, ``reconnect``, as :func:`smartcam.connect` has them.
+
+    Raises:
+        ConfigurationError: the URL, the file or an option cannot work.
+        MissingExtraError: a URL, and the extra ``fleet`` is not installed.
+    """
+    if isinstance(place, str) and place.strip().startswith("fleet"):
+        address = FleetAddress.parse(place) if "://" in place else None
+        if address is not None:
+            if address.camera:
+                raise ConfigurationError(
+                    f"fleet address {place!r} is a camera's; smartcam.connect() takes it"
+                )
+            end = ZenohEnd(address.link)
+            return Fleet(end, address, address.fleet, None, connect_timeout, options)
+    bus = MemoryBus()
+    server = FleetServer(place, bus=bus.end())
+    return Fleet(bus.end(), None, server.file.fleet, server, connect_timeout, options)
+
+
+def fleet_camera(
+    url: str, options: dict[str, Any], observers: Iterable[Observer]
+) -> FleetCamera[Any]:
+    """Return a camera by its fleet URL.
+
+    Raises:
+        ConfigurationError: the URL or an option cannot work.
+        MissingExtraError: the extra ``fleet`` is not installed.
+    """
+    address = FleetAddress.parse(url)
+    if not address.camera:
+        raise ConfigurationError(
+            f"fleet address {url!r} names no camera: expected fleet://HOST[:PORT]/CAMERA; "
+            "smartcam.fleet.open() takes the fleet"
+        )
+    settings = CameraSettings.of(address.of(address.camera), options)
+    program = Program(ZenohEnd(address.link), address.fleet, address.camera)
+    return FleetCamera(settings, address.camera, program, observers=observers)

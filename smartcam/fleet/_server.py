@@ -1,0 +1,138 @@
+"""An agent with its cameras, as a fleet file says: what ``smartcam serve`` runs."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from smartcam._server import Server
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
+from smartcam.fleet._agent import Agent
+from smartcam.fleet._file import FleetFile, load_fleet
+from smartcam.fleet._keys import Keys
+from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+
+if TYPE_CHECKING:
+    from smartcam.emulator._wire_camera import WireCamera
+    from smartcam.fleet._bus import Bus
+    from smartcam.fleet._file import Planned
+    from smartcam.fleet._host import Host
+
+OPEN_TIMEOUT = 10.0
+"""Seconds for coming to the bus."""
+
+
+class FleetServer(Server):
+    """An agent that shares the cameras of a fleet file; made by :func:`smartcam.fleet.serve`.
+
+    Args:
+        file: the path of a fleet file, or what stands in one.
+        bus: an end of another bus than the file says.
+
+    Raises:
+        ConfigurationError: something in it cannot work.
+        MissingExtraError: PyYAML, or the bus' engine, is not installed.
+    """
+
+    def __init__(self, file: str | Path | FleetFile, *, bus: Bus | None = None) -> None:
+        self.file: FleetFile = file if isinstance(file, FleetFile) else load_fleet(file)
+        self._folder = Path() if isinstance(file, FleetFile) else Path(file).parent
+        try:
+            self._plan = self.file.plan()
+        except ValueError as exc:
+            raise ConfigurationError(f"fleet {self.file.fleet}: {exc}") from exc
+        listen, connect = self.file.endpoints
+        self._listen, self._connect = listen, connect = with_ports(listen), connect
+        self._bus = bus or ZenohEnd(Link(listen, connect, self.file.certificates))
+        self._agent: Agent | None = None
+        self._stack = contextlib.AsyncExitStack()
+
+    async def start(self) -> None:
+        """Start the emulated cameras, come to the bus, and begin to have sessions.
+
+        Raises:
+            ConnectFailedError: an endpoint cannot be listened on, or reached.
+            ConfigurationError: an option of a camera cannot work.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._agent is not None:
+            return
+        file = self.file
+        async with contextlib.AsyncExitStack() as stack:
+            cameras = {}
+            for planned in self._plan:
+                url = planned.entry.url or await self._emulate(planned, stack)
+                cameras[planned.name] = planned.entry.settings(planned.name, url)
+            history = (file.history.results, file.history.bytes)
+            agent = Agent(file.agent_name, Keys(file.fleet), self._bus, cameras, history=history)
+            stack.push_async_callback(agent.close)
+            await agent.open(OPEN_TIMEOUT)
+            self._agent, self._stack = agent, stack.pop_all()
+
+    async def stop(self) -> None:
+        """End the sessions with Disconnect, and leave the bus. Harmless when done twice."""
+        self._agent = None
+        await self._stack.aclose()
+
+    async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
+        """Start an emulated camera; return its URL."""
+        from smartcam.emulator import EmulatedCamera, load_scenario
+        from smartcam.emulator._makes import emulated_class
+
+        emulated = planned.entry.emulated
+        if emulated is None:
+            raise ConfigurationError(f"{planned.name}: neither url nor emulated")
+        seed = emulated.seed + planned.nth
+        camera: WireCamera
+        if emulated.scenario is None:
+            camera = EmulatedCamera(seed=seed)
+        else:
+            scenario = load_scenario(self._folder / emulated.scenario)
+            scenario = scenario.model_copy(update={"seed": seed})
+            camera = emulated_class(scenario.protocol).from_scenario(scenario, host="127.0.0.1")
+        await stack.enter_async_context(camera)
+        return camera.url
+
+    async def wait_tried(self) -> None:
+        """Wait until every camera was tried once, well or not; bounded by ``connect_timeout``."""
+        if self._agent is not None:
+            await self._agent.wait_tried()
+
+    @property
+    def name(self) -> str:
+        """The agent's name."""
+        return "" if self._agent is None else self._agent.name
+
+    @property
+    def hosts(self) -> dict[str, Host]:
+        """Its cameras by name, empty before it is started."""
+        return {} if self._agent is None else self._agent.hosts
+
+    @property
+    def address(self) -> FleetAddress:
+        """Where programs on this host find it."""
+        return address_of((*self._listen, *self._connect)[0], self.file)
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """The fleet URLs of its cameras, by name."""
+        address = self.address
+        return {planned.name: address.of(planned.name).url for planned in self._plan}
+
+
+def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
+    """Return the address of a fleet by an endpoint such as ``tcp/127.0.0.1:7447``."""
+    kind, _, place = endpoint.partition("/")
+    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+    host = host.strip("[]") or place
+    if host in {"0.0.0.0", "::"}:  # noqa: S104 - what is listened on everywhere is here, too
+        host = "127.0.0.1"
+    scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
+    number = int(port) if port.isdecimal() else DEFAULT_PORT
+    certificates = file.certificates if scheme == "fleet+tls" else None
+    # a router that others stand around may have several fleets
+    name = None if file.endpoints[0] else file.fleet
+    return FleetAddress(scheme, host, number, name, "", certificates)

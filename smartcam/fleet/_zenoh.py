@@ -1,0 +1,498 @@
+"""The bus between processes and hosts: Zenoh, whose binding calls back in threads of its own.
+
+What comes is put into one queue, and a burst wakes the event loop once. Nothing is said in a way
+that could make the loop wait: what does not fit into the engine's buffers is dropped there, and who
+hears it finds the gap by the numbers. Only what is long goes out in a thread, which may wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import functools
+import json
+import logging
+import os
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError, ConnectFailedError, MissingExtraError
+from smartcam.fleet._bus import Bus, Handle, Publisher, Question
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from typing import Self
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+RUNTIME = (
+    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
+    "app:(worker_threads:1))"
+)
+"""Zenoh's threads: one for everything, which halves the CPU time of a call; its callbacks here only
+put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
+
+LEASE = 5.0
+"""Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
+
+LONG = 1 << 16
+"""Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
+
+MOST_WAITING = 1 << 26
+"""Bytes that wait for the event loop; results beyond are dropped, and asked for again later."""
+
+TURN = 64
+"""Callbacks in one turn of the event loop."""
+
+CLOSE_TIMEOUT = 5.0
+
+
+@dataclass(frozen=True)
+class Link:
+    """How an end comes to the bus.
+
+    Attributes:
+        listen: endpoints to listen on, such as ``tcp/127.0.0.1:7447``.
+        connect: endpoints to connect to; with several, whichever answers.
+        certificates: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, for TLS.
+    """
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    certificates: str | None = None
+
+    @property
+    def place(self) -> str:
+        """Return where it is, for texts."""
+        return ", ".join(self.listen or self.connect)
+
+    def settings(self, timeout: float) -> dict[str, Any]:
+        """Return the engine's settings by their paths."""
+        found: dict[str, Any] = {
+            # who connects only is a client of a router, which whoever listens is
+            "mode": "router" if self.listen else "client",
+            "listen/endpoints": list(self.listen),
+            "connect/endpoints": list(self.connect),
+            "connect/timeout_ms": 0,  # one try; later ones are made without end
+            "connect/exit_on_failure": not self.listen,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "scouting/delay": 0,
+            "transport/shared_memory/enabled": False,
+            "transport/link/tx/lease": int(1e3 * LEASE),
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/unicast/open_timeout": max(1, int(1e3 * timeout)),
+        }
+        for queue in ("data", "interactive_high"):
+            found[f"transport/link/tx/queue/size/{queue}"] = 16
+        if self.certificates is not None:
+            tls = f"{self.certificates.rstrip('/')}/"
+            found |= {
+                "transport/link/tls/root_ca_certificate": f"{tls}ca.pem",
+                "transport/link/tls/enable_mtls": True,
+                "transport/link/tls/connect_certificate": f"{tls}cert.pem",
+                "transport/link/tls/connect_private_key": f"{tls}key.pem",
+                "transport/link/tls/listen_certificate": f"{tls}cert.pem",
+                "transport/link/tls/listen_private_key": f"{tls}key.pem",
+                "transport/link/tls/verify_name_on_connect": True,
+            }
+        return found
+
+
+def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
+    """Return endpoints to listen on, with a free port where one has port 0."""
+    return tuple(
+        f"{one.removesuffix(':0')}:{_free_port(one)}" if one.endswith(":0") else one
+        for one in endpoints
+    )
+
+
+def _free_port(endpoint: str) -> int:
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as found:
+        found.bind((host, 0))
+        return int(found.getsockname()[1])
+
+
+@functools.cache
+def _engine() -> Any:
+    """Return Zenoh.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
+    try:
+        import zenoh
+    except ImportError as exc:
+        raise MissingExtraError(
+            'a fleet over the network needs Zenoh, which is not installed: pip install "'
+            'smartcam[fleet]"',
+            extra="fleet",
+        ) from exc
+    return zenoh
+
+
+class ZenohEnd(Bus):
+    """One end of a bus that Zenoh makes.
+
+    Args:
+        link: how it comes there.
+        more: further settings of the engine, by their paths.
+    """
+
+    def __init__(self, link: Link, more: Mapping[str, Any] | None = None) -> None:
+        self._link, self._more = link, dict(more or {})
+        self._zenoh = _engine()
+        self._session: Any = None
+        self._declared: set[_Declared] = set()
+        self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
+        self._waiting = collections.deque()
+        self._bytes = 0
+        self._woken = False
+        self._lock = threading.Lock()
+        self._told_dropped = False
+        self._sender: ThreadPoolExecutor | None = None
+        self._sending = 0
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self, timeout: float) -> Self:
+        self._loop = loop = asyncio.get_running_loop()
+        zenoh = self._zenoh
+        config = zenoh.Config()
+        for path, value in {**self._link.settings(timeout), **self._more}.items():
+            try:
+                config.insert_json5(path, json.dumps(value))
+            except zenoh.ZError as exc:
+                raise ConfigurationError(f"the fleet's engine refuses {path}: {value!r}") from exc
+        opening = loop.run_in_executor(None, zenoh.open, config)
+        try:
+            async with asyncio.timeout(timeout):
+                self._session = await asyncio.shield(opening)
+        except TimeoutError as exc:
+            opening.add_done_callback(_close_late)
+            raise self._failed(f"no answer within {timeout:g} s") from exc
+        except zenoh.ZError as exc:
+            raise self._failed(_reason(exc)) from exc
+        except asyncio.CancelledError:
+            opening.add_done_callback(_close_late)
+            raise
+        return self
+
+    def _failed(self, why: str) -> ConnectFailedError:
+        doing = "listen on" if self._link.listen else "reach"
+        text = f"the fleet's bus: cannot {doing} {self._link.place}: {why}"
+        return ConnectFailedError(text, attempts=(why,))
+
+    async def close(self) -> None:
+        session, self._session = self._session, None
+        self._waiting.clear()
+        self._bytes = 0
+        if session is None:
+            return
+        for one in tuple(self._declared):
+            one.close()
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.shutdown(wait=False)
+        closing = self._loop.run_in_executor(None, session.close)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await asyncio.shield(closing)
+
+    # ------------------------------------------------------------------ to the loop
+
+    def _in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
+        """Have something called in the event loop, in order; for any thread."""
+        with self._lock:
+            self._waiting.append((call, arguments, size))
+            self._bytes += size
+            if self._woken:
+                return
+            self._woken = True
+        self._wake()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed, and nobody hears any more
+            self._loop.call_soon_threadsafe(self._drain)
+
+    def _drain(self) -> None:
+        waiting = self._waiting
+        for _ in range(TURN):
+            try:
+                call, arguments, size = waiting.popleft()
+            except IndexError:
+                break
+            with self._lock:
+                self._bytes -= size
+            try:
+                call(*arguments)
+            except Exception:
+                logger.exception("%s ! what came from the bus was not taken", self._link.place)
+        with self._lock:
+            self._woken = bool(waiting)
+        if self._woken:
+            self._loop.call_soon(self._drain)
+
+    def _full(self, size: int) -> bool:
+        """Whether the loop is so far behind that what can be asked for again is dropped."""
+        if self._bytes + size <= MOST_WAITING:
+            return False
+        if not self._told_dropped:
+            self._told_dropped = True
+            logger.warning(
+                "%s ! this program does not read: %d bytes wait; more is dropped",
+                self._link.place,
+                self._bytes,
+            )
+        return True
+
+    # ------------------------------------------------------------------ what is said
+
+    def put(self, key: str, payload: bytes) -> None:
+        zenoh, session = self._zenoh, self._session
+        if session is None:
+            return
+        how: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
+        if len(payload) > LONG:
+            how["congestion_control"] = zenoh.CongestionControl.BLOCK
+            if self._sender is None:
+                self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
+            self._sender.submit(_put, session, key, payload, how)
+            return
+        how["congestion_control"] = zenoh.CongestionControl.DROP
+        _put(session, key, payload, how)
+
+    def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
+        return _Publisher(self, key, on_heard)
+
+    def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
+        in_loop, full = self._in_loop, self._full
+
+        def on_sample(sample: Any) -> None:
+            payload = sample.payload.to_bytes()
+            if not full(len(payload)):
+                in_loop(declared.call, len(payload), hear, str(sample.key_expr), payload)
+
+        declared = _Declared(self)
+        return declared.of(lambda session: session.declare_subscriber(pattern, _direct(on_sample)))
+
+    def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
+        def on_query(query: Any) -> None:
+            self._in_loop(declared.call, 0, answer, _Question(self._zenoh, query))
+
+        declared = _Declared(self)
+        return declared.of(
+            lambda session: session.declare_queryable(pattern, _direct(on_query), complete=False)
+        )
+
+    async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
+        zenoh = self._zenoh
+        return await self._answers(
+            lambda session, hear: session.get(
+                pattern,
+                hear,
+                payload=payload,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout,
+            ),
+            timeout,
+        )
+
+    async def _answers(
+        self, ask: Callable[[Any, Any], None], timeout: float
+    ) -> list[tuple[str, bytes]]:
+        """Return what all answer; ``ask`` is given the session and what hears them."""
+        zenoh, session = self._zenoh, self._session
+        answers: list[tuple[str, bytes]] = []
+        done = self._loop.create_future()
+
+        def add(key: str, payload: bytes) -> None:
+            answers.append((key, payload))
+
+        def end() -> None:
+            if not done.done():
+                done.set_result(None)
+
+        def on_reply(reply: Any) -> None:
+            if reply.ok is not None:
+                payload = reply.ok.payload.to_bytes()
+                self._in_loop(add, len(payload), str(reply.ok.key_expr), payload)
+
+        if session is None:
+            return answers
+        ended = functools.partial(self._in_loop, end, 0)
+        ask(session, zenoh.handlers.Callback(on_reply, ended, indirect=False))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await done
+        return answers
+
+    # ------------------------------------------------------------------ who is there
+
+    def be_present(self, key: str) -> Handle:
+        return _Declared(self).of(lambda session: session.liveliness().declare_token(key))
+
+    async def present(self, pattern: str, timeout: float) -> list[str]:
+        found = await self._answers(
+            lambda session, hear: session.liveliness().get(pattern, hear, timeout=timeout), timeout
+        )
+        return [key for key, _ in found]
+
+    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+        put = self._zenoh.SampleKind.PUT
+
+        def on_sample(sample: Any) -> None:
+            self._in_loop(declared.call, 0, see, str(sample.key_expr), sample.kind == put)
+
+        declared = _Declared(self)
+        return declared.of(
+            lambda session: session.liveliness().declare_subscriber(
+                pattern, _direct(on_sample), history=True
+            )
+        )
+
+    # ------------------------------------------------------------------ for what is declared
+
+    def declare(self, one: _Declared, how: Callable[[Any], Any]) -> Any:
+        """Declare something at the engine; it is closed with this end."""
+        if self._session is None:
+            raise ConfigurationError("the fleet's bus is not open")
+        self._declared.add(one)
+        return how(self._session)
+
+    def forget(self, one: _Declared) -> None:
+        """It is closed."""
+        self._declared.discard(one)
+
+    def publish(self, publisher: Any, payload: bytes) -> None:
+        """Have a publisher say something."""
+        _quietly(publisher.put, payload)
+
+    @property
+    def engine(self) -> Any:
+        """The module."""
+        return self._zenoh
+
+    def later(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Call something in the event loop; for any thread."""
+        self._in_loop(call, 0, *arguments)
+
+
+class _Declared(Handle):
+    def __init__(self, end: ZenohEnd) -> None:
+        self._end = end
+        self._closed = False
+        self._it: Any = None
+
+    def of(self, how: Callable[[Any], Any]) -> Self:
+        self._it = self._end.declare(self, how)
+        return self
+
+    def call(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Call back, unless it was closed meanwhile."""
+        if not self._closed:
+            call(*arguments)
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._end.forget(self)
+            _quietly(self._it.undeclare)
+
+
+class _Publisher(Publisher):
+    def __init__(self, end: ZenohEnd, key: str, on_heard: Callable[[bool], None] | None) -> None:
+        zenoh = end.engine
+        self._end = end
+        self._heard = False
+        self._told = on_heard
+
+        def declare(session: Any) -> Any:
+            return session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA,
+                express=False,
+            )
+
+        def on_matching(status: Any) -> None:
+            end.later(self._declared.call, self._on_heard, status.matching)
+
+        self._declared = _Declared(end)
+        self._publisher: Any = None
+        self._declared.of(lambda session: self._declare(declare(session), on_matching))
+
+    def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
+        self._publisher = publisher
+        publisher.declare_matching_listener(_direct(on_matching))
+        self._heard = publisher.matching_status.matching
+        return publisher
+
+    def _on_heard(self, heard: bool) -> None:
+        if heard != self._heard:
+            self._heard = heard
+        if self._told is not None:
+            self._told(heard)
+
+    @property
+    def heard(self) -> bool:
+        return self._heard
+
+    def put(self, payload: bytes) -> None:
+        self._end.publish(self._publisher, payload)
+
+    def close(self) -> None:
+        self._declared.close()
+
+
+class _Question(Question):
+    def __init__(self, zenoh: Any, query: Any) -> None:
+        self.key = str(query.key_expr)
+        self.payload = b"" if query.payload is None else query.payload.to_bytes()
+        self._query = query
+        self._encoding = zenoh.Encoding.APPLICATION_JSON
+
+    def reply(self, key: str, payload: bytes) -> None:
+        if self._query is not None:
+            _quietly(self._query.reply, key, payload, encoding=self._encoding)
+
+    def close(self) -> None:
+        query, self._query = self._query, None
+        if query is not None:
+            _quietly(query.drop)
+
+
+def _direct(call: Callable[[Any], None]) -> Any:
+    """Have a callback called in the engine's own thread: by default each has a thread."""
+    return _engine().handlers.Callback(call, indirect=False)
+
+
+def _put(session: Any, key: str, payload: bytes, how: dict[str, Any]) -> None:
+    _quietly(session.put, key, payload, **how)
+
+
+def _quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
+    """Do something at the engine; a session that ends meanwhile is no error of the caller's."""
+    try:
+        call(*arguments, **named)
+    except _engine().ZError as exc:
+        logger.debug("the fleet's bus: %s", exc)
+
+
+def _close_late(opening: asyncio.Future[Any]) -> None:
+    """Close a session that came after nobody wanted it any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        threading.Thread(target=opening.result().close, daemon=True).start()
+
+
+def _reason(error: Exception) -> str:
+    """Return what the engine says without its source's places."""
+    return str(error).partition(" at /")[0].strip(" .")

@@ -1,0 +1,119 @@
+"""YAML files of a form of ours, read from a path; a mistake is told with file, line and field."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+from pydantic import BaseModel, ValidationError
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.layout._yamls import MAX_YAML_TEXT, BadYamlError, compose, construct
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+M = TypeVar("M", bound=BaseModel)
+
+_SHOWN = 20  # mistakes that are told at once
+
+
+def read_model(
+    path: str | Path,
+    what: str,
+    kind: type[M],
+    such_as: str,
+    mistake: Callable[[M], tuple[Sequence[int | str], str] | None],
+) -> M:
+    """Read a file.
+
+    Args:
+        path: of the file.
+        what: it is, for errors: ``scenario``.
+        kind: its form.
+        such_as: a field of it.
+        mistake: returns the place in it of what cannot work, and why; None where all is well.
+
+    Raises:
+        ConfigurationError: the file cannot be read or a field of it is wrong; the text names file,
+            line and field.
+        MissingExtraError: PyYAML is not installed.
+    """
+    named = f"{what} {path}"
+    try:
+        with Path(path).open(encoding="utf-8") as stream:
+            text = stream.read(MAX_YAML_TEXT + 1)
+    except (OSError, UnicodeDecodeError) as exc:
+        raise ConfigurationError(f"{named}: {exc}") from exc
+    try:
+        root = compose(text, what=f"a {what} file")
+        if root is not None:
+            _refuse_twice(root, named)
+        data = None if root is None else construct(root)
+    except BadYamlError as exc:
+        line = "" if exc.line is None else f", line {exc.line}"
+        raise ConfigurationError(f"{named}{line}: {exc}") from exc
+    if not isinstance(data, dict):
+        raise ConfigurationError(f"{named}: expected fields such as '{such_as}:'")
+    try:
+        model = kind.model_validate(data)
+    except ValidationError as exc:
+        findings = [
+            (item["loc"], item["msg"].removeprefix("Value error, ")) for item in exc.errors()
+        ]
+        raise ConfigurationError(_texts(named, root, findings)) from exc
+    found = mistake(model)
+    if found is not None:
+        raise ConfigurationError(_texts(named, root, [found]))
+    return model
+
+
+def _texts(named: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]) -> str:
+    texts = [
+        ": ".join([f"line {_line(root, place)}", *_field(place), text])
+        for place, text in itertools.islice(findings, _SHOWN)
+    ]
+    return f"{named}, {'; '.join(texts)}"
+
+
+def _field(place: Sequence[int | str]) -> list[str]:
+    return [".".join(str(part) for part in place)] if place else []
+
+
+def _line(node: Any, loc: Sequence[int | str]) -> int:
+    """Return the line of the deepest node on the way to ``loc`` that is in the file."""
+    for part in loc:
+        found = _child(node, part)  # pydantic's way has the kinds of faults in it, too
+        node = node if found is None else found
+    return int(node.start_mark.line) + 1
+
+
+def _child(node: Any, part: int | str) -> Any:
+    if node.id == "mapping":
+        return next((value for key, value in node.value if key.value == str(part)), None)
+    if node.id == "sequence" and isinstance(part, int) and part < len(node.value):
+        return node.value[part]
+    return None
+
+
+def _refuse_twice(root: Any, named: str) -> None:
+    """Refuse a key that stands twice in one mapping; YAML would take the last in silence."""
+    seen: set[int] = set()  # aliases may make a circle
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen or node.id == "scalar":
+            continue
+        seen.add(id(node))
+        if node.id == "sequence":
+            waiting.extend(node.value)
+            continue
+        keys: set[str] = set()
+        for key, value in cast("list[tuple[Any, Any]]", node.value):
+            if str(key.value) in keys:
+                raise ConfigurationError(
+                    f"{named}, line {key.start_mark.line + 1}: {key.value!r} stands there twice"
+                )
+            keys.add(str(key.value))
+            waiting.append(value)
