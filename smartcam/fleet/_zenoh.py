@@ -262,12 +262,24 @@ class ZenohEnd(Bus):
         how: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
         if len(payload) > LONG:
             how["congestion_control"] = zenoh.CongestionControl.BLOCK
-            if self._sender is None:
-                self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
-            self._sender.submit(_put, session, key, payload, how)
+            self._in_thread(_put, session, key, payload, how)
             return
         how["congestion_control"] = zenoh.CongestionControl.DROP
         _put(session, key, payload, how)
+
+    def _in_thread(self, call: Callable[..., object], *arguments: Any) -> None:
+        """Say something that is long in a thread, which may wait for the engine."""
+        if self._sender is None:
+            self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
+        self._sender.submit(call, *arguments)
+
+    def reply(self, query: Any, replies: list[tuple[str, bytes]]) -> None:
+        """Answer a query, and end it; never waits."""
+        control = self._zenoh.CongestionControl
+        if self._session is not None and sum(len(payload) for _, payload in replies) > LONG:
+            self._in_thread(_reply, self._zenoh, query, replies, control.BLOCK)
+        else:
+            _reply(self._zenoh, query, replies, control.DROP)
 
     def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
         return _Publisher(self, key, on_heard)
@@ -285,7 +297,7 @@ class ZenohEnd(Bus):
 
     def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
         def on_query(query: Any) -> None:
-            self._in_loop(declared.call, 0, answer, _Question(self._zenoh, query))
+            self._in_loop(declared.call, 0, answer, _Question(self, query))
 
         declared = _Declared(self)
         return declared.of(
@@ -454,20 +466,28 @@ class _Publisher(Publisher):
 
 
 class _Question(Question):
-    def __init__(self, zenoh: Any, query: Any) -> None:
+    def __init__(self, end: ZenohEnd, query: Any) -> None:
         self.key = str(query.key_expr)
         self.payload = b"" if query.payload is None else query.payload.to_bytes()
-        self._query = query
-        self._encoding = zenoh.Encoding.APPLICATION_JSON
+        self._end, self._query = end, query
+        self._replies: list[tuple[str, bytes]] = []
 
     def reply(self, key: str, payload: bytes) -> None:
-        if self._query is not None:
-            _quietly(self._query.reply, key, payload, encoding=self._encoding)
+        self._replies.append((key, payload))
 
     def close(self) -> None:
         query, self._query = self._query, None
         if query is not None:
-            _quietly(query.drop)
+            self._end.reply(query, self._replies)
+
+
+def _reply(zenoh: Any, query: Any, replies: list[tuple[str, bytes]], control: Any) -> None:
+    encoding = zenoh.Encoding.APPLICATION_JSON
+    for key, payload in replies:
+        _quietly(
+            query.reply, key, payload, encoding=encoding, congestion_control=control, express=True
+        )
+    _quietly(query.drop)
 
 
 def _direct(call: Callable[[Any], None]) -> Any:
