@@ -72,15 +72,30 @@ async def _trigger(call: Call) -> Answer:
     data = call.blobs[0] if call.blobs else None
     wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
     request = TriggerRequest(Carrier(call.owner, layouts), data, wanted, wait)
-    outcomes = call.host.outcomes
-    runs = outcomes[call.owner] = []
-    try:
-        await call.host.require().trigger_for(
-            request, call.argument("application", int), call.argument("expected", int), call.timeout
-        )
-    finally:
-        del outcomes[call.owner]
+    application, expected = call.argument("application", int), call.argument("expected", int)
+    runs = await outcomes(call.host, call.owner, request, application, expected, call.timeout)
     return {}, [encode_runs(0, call.host.results.following, runs)]
+
+
+async def outcomes(
+    host: Host,
+    owner: Owner,
+    request: TriggerRequest,
+    application: int | None,
+    expected: int | None,
+    timeout: float,
+) -> list[bytes]:
+    """Trigger for somebody, and return the runs that came of it.
+
+    The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is whose trigger it is.
+    """
+    runs: list[bytes] = []
+    host.outcomes[owner] = runs
+    try:
+        await host.require().trigger_for(request, application, expected, timeout)
+    finally:
+        del host.outcomes[owner]
+    return runs
 
 
 async def _switch_application(call: Call) -> Answer:

@@ -5,7 +5,13 @@ from __future__ import annotations
 from typing import Any, cast
 
 import smartcam.exceptions
-from smartcam.exceptions import ConnectionLostError, RemoteProtocolError, SmartCamError
+from smartcam.exceptions import (
+    ConnectionLostError,
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
 from smartcam.models import jsonable
 
 MAX_CHAIN = 8
@@ -55,6 +61,12 @@ _KINDS: dict[str, type[SmartCamError]] = {
     for name in smartcam.exceptions.__all__
     if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
 }
+
+
+def late(said: str, text: str) -> SmartCamError:
+    """Return the error of a call whose time was over before it was done."""
+    kind = TriggerTimeoutError if "trigger" in said.lower() else ResponseTimeoutError
+    return kind(text)
 
 
 def agent_lost(agent: str, doing: str) -> ConnectionLostError:

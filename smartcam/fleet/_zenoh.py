@@ -377,8 +377,9 @@ class ZenohEnd(Bus):
         """Declare something at the engine; it is closed with this end."""
         if self._session is None:
             raise ConfigurationError("the fleet's bus is not open")
+        made = how(self._session)
         self._declared.add(one)
-        return how(self._session)
+        return made
 
     def forget(self, one: _Declared) -> None:
         """It is closed."""
