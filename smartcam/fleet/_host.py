@@ -231,12 +231,13 @@ class Host:
     # ------------------------------------------------------------------ what comes
 
     def _on_status(self, status: Status) -> None:
+        self.topics.on_status(status)
         self._say({"kind": "Status"})
 
     def _on_event(self, event: CameraEvent) -> None:
-        self.topics.on_event(event)
         if isinstance(event, StatusChanged):
             return  # a status tells that
+        self.topics.on_event(event)
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
         self._say({"kind": type(event).__name__, "event": fields})

@@ -199,7 +199,7 @@ class Plain:
             error = ConfigurationError(
                 f"{name}: expected camera_name, the name of a camera, got {camera!r:.80}"
             )
-        if error is not None and not isinstance(camera, str):
+        if error is not None and (not isinstance(camera, str) or not camera):
             _say(question, _Order("", name, service, fields, error).failed(error))
             return
         self._take(question, _Order(str(camera), name, service, fields, error))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from smartcam._client.interpretation import Interpretation
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._reading import result_fields, singles
-from smartcam.models import Connected, Disconnected, Reconnected, Status, jsonable
+from smartcam.models import Connected, Disconnected, Reconnected, Status, StatusChanged, jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -154,6 +154,7 @@ class CameraTopics:
         self.status_out: Publisher | None = None
         self.results_out: Publication | None = None
         self.statuses = self.events = 1
+        self._before: Status | None = None
         self.interpret(host.settings.interpret_as)
 
     def interpret(self, spec: Any) -> None:
@@ -278,6 +279,14 @@ class CameraTopics:
             data = as_json({**self.state(), "number": number, "at": at})
             for one in hearing:
                 one.put(data)
+
+    def on_status(self, status: Status) -> None:
+        """The camera told its status; that it is another one is an event."""
+        before, self._before = self._before, status
+        if status != before:
+            at = datetime.now(UTC)
+            name = self._host.name
+            self.on_event(StatusChanged(camera=name, at=at, status=status, previous=before))
 
     def on_event(self, event: CameraEvent) -> None:
         """An event of the camera's."""

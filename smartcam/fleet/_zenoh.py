@@ -42,6 +42,9 @@ LEASE = 5.0
 LONG = 1 << 16
 """Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
 
+REPLIERS = 4
+"""Threads that answer queries: who asks and does not read holds up one of them."""
+
 MOST_WAITING = 1 << 26
 """Bytes that wait for the event loop; results beyond are dropped, and asked for again later."""
 
@@ -158,7 +161,7 @@ class ZenohEnd(Bus):
         self._lock = threading.Lock()
         self._told_dropped = False
         self._sender: ThreadPoolExecutor | None = None
-        self._sending = 0
+        self._repliers: ThreadPoolExecutor | None = None
 
     # ------------------------------------------------------------------ life
 
@@ -198,10 +201,9 @@ class ZenohEnd(Bus):
             return
         for one in tuple(self._declared):
             one.close()
-        sender, self._sender = self._sender, None
-        if sender is not None:
-            sender.shutdown(wait=False)
-        closing = self._loop.run_in_executor(None, session.close)
+        threads = [one for one in (self._sender, self._repliers) if one is not None]
+        self._sender = self._repliers = None
+        closing = self._loop.run_in_executor(None, _end, session, threads)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.shield(closing)
@@ -262,24 +264,24 @@ class ZenohEnd(Bus):
         how: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
         if len(payload) > LONG:
             how["congestion_control"] = zenoh.CongestionControl.BLOCK
-            self._in_thread(_put, session, key, payload, how)
+            if self._sender is None:
+                self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
+            self._sender.submit(_put, session, key, payload, how)
             return
         how["congestion_control"] = zenoh.CongestionControl.DROP
         _put(session, key, payload, how)
 
-    def _in_thread(self, call: Callable[..., object], *arguments: Any) -> None:
-        """Say something that is long in a thread, which may wait for the engine."""
-        if self._sender is None:
-            self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
-        self._sender.submit(call, *arguments)
-
     def reply(self, query: Any, replies: list[tuple[str, bytes]]) -> None:
-        """Answer a query, and end it; never waits."""
-        control = self._zenoh.CongestionControl
-        if self._session is not None and sum(len(payload) for _, payload in replies) > LONG:
-            self._in_thread(_reply, self._zenoh, query, replies, control.BLOCK)
-        else:
-            _reply(self._zenoh, query, replies, control.DROP)
+        """Answer a query, and end it; never waits.
+
+        The engine may wait for who has asked, as that one has said in the query; so threads do it.
+        """
+        if self._session is None or not replies:
+            _quietly(query.drop)
+            return
+        if self._repliers is None:
+            self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
+        self._repliers.submit(_reply, query, replies, self._zenoh.Encoding.APPLICATION_JSON)
 
     def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
         return _Publisher(self, key, on_heard)
@@ -482,13 +484,17 @@ class _Question(Question):
             self._end.reply(query, self._replies)
 
 
-def _reply(zenoh: Any, query: Any, replies: list[tuple[str, bytes]], control: Any) -> None:
-    encoding = zenoh.Encoding.APPLICATION_JSON
+def _reply(query: Any, replies: list[tuple[str, bytes]], encoding: Any) -> None:
     for key, payload in replies:
-        _quietly(
-            query.reply, key, payload, encoding=encoding, congestion_control=control, express=True
-        )
+        _quietly(query.reply, key, payload, encoding=encoding, express=True)
     _quietly(query.drop)
+
+
+def _end(session: Any, threads: list[ThreadPoolExecutor]) -> None:
+    """Say what is to be said yet, then end the session."""
+    for one in threads:
+        one.shutdown()
+    session.close()
 
 
 def _direct(call: Callable[[Any], None]) -> Any:
