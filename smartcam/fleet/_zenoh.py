@@ -45,6 +45,9 @@ LONG = 1 << 16
 REPLIERS = 4
 """Threads that answer queries: who asks and does not read holds up one of them."""
 
+MOST_REPLYING = 4096
+"""Queries whose answers wait for these threads; one beyond gets none."""
+
 MOST_WAITING = 1 << 26
 """Bytes that wait for the event loop; results beyond are dropped, and asked for again later."""
 
@@ -162,6 +165,7 @@ class ZenohEnd(Bus):
         self._told_dropped = False
         self._sender: ThreadPoolExecutor | None = None
         self._repliers: ThreadPoolExecutor | None = None
+        self._replying = 0
 
     # ------------------------------------------------------------------ life
 
@@ -276,12 +280,19 @@ class ZenohEnd(Bus):
 
         The engine may wait for who has asked, as that one has said in the query; so threads do it.
         """
-        if self._session is None or not replies:
+        if self._session is None or not replies or self._replying >= MOST_REPLYING:
             _quietly(query.drop)
             return
         if self._repliers is None:
             self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
-        self._repliers.submit(_reply, query, replies, self._zenoh.Encoding.APPLICATION_JSON)
+        with self._lock:
+            self._replying += 1
+        encoding = self._zenoh.Encoding.APPLICATION_JSON
+        self._repliers.submit(_reply, query, replies, encoding).add_done_callback(self._replied)
+
+    def _replied(self, _: object) -> None:
+        with self._lock:
+            self._replying -= 1
 
     def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
         return _Publisher(self, key, on_heard)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._bus import Bus
 
-ROOT = "smartcam/plant"
+PREFIX = "smartcam/plant"
 NAME = "line1/cam3"
 PATIENCE = 30.0
 """Seconds; only what has gone wrong takes as long."""
@@ -32,8 +32,8 @@ LAYOUT = "n: int32"
 
 def applications() -> list[Application]:
     """Return a counter from 1, one that sends two texts, and one that sends nothing."""
-    counts = [{"n": number} for number in range(1, 100)]
-    texts = [{"text": "bolt"}, {"text": ""}]
+    counts: list[Any] = [{"n": number} for number in range(1, 100)]
+    texts: list[Any] = [{"text": "bolt"}, {"text": ""}]
     return [
         Application(id=COUNTER, layout=LAYOUT, cycle=counts, processing_time=0.01, load_time=0.05),
         Application(id=TEXTS, layout="(text: string[50])*", constant=texts, load_time=0.05),
@@ -53,8 +53,8 @@ class Client:
     async def ask(self, key: str, request: object = None) -> list[tuple[str, dict[str, Any]]]:
         """Return what all answer, by key."""
         payload = request if isinstance(request, bytes) else json.dumps(request).encode()
-        answers = await self.ask_raw(f"{ROOT}/{key}", b"" if request is None else payload)
-        return [(key.removeprefix(f"{ROOT}/"), json.loads(said)) for key, said in answers]
+        answers = await self.ask_raw(f"{PREFIX}/{key}", b"" if request is None else payload)
+        return [(key.removeprefix(f"{PREFIX}/"), json.loads(said)) for key, said in answers]
 
     async def call(self, name: str, camera: str = NAME, **request: Any) -> dict[str, Any]:
         """Return the one answer of a service."""
@@ -72,7 +72,7 @@ class Client:
     async def topic(self, pattern: str) -> Heard:
         """Subscribe; what is said from now on is heard."""
         heard = Heard()
-        self.hear(f"{ROOT}/{pattern}", heard.take)
+        self.hear(f"{PREFIX}/{pattern}", heard.take)
         await self.call("status")  # the agent has seen the subscription before it answers
         return heard
 
@@ -84,7 +84,7 @@ class Heard:
         self._came: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue()
 
     def take(self, key: str, payload: bytes) -> None:
-        self._came.put_nowait((key.removeprefix(f"{ROOT}/"), json.loads(payload)))
+        self._came.put_nowait((key.removeprefix(f"{PREFIX}/"), json.loads(payload)))
 
     async def next(self) -> tuple[str, dict[str, Any]]:
         """Return the next one with its key."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import struct
+import sys
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 import smartcam.fleet
 from smartcam.emulator import EmulatedCamera
 from smartcam.fleet._bus import MemoryBus
+from tests import ROOT
 from tests.fleet.plainkit import (
     COUNTER,
     LAYOUT,
@@ -166,7 +169,12 @@ async def test_nothing_is_made_as_long_as_nobody_subscribes(
     async with plant() as place:
         topics = place.server.hosts[NAME].topics
         result = topics.result
-        monkeypatch.setattr(topics, "result", lambda run: made.append("result") or result(run))
+
+        def counted(run: Any) -> dict[str, Any]:
+            made.append("result")
+            return result(run)
+
+        monkeypatch.setattr(topics, "result", counted)
         await place.client.call("trigger")
         elsewhere = await place.client.topic("topic/results/line2/*")
         await place.client.call("trigger")
@@ -264,3 +272,33 @@ async def test_each_agent_answers_for_its_own_cameras_and_one_for_those_that_nob
             assert "has no camera 'line/c'" in nobody["error"]
             assert nobody["kind"] == "ConfigurationError"
             await end.close()
+
+
+# ---------------------------------------------------------------------- the example
+
+EXAMPLE = ROOT / "examples" / "plain-zenoh" / "plain_zenoh.py"
+
+
+@pytest.mark.real_time
+async def test_example_lists_triggers_and_hears_a_camera() -> None:
+    async with plant() as place:
+        endpoint = f"tcp/127.0.0.1:{place.server.address.port}"
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, str(EXAMPLE), endpoint, stdout=asyncio.subprocess.PIPE
+        )
+        async with asyncio.timeout(PATIENCE):
+            printed, _ = await process.communicate()
+        assert printed.decode().splitlines() == [
+            f"smartcam/plant/cameras/{NAME} ['RUNNING', 'WAITING_FOR_TRIGGER']",
+            "{'n': 1}",
+            "1",
+        ]
+        assert process.returncode == 0
+
+
+def test_example_is_short_and_stands_on_the_page() -> None:
+    source = EXAMPLE.read_text(encoding="utf-8")
+    assert len(source.splitlines()) < 30
+    assert "smartcam" not in re.findall(r"^import (\w+)", source, re.MULTILINE)
+    function = source[source.index("def use") : source.index("\n\n\nif __name__")]
+    assert function in (ROOT / "docs" / "bus.md").read_text(encoding="utf-8")

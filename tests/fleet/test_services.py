@@ -288,7 +288,12 @@ async def test_setup_of_a_camera_that_is_there(name: str) -> None:
         assert (said["camera"], said["application"]) == (NAME, LOCALIZATIONS)
         answer = await place.client.thesis(name, con_address="10.9.9.9")
         assert f"it is at bvs://127.0.0.1:{place.camera.port}" in answer["error"]
-        for wrong in ({"interpret_as": "nonsense"}, {"topic_status": "a b"}, {"port": []}):
+        wrongs: list[dict[str, Any]] = [
+            {"interpret_as": "nonsense"},
+            {"topic_status": "a b"},
+            {"port": []},
+        ]
+        for wrong in wrongs:
             assert (await place.client.thesis(name, **wrong))["kind"]
 
 
