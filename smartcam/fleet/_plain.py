@@ -26,9 +26,9 @@ from smartcam.exceptions import (
 from smartcam.fleet._address import check_name
 from smartcam.fleet._keys import meets
 from smartcam.fleet._reading import failure
-from smartcam.fleet._services import SERVICES, UNKNOWN, Request, Service, Work
+from smartcam.fleet._services import SERVICES, UNKNOWN, PlainRequest, Service, Work
 from smartcam.fleet._shared import Owner
-from smartcam.fleet._thesis import SETUP, STOP, THESIS, Setup
+from smartcam.fleet._thesis import SETUP, STOP, THESIS, ThesisSetup
 from smartcam.fleet._topics import Topics, as_json
 from smartcam.settings import validated
 
@@ -97,14 +97,14 @@ class _Order(NamedTuple):
         """Return the answer for an error."""
         return {**failure(error), **self.service.nothing}
 
-    def what(self, request: Request) -> object:
+    def what(self, request: PlainRequest) -> object:
         """Return what is to be done, to know the same call again."""
         same = request.model_copy(update={"timeout": None, "epoch": None})
         return self.camera, self.service, same
 
 
 @dataclass(eq=False)
-class _Call:
+class _PlainCall:
     """A call, under way or done.
 
     Attributes:
@@ -137,7 +137,9 @@ class Plain:
         self._program = agent.next_program()
         self._numbers = 0
         self._under_way: collections.Counter[str] = collections.Counter()
-        self._known: collections.OrderedDict[tuple[str, str], _Call] = collections.OrderedDict()
+        self._known: collections.OrderedDict[tuple[str, str], _PlainCall] = (
+            collections.OrderedDict()
+        )
         self._known_bytes = 0
         self._added: set[str] = set()
 
@@ -298,7 +300,7 @@ class Plain:
             return
         if call is None:
             if not self._is_full(question, order):
-                call = _Call(order.what(request), [question])
+                call = _PlainCall(order.what(request), [question])
                 if request.id is not None:
                     self._remember(request, call)
                 self._start(self._do(order, request, call), order)
@@ -308,7 +310,7 @@ class Plain:
             question.reply(question.key, call.answer)
             question.close()
 
-    def _known_call(self, order: _Order, request: Request) -> _Call | None:
+    def _known_call(self, order: _Order, request: PlainRequest) -> _PlainCall | None:
         known = self._known.get((request.program, str(request.id)))
         if known is not None and known.what != order.what(request):
             raise LocalProtocolError(
@@ -316,7 +318,7 @@ class Plain:
             )
         return known
 
-    def _remember(self, request: Request, call: _Call) -> None:
+    def _remember(self, request: PlainRequest, call: _PlainCall) -> None:
         self._known[request.program, str(request.id)] = call
 
     def _forget_old(self) -> None:
@@ -330,7 +332,7 @@ class Plain:
                 self._known_bytes -= len(answer)
                 del known[key]
 
-    async def _do(self, order: _Order, request: Request, call: _Call) -> None:
+    async def _do(self, order: _Order, request: PlainRequest, call: _PlainCall) -> None:
         """Do a call, and answer all who asked for it."""
         name = order.name
         answer: dict[str, Any] = {}
@@ -356,7 +358,7 @@ class Plain:
                 self._known_bytes += len(call.answer)
                 self._forget_old()
 
-    async def _bounded(self, order: _Order, request: Request) -> dict[str, Any]:
+    async def _bounded(self, order: _Order, request: PlainRequest) -> dict[str, Any]:
         """Do a call within its time.
 
         Raises:
@@ -383,7 +385,7 @@ class Plain:
             ) from exc
 
     async def _serve(
-        self, order: _Order, request: Request, host: Host, deadline: float
+        self, order: _Order, request: PlainRequest, host: Host, deadline: float
     ) -> dict[str, Any]:
         service, loop = order.service, asyncio.get_running_loop()
         self._numbers += 1
@@ -402,14 +404,14 @@ class Plain:
 
     # ------------------------------------------------------------------ cameras that Setup adds
 
-    async def _host(self, order: _Order, request: Request) -> Host:
+    async def _host(self, order: _Order, request: PlainRequest) -> Host:
         """Return the camera; Setup adds one that nobody has."""
         host = self._agent.hosts.get(order.camera)
         if host is not None:
-            if isinstance(request, Setup):
+            if isinstance(request, ThesisSetup):
                 await host.tried(FIRST_TRY)
             return host
-        if not isinstance(request, Setup):
+        if not isinstance(request, ThesisSetup):
             raise ConnectionClosedError(f"{order.camera}: the camera was stopped meanwhile")
         if len(self._added) >= MOST_ADDED:
             raise LocalProtocolError(f"{order.camera}: Setup has added {MOST_ADDED} cameras")

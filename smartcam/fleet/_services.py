@@ -59,7 +59,7 @@ Text = Annotated[str, Field(max_length=200)]
 Interpret = Annotated[str, Field(max_length=10_000)]
 
 
-class Request(BaseModel):
+class PlainRequest(BaseModel):
     """What every request may say."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -70,7 +70,7 @@ class Request(BaseModel):
     epoch: Text | None = None
 
 
-class _Trigger(Request):
+class _PlainTrigger(PlainRequest):
     application: Number | None = None
     input: Hex | None = None
     results_per_trigger: Annotated[int, Field(ge=1, le=MOST_RESULTS)] | None = None
@@ -78,23 +78,23 @@ class _Trigger(Request):
     interpret_as: Interpret | None = None
 
 
-class _Switch(Request):
+class _PlainSwitch(PlainRequest):
     application: Number | Text
 
 
-class _Input(Request):
+class _PlainInput(PlainRequest):
     input: Hex
 
 
-class _SequenceNumber(Request):
+class _PlainNumber(PlainRequest):
     number: Number
 
 
-class _SetClock(Request):
+class _PlainClock(PlainRequest):
     when: Annotated[Text, AfterValidator(_time)]
 
 
-class _Results(Request):
+class _PlainResults(PlainRequest):
     first: Annotated[int, Field(ge=1)] | None = None
     most: Annotated[int, Field(ge=1, le=MOST_RESULTS)] = 100
 
@@ -128,7 +128,7 @@ class Service(NamedTuple):
         nothing: what its answer has beside an error.
     """
 
-    request: type[Request]
+    request: type[PlainRequest]
     do: Callable[[Work], Awaitable[dict[str, Any]]]
     command: bool = True
     timeout: float = DEFAULT_TIMEOUT
@@ -212,32 +212,32 @@ async def _unknown(work: Work) -> dict[str, Any]:
     raise UnsupportedError(f"{work.host.name}: there is no such service")
 
 
-UNKNOWN = Service(Request, _unknown)
+UNKNOWN = Service(PlainRequest, _unknown)
 """In place of a service that is not there."""
 
-_OF_ALL = {*Request.model_fields}
+_OF_ALL = {*PlainRequest.model_fields}
 
-_REQUESTS: dict[str, type[Request]] = {
-    "switch_application": _Switch,
-    "start": Request,
-    "stop": Request,
-    "reset_errors": Request,
-    "set_input": _Input,
-    "set_sequence_number": _SequenceNumber,
-    "set_clock": _SetClock,
-    "reboot": Request,
-    "query_status": Request,
-    "query_application": Request,
-    "wait_ready": Request,
-    "get_clock": Request,
-    "read_image": Request,
+_REQUESTS: dict[str, type[PlainRequest]] = {
+    "switch_application": _PlainSwitch,
+    "start": PlainRequest,
+    "stop": PlainRequest,
+    "reset_errors": PlainRequest,
+    "set_input": _PlainInput,
+    "set_sequence_number": _PlainNumber,
+    "set_clock": _PlainClock,
+    "reboot": PlainRequest,
+    "query_status": PlainRequest,
+    "query_application": PlainRequest,
+    "wait_ready": PlainRequest,
+    "get_clock": PlainRequest,
+    "read_image": PlainRequest,
 }
 """What the services take that do the same as a call of smartcam's own programs."""
 
 SERVICES: dict[str, Service] = {
-    "trigger": Service(_Trigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
-    "status": Service(Request, _status, command=False),
-    "results": Service(_Results, _results, command=False),
+    "trigger": Service(_PlainTrigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
+    "status": Service(PlainRequest, _status, command=False),
+    "results": Service(_PlainResults, _results, command=False),
     **{do: Service(kind, _same(do), do in COMMANDS) for do, kind in _REQUESTS.items()},
 }
 """The plain services by name."""

@@ -19,7 +19,7 @@ from smartcam.fleet._services import (
     MOST_TIMEOUT,
     Interpret,
     Number,
-    Request,
+    PlainRequest,
     Service,
     Text,
     Work,
@@ -49,14 +49,14 @@ def _topic(text: str) -> str:
 Topic = Annotated[Text, AfterValidator(_topic)]
 
 
-class OfThesis(Request):
+class ThesisRequest(PlainRequest):
     """What every request of the thesis' may say."""
 
     camera_name: Annotated[str, Field(min_length=1, max_length=200)]
     timeout: Annotated[float, Field(ge=0, le=MOST_TIMEOUT, allow_inf_nan=False)] | None = None
 
 
-class Setup(OfThesis):
+class ThesisSetup(ThesisRequest):
     """A camera's address, and what is to be had of it."""
 
     camera_model_name: Text = ""
@@ -102,23 +102,23 @@ class Setup(OfThesis):
         return _KEYWORDS.get(said.lower(), said) or None
 
 
-class _Publishing(OfThesis):
+class _ThesisPublishing(ThesisRequest):
     topic_for_outputs: Topic = ""
     min_delay: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = 0.0
     queue_size: Annotated[int, Field(ge=0, le=10_000)] = 0
 
 
-class _Application(OfThesis):
+class _ThesisApplication(ThesisRequest):
     application_id: Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
 
 
-class _Trigger(OfThesis):
+class _ThesisTrigger(ThesisRequest):
     application_id: Number = 0
 
 
 async def _setup(work: Work) -> dict[str, Any]:
     """Set up a camera that is there already."""
-    request: Setup = work.request
+    request: ThesisSetup = work.request
     host, topics = work.host, work.topics
     if request.con_address:
         wanted, has = request.address(), host.settings.address
@@ -139,7 +139,7 @@ async def _setup(work: Work) -> dict[str, Any]:
 
 
 async def _enable_publishing(work: Work) -> dict[str, Any]:
-    request: _Publishing = work.request
+    request: _ThesisPublishing = work.request
     return {
         "topic": work.topics.publish_results(
             request.topic_for_outputs, request.min_delay, request.queue_size or DEFAULT_QUEUE
@@ -186,21 +186,21 @@ def _with_poses(spec: Any, application: int) -> Any:
     return "localizations" if own is None or without_poses(resolve(own)) is not None else own
 
 
-SETUP = Service(Setup, _setup)
-STOP = Service(OfThesis, _stop)
+SETUP = Service(ThesisSetup, _setup)
+STOP = Service(ThesisRequest, _stop)
 
 THESIS: dict[str, Service] = {
     "SmartcameraSetup": SETUP,
     "Setup": SETUP,
     "SmartcameraStop": STOP,
     "Stop": STOP,
-    "EnablePublishing": Service(_Publishing, _enable_publishing, command=False),
-    "ChangeApplication": Service(_Application, _change_application),
+    "EnablePublishing": Service(_ThesisPublishing, _enable_publishing, command=False),
+    "ChangeApplication": Service(_ThesisApplication, _change_application),
     "Trigger50ByteString": Service(
-        _Trigger, _trigger_strings, timeout=DEFAULT_TRIGGER_TIMEOUT, nothing={"strings": []}
+        _ThesisTrigger, _trigger_strings, timeout=DEFAULT_TRIGGER_TIMEOUT, nothing={"strings": []}
     ),
     "TriggerLocalization": Service(
-        _Trigger,
+        _ThesisTrigger,
         _trigger_localizations,
         timeout=DEFAULT_TRIGGER_TIMEOUT,
         nothing={"localizations": []},
