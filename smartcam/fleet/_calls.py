@@ -75,14 +75,29 @@ async def _trigger(call: Call) -> Answer:
     carrier = Carrier(call.owner, layouts, by_application=each)
     expected = call.argument("expected", int)
     request = TriggerRequest(carrier, data, wanted, wait, expected)
-    outcomes = call.host.outcomes
-    runs = outcomes[call.owner] = []
-    try:
-        application = call.argument("application", int)
-        await call.host.require().trigger_for(request, application, call.timeout)
-    finally:
-        del outcomes[call.owner]
+    application = call.argument("application", int)
+    runs = await outcomes(call.host, call.owner, request, application, call.timeout)
     return {}, [encode_runs(0, call.host.results.following, runs)]
+
+
+async def outcomes(
+    host: Host,
+    owner: Owner,
+    request: TriggerRequest,
+    application: int | None,
+    timeout: float,
+) -> list[bytes]:
+    """Trigger for somebody, and return the runs that came of it.
+
+    The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is whose trigger it is.
+    """
+    runs: list[bytes] = []
+    host.outcomes[owner] = runs
+    try:
+        await host.require().trigger_for(request, application, timeout)
+    finally:
+        del host.outcomes[owner]
+    return runs
 
 
 async def _switch_application(call: Call) -> Answer:

@@ -392,7 +392,9 @@ class FleetCamera(Camera[ValueT]):
         error = from_fields(said["error"])
         if isinstance(error, LinkError) and not isinstance(error, ConnectFailedError):
             return error
-        lost = ConnectionLostError(f"{self.name}: the agent has no session with the camera: {error}")
+        lost = ConnectionLostError(
+            f"{self.name}: the agent has no session with the camera: {error}"
+        )
         lost.__cause__ = error
         return lost
 

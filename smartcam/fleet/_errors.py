@@ -5,7 +5,12 @@ from __future__ import annotations
 from typing import Any, cast
 
 import smartcam.exceptions
-from smartcam.exceptions import RemoteProtocolError, SmartCamError
+from smartcam.exceptions import (
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
 from smartcam.models import jsonable
 
 MAX_CHAIN = 8
@@ -54,7 +59,7 @@ def _meant(value: Any) -> Any:
     if isinstance(value, dict):
         said = cast("dict[str, Any]", value)
         if said.keys() == {"tuple"} and isinstance(said["tuple"], list):
-            return tuple(cast("list[Any]", said["tuple"]))
+            return tuple(said["tuple"])
     return cast("object", value)
 
 
@@ -64,3 +69,8 @@ _KINDS: dict[str, type[SmartCamError]] = {
     if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
 }
 
+
+def late(said: str, text: str) -> SmartCamError:
+    """Return the error of a call whose time was over before it was done."""
+    kind = TriggerTimeoutError if "trigger" in said.lower() else ResponseTimeoutError
+    return kind(text)

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam._client.interpretation import Interpretation
 from smartcam.exceptions import ConnectionLostError, SmartCamError
-from smartcam.fleet._errors import to_fields
+from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._gate import Gate
 from smartcam.fleet._log import Log
 from smartcam.fleet._shared import SharedCamera, Tap
+from smartcam.fleet._topics import CameraTopics
 from smartcam.fleet._wire import (
     CURRENT,
     LATE,
@@ -25,11 +26,12 @@ from smartcam.fleet._wire import (
 from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import AsyncGenerator, Sequence
 
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._keys import Keys
     from smartcam.fleet._shared import Carried, Owner
+    from smartcam.fleet._topics import Topics
     from smartcam.models import CameraEvent, Result, Status
     from smartcam.settings import CameraSettings
 
@@ -50,12 +52,14 @@ class Host:
         keys: of the fleet.
         epoch: of the agent.
         history: results that are kept, and their bytes.
+        topics: where it is said in JSON.
 
     Attributes:
         gate: whose commands may pass.
         results: the last results.
         states: the last things that happened.
         outcomes: the runs of triggers under way, by whose they are; for who has put a list there.
+        topics: says in JSON what comes, for other programs.
         failure: why there is no session yet, None where there is or was one.
     """
 
@@ -67,6 +71,7 @@ class Host:
         keys: Keys,
         epoch: int,
         history: tuple[int, int],
+        topics: Topics,
     ) -> None:
         self.name = name
         self.settings = settings
@@ -77,6 +82,7 @@ class Host:
         self.failure: SmartCamError | None = None
         self._epoch = epoch
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
+        self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make()
         self._states_out: Publisher = bus.publisher(keys.states(name))
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
@@ -96,6 +102,17 @@ class Host:
     def connected(self) -> bool:
         """Whether there is a session."""
         return self._camera.connected
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers that what is said next has."""
+        topics = self.topics
+        return self.results.following, self.states.following, topics.statuses, topics.events
+
+    @numbers.setter
+    def numbers(self, numbers: tuple[int, ...]) -> None:
+        topics = self.topics
+        self.results.following, self.states.following, topics.statuses, topics.events = numbers
 
     def _make(self) -> SharedCamera:
         tap = Tap(self._on_results, self._on_status, self._on_event, self._on_end)
@@ -140,6 +157,7 @@ class Host:
             self._reminder.cancel()
         self._states_out.close()
         self._results_out.close()
+        self.topics.close()
 
     def _fail(self, error: BaseException) -> None:
         if not isinstance(error, SmartCamError):
@@ -160,6 +178,25 @@ class Host:
                 f"{self.name}: the agent has no session with the camera: {why}"
             ) from self.failure
         return self._camera
+
+    @contextlib.asynccontextmanager
+    async def turn(self, program: str, said: str, timeout: float) -> AsyncGenerator[None]:
+        """A command of ``program`` has its turn as long as the body runs.
+
+        Raises:
+            ResponseTimeoutError, TriggerTimeoutError: another program has reserved the camera for
+                ``timeout`` seconds more.
+        """
+        async with contextlib.AsyncExitStack() as stack:
+            try:
+                await stack.enter_async_context(self.gate.command(program, timeout))
+            except TimeoutError as exc:
+                raise late(
+                    said,
+                    f"{self.name}: reserved by {self.gate.holder}, which did not let go within "
+                    f"{timeout:.3g} s; {said} was not done",
+                ) from exc
+            yield
 
     # ------------------------------------------------------------------ what the camera is
 
@@ -203,11 +240,13 @@ class Host:
     # ------------------------------------------------------------------ what comes
 
     def _on_status(self, status: Status) -> None:
+        self.topics.on_status(status)
         self._say({"kind": "Status"})
 
     def _on_event(self, event: CameraEvent) -> None:
         if isinstance(event, StatusChanged):
             return  # a status tells that
+        self.topics.on_event(event)
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
         said: dict[str, Any] = {"kind": type(event).__name__, "event": fields}
@@ -228,6 +267,7 @@ class Host:
         self.states.add(1, clock, data)
         self._fresh_states.append(data)
         self._flush_soon()
+        self.topics.on_state()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
         """Keep results that came together, and say them at the end of this turn of the loop."""
@@ -257,6 +297,7 @@ class Host:
         if self._results_out.heard:
             self._fresh.append(data)
             self._flush_soon()
+        self.topics.on_run(run)
 
     def _flush_soon(self) -> None:
         if not self._flushing:

@@ -8,7 +8,6 @@ import json
 import logging
 import math
 import weakref
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.listeners import Listeners
@@ -19,9 +18,9 @@ from smartcam.exceptions import (
     WrongApplicationError,
 )
 from smartcam.fleet._log import Feed
+from smartcam.fleet._reading import as_result, interpreted, singles
 from smartcam.fleet._wire import CURRENT, LATE, Batch, Message, Run, decode, decode_runs
 from smartcam.models import Result
-from smartcam.protocols.messages import ResultContainer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -382,10 +381,7 @@ class Receiver:
                 return
             if listeners.streams_results and self._take_burst(run, now):
                 return
-            for place in range(len(run.payloads)):
-                one = replace(
-                    run, number=run.number + place, payloads=run.payloads[place : place + 1]
-                )
+            for one in singles(run):
                 fate = "late" if run.flags & LATE else "streamed"
                 try:
                     outcome: Result | InterpretationError = self._interpret(
@@ -437,32 +433,10 @@ class Receiver:
         return True
 
     def _interpret(self, run: Run, interpretation: Interpretation) -> Result:
-        cells = fault = None
-        if run.cells:
-            said: dict[str, Any] = json.loads(run.cells)
-            fault, given = said.get("fault"), said.get("cells")
-            cells = None if given is None else tuple(given)
-        (data,) = run.payloads
-        container = ResultContainer(
-            application=run.application, data=data, cells=cells, fault=fault
-        )
-        at = run.received_at
-        value, sequence, empty_slots = interpretation(
-            container, run.endian, camera=self._name, number=run.number, at=at
-        )
+        value, sequence, empty_slots = interpreted(run, interpretation, self._name)
         if empty_slots:
             self._counters.skip(empty_slots)
-        return Result(
-            self._name,
-            run.application,
-            sequence,
-            run.number,
-            run.trigger_time,
-            at,
-            None if math.isnan(run.latency) else run.latency,
-            data,
-            value,
-        )
+        return as_result(run, self._name, value, sequence)
 
     def _wrong_application(self, run: Run, expected: int) -> WrongApplicationError:
         return WrongApplicationError(

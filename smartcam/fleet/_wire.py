@@ -25,8 +25,11 @@ MAX_MESSAGE = 1 << 26
 
 
 def grace(timeout: float) -> float:
-    """Return the seconds for which a reply is awaited beyond a call's own, so that the agent gives
-    up first. Half of it may go by until the call is there; then it has all its time."""
+    """Return the seconds for which a reply is awaited beyond a call's own.
+
+    So the agent gives up first. Half of it may go by until the call is there; then the call has
+    all its time.
+    """
     return min(0.25, 0.02 + 0.1 * timeout)
 
 

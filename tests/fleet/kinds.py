@@ -1,4 +1,4 @@
-"""Kinds of cameras: at the wire, and of a fleet over either bus; each made as ``connect()`` does."""
+"""Kinds of cameras: at the wire, and of a fleet over either bus; made as ``connect()`` does."""
 
 from __future__ import annotations
 
@@ -35,7 +35,11 @@ class OwnAgentCamera(FleetCamera[Any]):
     """A camera of a fleet whose agent begins and ends with it."""
 
     def __init__(
-        self, url: str, ends: tuple[Bus, Bus], options: dict[str, Any], observers: Iterable[Observer]
+        self,
+        url: str,
+        ends: tuple[Bus, Bus],
+        options: dict[str, Any],
+        observers: Iterable[Observer],
     ) -> None:
         name = "line1/cam1"
         theirs = {key: value for key, value in options.items() if key in AGENTS}
@@ -44,7 +48,10 @@ class OwnAgentCamera(FleetCamera[Any]):
         address = Address("fleet", "fleet", "localhost", 7447, path=name)
         own = {key: value for key, value in options.items() if key not in {"max_length", "restore"}}
         super().__init__(
-            CameraSettings.of(address, own), name, Program(ends[1], FLEET, name), observers=observers
+            CameraSettings.of(address, own),
+            name,
+            Program(ends[1], FLEET, name),
+            observers=observers,
         )
 
     async def attend(self, timeout: float) -> None:
