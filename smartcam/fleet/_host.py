@@ -26,7 +26,7 @@ from smartcam.fleet._wire import (
     encode_runs,
     timestamp,
 )
-from smartcam.models import StatusChanged, jsonable
+from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -200,7 +200,9 @@ class Host:
             return  # a status tells that
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
-        self._say({"kind": type(event).__name__, "event": fields})
+        # who said hello before there was a session does not know what the camera can do
+        about = self.about() if isinstance(event, (Connected, Reconnected)) else {}
+        self._say({**about, "kind": type(event).__name__, "event": fields})
 
     def _say(self, fields: dict[str, Any]) -> None:
         """Say what happened, and what the camera is now."""
