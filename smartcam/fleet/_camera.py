@@ -51,9 +51,6 @@ if TYPE_CHECKING:
 REACH_TIMEOUT = 0.5
 """Seconds that what was said before a reply is waited for; it comes before, unless it was lost."""
 
-ABOUT = {"protocol_version", "capabilities"}
-"""What a session tells of the camera beside its state."""
-
 
 class FleetCamera(Camera[ValueT]):
     """A camera that an agent of a fleet shares with other programs.
@@ -380,7 +377,6 @@ class FleetCamera(Camera[ValueT]):
 
     def _begin_session(self, said: dict[str, Any], at: datetime) -> None:
         self._linked, self._trouble = True, None
-        self._hello.update({key: said[key] for key in ABOUT & said.keys()})
         self._counters.begin(self._wire if not self._sessions else Counters())
         self._sessions += 1
         event = Connected if self._sessions == 1 else Reconnected

@@ -25,7 +25,7 @@ from smartcam.fleet._wire import (
     encode_runs,
     timestamp,
 )
-from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
+from smartcam.models import StatusChanged, jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -199,9 +199,7 @@ class Host:
             return  # a status tells that
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
-        # who said hello before there was a session does not know what the camera can do
-        about = self.about() if isinstance(event, (Connected, Reconnected)) else {}
-        self._say({**about, "kind": type(event).__name__, "event": fields})
+        self._say({"kind": type(event).__name__, "event": fields})
 
     def _say(self, fields: dict[str, Any]) -> None:
         """Say what happened, and what the camera is now."""
