@@ -488,6 +488,19 @@ async def test_events_begin_before_the_fleet_is_opened() -> None:
     assert {(one.fleet, one.agent) for one in got} == {("plant", "first")}
 
 
+async def test_camera_can_be_waited_for_as_soon_as_it_has_joined() -> None:
+    bus = MemoryBus()
+    async with fleet_on(bus) as fleet:
+        events = fleet.events()
+        async with agent(bus, "one", "a"):
+            async for event in events:
+                if isinstance(event, CameraJoined):
+                    break
+            assert not fleet["a"].connected
+            await fleet["a"].wait_connected()
+            assert fleet["a"].connected
+
+
 async def test_agent_that_is_cut_off_has_left_and_comes_back() -> None:
     bus = MemoryBus()
     end = bus.end()
