@@ -2,8 +2,8 @@
 
 ``python`` blocks run as scripts of their own. ``console`` blocks run line by line, each block with
 an emulator of its own unless it starts one; what they show must be what is printed, numbers aside.
-A block of any language whose first line is ``# NAME.EXTENSION`` is a file, which the page's other
-blocks find in their folder.
+A block of any language whose first line is ``# NAME.EXTENSION`` is a file, which the page's
+``console`` blocks find in their folder.
 """
 
 from __future__ import annotations

@@ -457,6 +457,7 @@ async def test_events_tell_who_is_there_and_who_comes_and_goes() -> None:
             await until(lambda: len(fleet) == 3)
             late = fleet.events()
             assert fleet.agents() == ["one", "two"]
+            assert fleet.agents("b") == ["two"]
         await until(lambda: len(fleet) == 1)
         assert fleet.agents() == ["one"]
     left = [("CameraLeft", "two", "b"), ("CameraLeft", "two", "c"), ("AgentLeft", "two")]
