@@ -138,7 +138,7 @@ def test_address_of_the_fleet_is_no_cameras() -> None:
 
 
 def test_where_a_wire_is_wanted_it_says_so() -> None:
-    with pytest.raises(UnsupportedError, match="agent of a fleet shares"):
+    with pytest.raises(UnsupportedError, match="of a fleet"):
         parse_address("fleet://localhost/line1/cam3")
 
 

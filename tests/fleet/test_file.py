@@ -174,7 +174,7 @@ URL = "url: bvs://192.168.0.10\n    "
         (camera("application: 7"), ", line 3: cameras.line1/cam3: .*url or emulated, got neither"),
         (camera(f"{URL}emulated: {{}}"), ", line 3: .*cam3: .*url or emulated, got both"),
         (camera("url: bvz://h"), ", line 3: .*cam3.url: .*unknown scheme 'bvz'.*did you mean"),
-        (camera("url: fleet://h/a"), ", line 3: .*cam3.url: .*an agent of a fleet shares"),
+        (camera("url: fleet://h/a"), ", line 3: .*cam3.url: .*of a fleet"),
         (camera("url: h\n    model: XYZ"), ", line 3: .*cam3.url: unknown camera model 'XYZ'"),
         (camera("emulated: {}\n    model: BVS002C"), ", line 4: .*cam3.model: is for a url"),
         (camera(f"{URL}interpret_as: 'n: int3'"), ", line 4: .*interpret_as: layout: .*int3"),
