@@ -28,7 +28,7 @@ from smartcam.fleet._errors import to_fields
 from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Owner
-from smartcam.fleet._wire import Message, decode, encode
+from smartcam.fleet._wire import Message, decode, encode, grace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,9 +46,6 @@ MOST_CALLS = 256
 
 KNOWN_CALLS = 4096
 """Numbers of calls that are remembered for each program; older ones are not done any more."""
-
-MARGIN, MOST_MARGIN = 0.1, 0.1
-"""Share of a call's time, and seconds, that its answer has for its way."""
 
 FIRST_TRY = 30.0
 """Seconds that the first try to reach a camera is waited for at the start."""
@@ -224,11 +221,13 @@ class Agent:
             return
         if not guest.is_new(number):
             return  # it is done, or under way: a double
-        timeout = float(fields.get("deadline", now() + 1.0)) - now()
+        timeout, left = float(fields.get("timeout", 1.0)), 1.0
+        if "deadline" in fields:
+            left = float(fields["deadline"]) + grace(timeout) / 2 - now()
         error: SmartCamError | None = None
         if said not in ACTIONS or (said in COMMANDS) != command:
             error = UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
-        elif timeout < 0:
+        elif left < 0:
             error = _late(said, f"{host.name}: {said} came after its deadline; it was not done")
         elif len(guest.tasks) >= MOST_CALLS:
             error = LocalProtocolError(
@@ -237,7 +236,7 @@ class Agent:
         if error is not None:
             self._reply(program, number, {"error": to_fields(error)})
             return
-        timeout -= min(MARGIN * timeout, MOST_MARGIN)
+        timeout = min(timeout, left)
         owner = Owner(guest.number, number)
         arguments: Any = fields.get("arguments", {})
         call = Call(host, program, owner, arguments, message.blobs, timeout, guest.entered)

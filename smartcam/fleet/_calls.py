@@ -71,13 +71,15 @@ async def _trigger(call: Call) -> Answer:
         layouts = {int(key): text for key, text in layouts.items()}
     data = call.blobs[0] if call.blobs else None
     wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
-    request = TriggerRequest(Carrier(call.owner, layouts), data, wanted, wait)
+    each = bool(call.argument("by_application", bool))
+    carrier = Carrier(call.owner, layouts, by_application=each)
+    expected = call.argument("expected", int)
+    request = TriggerRequest(carrier, data, wanted, wait, expected)
     outcomes = call.host.outcomes
     runs = outcomes[call.owner] = []
     try:
-        await call.host.require().trigger_for(
-            request, call.argument("application", int), call.argument("expected", int), call.timeout
-        )
+        application = call.argument("application", int)
+        await call.host.require().trigger_for(request, application, call.timeout)
     finally:
         del outcomes[call.owner]
     return {}, [encode_runs(0, call.host.results.following, runs)]
@@ -104,7 +106,10 @@ async def _leave(call: Call) -> Answer:
     found = call.entered.pop((call.host.name, call.wanted("entered", int)), None)
     if found is not None:
         camera, before = found
-        await camera.leave_and_wait(before)
+        if call.argument("wait", bool) is False:
+            camera.leave(before)  # a failure is told by the next command
+        else:
+            await camera.leave_and_wait(before)
     return NOTHING
 
 

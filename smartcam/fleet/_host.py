@@ -8,24 +8,20 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.interpretation import Interpretation
-from smartcam.exceptions import (
-    ConnectionClosedError,
-    ConnectionLostError,
-    SmartCamError,
-)
+from smartcam.exceptions import ConnectionLostError, SmartCamError
+from smartcam.fleet._errors import to_fields
 from smartcam.fleet._gate import Gate
 from smartcam.fleet._log import Log
 from smartcam.fleet._shared import SharedCamera, Tap
 from smartcam.fleet._wire import (
     CURRENT,
-    OWNED,
-    WITH_CELLS,
+    LATE,
     Run,
     encode,
     encode_runs,
     timestamp,
 )
-from smartcam.models import StatusChanged, jsonable
+from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -86,6 +82,7 @@ class Host:
         self._flushing = False
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
+        self._over = False  # there will be no session any more
         self._states_out: Publisher = bus.publisher(keys.states(name))
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
 
@@ -100,7 +97,8 @@ class Host:
         return self._camera.connected
 
     def _make(self) -> SharedCamera:
-        return SharedCamera(self.settings, Tap(self._on_results, self._on_status, self._on_event))
+        tap = Tap(self._on_results, self._on_status, self._on_event, self._on_end)
+        return SharedCamera(self.settings, tap)
 
     # ------------------------------------------------------------------ life
 
@@ -116,6 +114,7 @@ class Host:
                     self._fail(error)
                     delay = next(delays, None)
                     if delay is None or backoff is None or not backoff.transient(error):
+                        self._over = True
                         return
                     await asyncio.sleep(delay)
                     self._camera = self._make()
@@ -134,6 +133,7 @@ class Host:
 
     async def close(self) -> None:
         """End the session with Disconnect; bounded."""
+        self._opened.clear()  # what is said from now on is no news
         await self._camera.close()
         if self._reminder is not None:
             self._reminder.cancel()
@@ -145,7 +145,7 @@ class Host:
             error = ConnectionLostError(f"{self.name}: {error}")
         self.failure = error
         self._opened.set()
-        self._say({"kind": "Absent", "reason": str(error)})
+        self._say({"kind": "Absent"})
 
     def require(self) -> SharedCamera:
         """Return the camera.
@@ -167,24 +167,34 @@ class Host:
         camera = self._camera
         try:
             status: int | None = int(camera.status)
-        except (ConnectionClosedError, SmartCamError):
+        except SmartCamError:
             status = None
-        return {
+        fields: dict[str, Any] = {
             "connected": camera.connected,
-            "trying": not self._opened.is_set(),
             "status": status,
             "endian": camera.endian,
             "application": camera.active_application,
         }
+        if not self._opened.is_set():
+            fields["trying"] = True
+        elif not camera.connected:
+            trouble = self.failure or camera.trouble
+            if trouble is not None:
+                fields["error"] = to_fields(trouble)
+            fields["over"] = self._over
+        return fields
 
     def about(self) -> dict[str, Any]:
-        """Return what else there is to know of it."""
-        camera = self._camera
-        fields: dict[str, Any] = {"camera": self.name, "url": camera.url, "camera_name": ""}
-        fields["protocol_version"] = camera.protocol_version
-        fields["failure"] = None if self.failure is None else str(self.failure)
-        fields["interpret_as"] = jsonable(self.settings.interpret_as)
-        fields["y_down"], fields["lenient"] = self.settings.y_down, self.settings.lenient
+        """Return what else there is to know of it, the same for a whole session."""
+        camera, settings = self._camera, self.settings
+        fields: dict[str, Any] = {
+            "camera": self.name,
+            "url": camera.url,
+            "protocol_version": camera.protocol_version,
+            "interpret_as": jsonable(settings.interpret_as),
+            "y_down": settings.y_down,
+            "lenient": settings.lenient,
+        }
         with contextlib.suppress(SmartCamError):
             fields["capabilities"] = jsonable(camera.capabilities)
         return fields
@@ -199,7 +209,15 @@ class Host:
             return  # a status tells that
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
-        self._say({"kind": type(event).__name__, "event": fields})
+        said: dict[str, Any] = {"kind": type(event).__name__, "event": fields}
+        if isinstance(event, (Connected, Reconnected)):
+            said["about"] = self.about()
+        self._say(said)
+
+    def _on_end(self) -> None:
+        if self._opened.is_set() and self.failure is None:
+            self._over = True
+            self._say({"kind": "Over"})
 
     def _say(self, fields: dict[str, Any]) -> None:
         """Say what happened, and what the camera is now."""
@@ -210,18 +228,18 @@ class Host:
         self._fresh_states.append(data)
         self._flush_soon()
 
-    def _on_results(self, results: Sequence[Result[Carried]], current: bool) -> None:
+    def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
         """Keep results that came together, and say them at the end of this turn of the loop."""
         first = results[0]
         owner = first.value.owner
-        flags = (CURRENT if current else 0) | (OWNED if first.triggered_at is not None else 0)
+        flags = (CURRENT if current else 0) | (LATE if late else 0)
         cells = first.value.cells
         clock = asyncio.get_running_loop().time()
         run = Run(
             self.results.following,
             first.application,
             self._camera.endian,
-            flags | (WITH_CELLS if cells else 0),
+            flags,
             owner.program,
             owner.call,
             clock,

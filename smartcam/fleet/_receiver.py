@@ -19,7 +19,7 @@ from smartcam.exceptions import (
     WrongApplicationError,
 )
 from smartcam.fleet._log import Feed
-from smartcam.fleet._wire import CURRENT, Batch, Message, Run, decode, decode_runs
+from smartcam.fleet._wire import CURRENT, LATE, Batch, Message, Run, decode, decode_runs
 from smartcam.models import Result
 from smartcam.protocols.messages import ResultContainer
 
@@ -338,6 +338,8 @@ class Receiver:
             InterpretationError: of the first that cannot be read.
         """
         found = [self._outcome(own, run) for run in batch.runs]
+        if batch.runs and not math.isnan(batch.runs[-1].latency):
+            self._counters.processing.add(batch.runs[-1].latency)
         for one in found:
             if isinstance(one, InterpretationError):
                 raise one
@@ -359,8 +361,6 @@ class Receiver:
                 counters.count("uninterpretable")
                 raise
             counters.count("triggered")
-            if not math.isnan(run.latency):
-                counters.processing.add(run.latency)
         except InterpretationError as error:
             outcome = error
         own.outcomes[run.number] = outcome
@@ -386,7 +386,7 @@ class Receiver:
                 one = replace(
                     run, number=run.number + place, payloads=run.payloads[place : place + 1]
                 )
-                fate = "streamed" if run.flags & CURRENT else "late"
+                fate = "late" if run.flags & LATE else "streamed"
                 try:
                     outcome: Result | InterpretationError = self._interpret(
                         one, self._interpretation()
@@ -406,7 +406,7 @@ class Receiver:
             size = len(run.payloads[0])
             listeners.offer_error(outcome, now, size, current=current, owned=owned)
         else:
-            listeners.offer_result(outcome, now, current=current)
+            listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 
     def _take_burst(self, run: Run, now: float) -> bool:
         """Hand on containers that are only streamed, all at once; False where that cannot be."""
