@@ -232,7 +232,7 @@ class FleetCamera(Camera[ValueT]):
 
     async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
         deadline = self._deadline(timeout)
-        if not self._opened and self._closed is None:
+        if not (self._opened or self._shared) and self._closed is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)

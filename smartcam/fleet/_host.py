@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import time
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.interpretation import Interpretation
@@ -84,14 +83,14 @@ class Host:
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make()
-        self._states_out: Publisher = bus.publisher(keys.states(name))
-        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
         self._fresh: list[bytes] = []  # runs that are not said yet
         self._fresh_states: list[bytes] = []
         self._flushing = False
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
         self._over = False  # there will be no session any more
+        self._states_out: Publisher = bus.publisher(keys.states(name))
+        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
 
     @property
     def camera(self) -> SharedCamera:
@@ -261,7 +260,7 @@ class Host:
 
     def _say(self, fields: dict[str, Any]) -> None:
         """Say what happened, and what the camera is now."""
-        clock = time.monotonic()
+        clock = asyncio.get_running_loop().time()
         said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
         data = json.dumps(said, separators=(",", ":")).encode()
         self.states.add(1, clock, data)
@@ -275,7 +274,7 @@ class Host:
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (LATE if late else 0)
         cells = first.value.cells
-        clock = time.monotonic()
+        clock = asyncio.get_running_loop().time()
         run = Run(
             self.results.following,
             first.application,
