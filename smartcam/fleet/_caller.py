@@ -156,6 +156,8 @@ class Caller:
             raise self._again(self.end)
         if self.trouble is not None:
             raise self._again(self.trouble)
+        if self._task is not None:
+            raise ConnectionLostError(f"{self.name}: no agent has answered yet")
         raise ConnectionClosedError(f"{self.name}: not connected: open it first")
 
     @staticmethod

@@ -202,6 +202,11 @@ async def _refresh(call: Call) -> Answer:
     return NOTHING
 
 
+async def _wait_connected(call: Call) -> Answer:
+    await call.host.require().wait_connected(call.timeout)
+    return NOTHING
+
+
 async def _reserve(call: Call) -> Answer:
     reservation = (call.program, call.owner.call)
     await call.host.gate.reserve(call.program, reservation, call.timeout)
@@ -253,6 +258,7 @@ ACTIONS: dict[str, Callable[[Call], Awaitable[Answer]]] = {
     "release": _release,
     "query_application": _query_application,
     "query_status": _query_status,
+    "wait_connected": _wait_connected,
     "wait_ready": _wait_ready,
     "read_image": _read_image,
     "get_clock": _get_clock,

@@ -184,14 +184,17 @@ class FleetCamera(Camera[ValueT]):
 
     async def _settle(self, deadline: float) -> None:
         """Wait until the agent has a session with the camera, or has tried in vain; bounded."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout_at(deadline):
+                await self._stirred_until(lambda: self._caller.met is not None and not self._trying)
+
+    async def _stirred_until(self, condition: Callable[[], bool]) -> None:
+        """Wait until something is true of what the agent says."""
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
         try:
-            async with asyncio.timeout_at(deadline):
-                while self._caller.met is None or self._trying:
-                    await queue.get()
-        except TimeoutError:
-            pass
+            while not condition():
+                await queue.get()
         finally:
             self._watching.discard(queue)
 
@@ -234,17 +237,26 @@ class FleetCamera(Camera[ValueT]):
         deadline = self._deadline(timeout)
         if not (self._opened or self._shared) and self._closed is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
+        loop = asyncio.get_running_loop()
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
         try:
             async with asyncio.timeout_at(deadline):
-                while not self.connected:
+                while True:
                     if self._closed is not None:
                         raise self._again(self._closed)
-                    await queue.get()
+                    if self.connected:
+                        with contextlib.suppress(ConnectionLostError):
+                            # what the agent restores, or goes back to, is done then
+                            await self._do("wait_connected", max(0.0, deadline - loop.time()))
+                            return
+                    else:
+                        await queue.get()
         except TimeoutError as exc:
             raise ResponseTimeoutError(
-                f"{self.name}: no session within {timeout:g} s: {self._trouble}", waited=timeout
+                f"{self.name}: no session within {timeout:g} s; the last one: "
+                f"{self._trouble or 'there was none yet'}",
+                waited=timeout,
             ) from exc
         finally:
             self._watching.discard(queue)
@@ -370,7 +382,8 @@ class FleetCamera(Camera[ValueT]):
                 str(event.get("reason") or error),
                 expected=bool(event.get("expected")),
             )
-            if said.get("over"):
+            if said.get("over") and self._closed is None:
+                self._counters.note_loss(error)
                 self._finish(error)
         elif not self._linked:
             self._begin_session(said, at)
@@ -526,8 +539,10 @@ class FleetCamera(Camera[ValueT]):
             self._caller.tell("leave", {"entered": number, "wait": False})
             raise
         self._expected = before
-        if self._closed is None:
+        if self.connected:
             await self._do("leave", limit, entered=number)
+        else:  # the next session goes back first
+            self._caller.tell("leave", {"entered": number, "wait": False})
 
     @contextlib.asynccontextmanager
     async def reserve(self, timeout: float = 10.0) -> AsyncGenerator[Self]:
@@ -622,6 +637,9 @@ class FleetCamera(Camera[ValueT]):
 
     async def reboot(self) -> None:
         await self._do("reboot", None)
+        with contextlib.suppress(TimeoutError, LinkError):  # it is told that the session is over
+            async with asyncio.timeout(REACH_TIMEOUT):
+                await self._stirred_until(lambda: not self.connected)
 
     async def request(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 from typing import Any, cast
 
 import smartcam.exceptions
@@ -18,14 +19,17 @@ MAX_CHAIN = 8
 
 
 def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
-    """Return an error as JSON. One that is not smartcam's own crosses as the nearest that is."""
-    known = next(
-        kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _KINDS or kind is object
-    )
-    fields: dict[str, Any] = {"kind": known, "text": str(error)}
-    if known == "object":
-        fields = {"kind": "SmartCamError", "text": f"{type(error).__name__}: {error}"}
-    attributes = {name: _said(value) for name, value in vars(error).items() if name[0] != "_"}
+    """Return an error as JSON. One that is not known crosses as the nearest that is."""
+    known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _KINDS), None)
+    if known is None:
+        fields: dict[str, Any] = {
+            "kind": SmartCamError.__name__,
+            "text": f"{type(error).__name__}: {error}",
+        }
+    else:
+        fields = {"kind": known, "text": str(error)}
+    own = vars(error) if isinstance(error, SmartCamError) else {}
+    attributes = {name: _said(value) for name, value in own.items() if name[0] != "_"}
     if attributes:
         fields["attributes"] = attributes
     if error.__cause__ is not None and depth:
@@ -35,18 +39,22 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
 
 def from_fields(fields: Any) -> SmartCamError:
     """Return the error that is said by ``fields``."""
+    error = _from_fields(fields)
+    return error if isinstance(error, SmartCamError) else SmartCamError(str(error))
+
+
+def _from_fields(fields: Any) -> BaseException:
     if not isinstance(fields, dict):
         return RemoteProtocolError(f"the agent's error is none: {fields!r:.80}")
     said = cast("dict[str, Any]", fields)
-    kind = _KINDS.get(str(said.get("kind")), SmartCamError)
-    error = kind(str(said.get("text", "")))
+    error = _KINDS.get(str(said.get("kind")), SmartCamError)(str(said.get("text", "")))
     attributes: Any = said.get("attributes")
     if isinstance(attributes, dict):
         for name, value in cast("dict[str, Any]", attributes).items():
             if name in vars(error):  # the kind's own, with their defaults
                 setattr(error, name, _meant(value))
     if "cause" in said:
-        error.__cause__ = from_fields(said["cause"])
+        error.__cause__ = _from_fields(said["cause"])
     return error
 
 
@@ -63,11 +71,20 @@ def _meant(value: Any) -> Any:
     return cast("object", value)
 
 
-_KINDS: dict[str, type[SmartCamError]] = {
-    name: getattr(smartcam.exceptions, name)
-    for name in smartcam.exceptions.__all__
-    if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
+_KINDS: dict[str, type[BaseException]] = {
+    **{
+        name: kind
+        for name, kind in vars(builtins).items()
+        if isinstance(kind, type) and issubclass(kind, (OSError, LookupError, ValueError))
+        if not issubclass(kind, UnicodeError)  # made of more than a text
+    },
+    **{
+        name: getattr(smartcam.exceptions, name)
+        for name in smartcam.exceptions.__all__
+        if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
+    },
 }
+"""What an error may be on the other side: one of ours, or what the system says, as its cause."""
 
 
 def late(said: str, text: str) -> SmartCamError:

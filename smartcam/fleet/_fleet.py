@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.models import Result, SubscriberStatistics
 
-MOST_AT_ONCE = 64
-"""Cameras that are met at a time when a fleet is opened."""
-
-
 @dataclass(frozen=True, slots=True)
 class FleetEvent:
     """Something that happened to a fleet.
@@ -220,7 +216,6 @@ class Fleet:
         self._agents: dict[str, set[str]] = {}  # of a camera, those that share it
         self._handles: list[Handle] = []
         self._opening: dict[str, asyncio.Task[None]] = {}
-        self._turns = asyncio.Semaphore(MOST_AT_ONCE)
         self._events: Subscribers[FleetEvent] = Subscribers()
         self._results: list[tuple[str, weakref.ref[FleetResults[Any]]]] = []
         self._stack = contextlib.AsyncExitStack()
@@ -419,14 +414,10 @@ class Fleet:
         for results in self._subscribed(name):
             results.add(camera)
         task = asyncio.get_running_loop().create_task(
-            self._open_camera(camera), name=f"smartcam.fleet.{name}.open"
+            camera.attend(self._timeout), name=f"smartcam.fleet.{name}.open"
         )
         self._opening[name] = task
         task.add_done_callback(lambda _: self._opening.pop(name, None))
-
-    async def _open_camera(self, camera: FleetCamera[Any]) -> None:
-        async with self._turns:
-            await camera.attend(self._timeout)
 
     # ------------------------------------------------------------------ over many
 
