@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, runs
+from smartcam._cli.running import first
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import camera_value, not_running
 from smartcam.backoff import Backoff
@@ -84,24 +85,9 @@ async def _record(
             if every is not None:
                 jobs.append(_trigger(camera, every, options.step(DEFAULT_TRIGGER_TIMEOUT)))
             async with counting(camera):
-                await _first(jobs, options.seconds)
+                await first(jobs, options.seconds)
     finally:
         await _end(recorder, unopened, options)
-
-
-async def _first(jobs: list[Coroutine[Any, Any, None]], seconds: float | None) -> None:
-    """Run jobs until the first is over, or for so many seconds; raise what it raised."""
-    tasks = [asyncio.create_task(job) for job in jobs]
-    try:
-        done, _ = await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        for task in tasks:
-            if task in done:
-                task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        # what a second one raised is the same loss again, and is not to be complained about
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def _watch_disk(recorder: Recorder) -> None:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.fleet._keys import Keys
+    from smartcam.models import CameraEvent
     from smartcam.settings import CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -91,6 +92,7 @@ class Agent:
         bus: an end of its own.
         cameras: options of the client of each camera, by the camera's name.
         history: results that are kept for each camera, and their bytes.
+        on_event: is told what happens to the cameras.
     """
 
     def __init__(
@@ -101,11 +103,12 @@ class Agent:
         cameras: dict[str, CameraSettings],
         *,
         history: tuple[int, int] = (10_000, 1 << 24),
+        on_event: Callable[[CameraEvent], None] = lambda _: None,
     ) -> None:
         self.name = name
         self.epoch: int = time.time_ns()
         self._keys, self._bus = keys, bus
-        self._cameras, self._history = cameras, history
+        self._cameras, self._history, self._on_event = cameras, history, on_event
         self.hosts: dict[str, Host] = {}
         self._programs: dict[str, Guest] = {}
         self._numbers = 0
@@ -129,7 +132,7 @@ class Agent:
                 key = keys.call(self.name, "**", command=command)
                 declared.append(bus.subscribe(key, self._hears(command)))
             for name, settings in self._cameras.items():
-                host = Host(name, settings, bus, keys, self.epoch, self._history)
+                host = Host(name, settings, bus, keys, self.epoch, self._history, self._on_event)
                 self.hosts[name] = host
                 self._start(host.run(), f"smartcam.fleet.{name}")
             declared.append(bus.be_present(keys.agent(self.name)))

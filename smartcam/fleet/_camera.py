@@ -196,10 +196,12 @@ class FleetCamera(Camera[ValueT]):
         if self._unreadable is not None:
             raise self._unreadable
         if not self.connected:
-            trouble = self._caller.trouble or self._trouble
+            trouble = self.trouble
             waited = self.settings.connect_timeout
             why = f"no agent of the fleet has this camera, or none answered within {waited:g} s"
-            raise self._not_reached(why if trouble is None else str(trouble)) from trouble
+            raise self._not_reached(
+                why if trouble is None else str(trouble).removeprefix(f"{self.name}: ")
+            ) from trouble
 
     def _not_reached(self, why: str) -> ConnectFailedError:
         address = self.settings.address
@@ -406,6 +408,13 @@ class FleetCamera(Camera[ValueT]):
     @property
     def connected(self) -> bool:
         return self._linked and self._caller.met is not None
+
+    @property
+    def trouble(self) -> LinkError | None:
+        """Why there is no session; None where there is one, and where nothing is known yet."""
+        if self.connected:
+            return None
+        return self._closed or self._caller.trouble or self._trouble
 
     @property
     def status(self) -> Status:

@@ -275,9 +275,15 @@ class Fleet:
         there = sorted(name for name, agents in self._agents.items() if agents)
         return [self._cameras[name] for name in there if meets(pattern, name)]
 
-    def agents(self) -> list[str]:
-        """Return the agents that are there, by name."""
-        return sorted({agent for agents in self._agents.values() for agent in agents})
+    def agents(self, pattern: str = "**") -> list[str]:
+        """Return the agents that share a camera of a pattern, by name.
+
+        Raises:
+            ConfigurationError: the pattern cannot be one.
+        """
+        check_pattern(pattern)
+        sharing = (agents for name, agents in self._agents.items() if meets(pattern, name))
+        return sorted({agent for agents in sharing for agent in agents})
 
     def __getitem__(self, name: str) -> FleetCamera[Any]:
         """Return a camera, which an agent shares or has shared.

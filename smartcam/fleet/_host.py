@@ -29,7 +29,7 @@ from smartcam.fleet._wire import (
 from smartcam.models import StatusChanged, jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._keys import Keys
@@ -54,6 +54,7 @@ class Host:
         keys: of the fleet.
         epoch: of the agent.
         history: results that are kept, and their bytes.
+        on_event: is told what happens to the camera.
 
     Attributes:
         gate: whose commands may pass.
@@ -71,6 +72,7 @@ class Host:
         keys: Keys,
         epoch: int,
         history: tuple[int, int],
+        on_event: Callable[[CameraEvent], None],
     ) -> None:
         self.name = name
         self.settings = settings
@@ -79,7 +81,7 @@ class Host:
         self.states = Log(MOST_STATES, MOST_STATE_BYTES)
         self.outcomes: dict[Owner, list[bytes]] = {}
         self.failure: SmartCamError | None = None
-        self._epoch = epoch
+        self._epoch, self._tell = epoch, on_event
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self._camera = self._make()
         self._states_out: Publisher = bus.publisher(keys.states(name))
@@ -196,6 +198,7 @@ class Host:
         self._say({"kind": "Status"})
 
     def _on_event(self, event: CameraEvent) -> None:
+        self._tell(event)
         if isinstance(event, StatusChanged):
             return  # a status tells that
         fields: dict[str, Any] = jsonable(event)
