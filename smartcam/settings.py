@@ -198,9 +198,10 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
                 return protocol, url
         schemes = [one for protocol in _protocols() for one in protocol.schemes]
         if is_fleet(url):
+            own = " or ".join(f"{one}://" for one in schemes)
             raise UnsupportedError(
                 f"{url} is of a fleet, whose agent has the session with the camera: this wants the "
-                f"camera's own address, which begins with {', '.join(f'{one}://' for one in schemes)}"
+                f"camera's own address, which begins with {own}"
             )
         schemes += FLEET_SCHEMES
         known = ", ".join(f"{one}://" for one in schemes)

@@ -66,8 +66,8 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     },
     "--name": {
         "metavar": "NAME",
-        "help": "The camera's name: in results, and as the frame of poses; default HOST:PORT, or its "
-        "name in the fleet.",
+        "help": "The camera's name: in results, and as the frame of poses; default HOST:PORT, or "
+        "that in the fleet.",
     },
     "--count": {"type": click.IntRange(min=1), "help": "End after so many results."},
     "--seconds": {"type": SECONDS, "help": "End after so many seconds."},
