@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 import smartcam
-from smartcam._cli import demo, demo_pick
+from smartcam._cli import demo, demo_fleet, demo_pick
 from smartcam._cli.calibrate import calibrate
 from smartcam._cli.decode import decode, from_hex
 from smartcam._cli.dissector import dissector
@@ -270,6 +270,13 @@ def _first_line(loaded: object) -> str:
     help="Calibrate a simulated robot against the camera instead, and pick seven parts with it.",
 )
 @click.option(
+    "--fleet",
+    "shared",
+    is_flag=True,
+    help="Have two agents share ten cameras, and three programs one of them, instead. Needs the "
+    'extra "fleet".',
+)
+@click.option(
     "--picture",
     type=click.Path(dir_okay=False),
     default="pick.svg",
@@ -284,9 +291,14 @@ def _first_line(loaded: object) -> str:
     help="With --pick: of all noise, and of where the table is.",
 )
 @runs(*OUTPUT)
-async def demo_command(pick: bool, picture: str, seed: int, options: Options) -> None:
+async def demo_command(pick: bool, shared: bool, picture: str, seed: int, options: Options) -> None:
     """Watch smartcam do its main job against an emulated camera over real TCP."""
-    await (demo_pick.pick(options, picture, seed) if pick else demo.demo(options))
+    if pick and shared:
+        raise click.UsageError("--pick and --fleet do not go together")
+    if shared:
+        await demo_fleet.demo(options)
+    else:
+        await (demo_pick.pick(options, picture, seed) if pick else demo.demo(options))
 
 
 for _one in (
