@@ -26,6 +26,7 @@ from smartcam.exceptions import (
     TriggerError,
     UnsupportedError,
 )
+from smartcam.fleet import FleetCamera
 from smartcam.recording import Recorder, load_recording, write_pcap
 from smartcam.recording import replay as replay_camera
 
@@ -42,7 +43,8 @@ _camera = click.option(
 
 @click.command(
     help="Record everything a camera says to an MCAP file, until Ctrl-C, --count or --seconds: "
-    "frames, results, events, errors. A lost link is made again, and the recording goes on. "
+    "frames, results, events, errors; of a fleet's camera no frames, and the results of every "
+    "program's triggers. A lost link is made again, and the recording goes on. "
     f"{CONNECTS}"
 )
 @click.argument("url")
@@ -73,7 +75,11 @@ async def _record(
         # subscribed, so that every container is interpreted
         results = unopened.results(max_queue=1)
         async with unopened as camera:
-            if every is None and not camera.capabilities.unasked_results:
+            if isinstance(camera, FleetCamera):
+                # its frames, which would tell, are its agent's
+                dialect = camera.capabilities.dialect
+                recorder.describe(camera.name, dialect=dialect, endian=camera.endian)
+            elif every is None and not camera.capabilities.unasked_results:
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some triggered "
                     "while it is recorded: --every SECONDS"

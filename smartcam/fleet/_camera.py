@@ -433,6 +433,11 @@ class FleetCamera(Camera[ValueT]):
         return self._hello.get("protocol_version")
 
     @property
+    def endian(self) -> int:
+        """The byte order that the camera's status told when its agent was met."""
+        return int(self._hello.get("endian", 0))
+
+    @property
     def capabilities(self) -> Capabilities:
         said = self._hello.get("capabilities")
         if said is None:
