@@ -101,7 +101,7 @@ _IN_A_FLEET = (
     _NAME,
     _DoctorCheck("bus", fleet_checks.reach, _switch, in_session=False),
     _DoctorCheck(
-        "agent", fleet_checks.find, lambda options: 2 * fleet_checks.LOOKS_WITHIN, in_session=False
+        "agent", fleet_checks.find, lambda options: 5 * fleet_checks.LOOKS_WITHIN, in_session=False
     ),
     _DoctorCheck("session", fleet_checks.connect, _switch, in_session=False),
     _DoctorCheck("reservation", fleet_checks.reserve, _once),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.fleet import FleetCamera
     from smartcam.settings import Address
 
-LOOKS_WITHIN = 3.0
+LOOKS_WITHIN = 1.0
 """Seconds in which an agent that has just been started, or joined its router, shows up."""
 
 LOOK_AGAIN = 0.1
