@@ -81,7 +81,7 @@ LIMITS = (
     "_client.link.MAX_REST",
     "camera.DEFAULT_MAX_QUEUE",
     "camera.DEFAULT_MAX_QUEUE_BYTES",
-    "client.MAX_INTERPRETATIONS",
+    "camera.MAX_INTERPRETATIONS",
     "camera.DEFAULT_TRIGGER_TIMEOUT",
     "_client.handshake.MAX_EARLY",
     "_client.handshake.DETECTION_SHARE",

@@ -200,8 +200,8 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         if is_fleet(url):
             own = " or ".join(f"{one}://" for one in schemes)
             raise UnsupportedError(
-                f"{url} is of a fleet, whose agent has the session with the camera: this wants the "
-                f"camera's own address, which begins with {own}"
+                f"{_masked(url)} is of a fleet, whose agent has the session with the camera: this "
+                f"wants the camera's own address, which begins with {own}"
             )
         schemes += FLEET_SCHEMES
         known = ", ".join(f"{one}://" for one in schemes)

@@ -51,7 +51,7 @@ def _camera(server: FleetServer, name: str) -> dict[str, Any]:
     connected = host.connected
     failure = host.failure or "it is tried for the first time"
     return {
-        "url": server.urls[name],
+        "url": server.address.of(name).url,
         "name": name,
         "camera": host.camera.url,
         "connected": connected,
@@ -62,7 +62,8 @@ def _camera(server: FleetServer, name: str) -> dict[str, Any]:
 
 def _tell(server: FleetServer, event: CameraEvent, options: Options) -> None:
     """Say that a camera has come, or is gone."""
-    if not isinstance(event, (Connected, Disconnected, Reconnected)):
+    known = event.camera in server.hosts
+    if not (known and isinstance(event, (Connected, Disconnected, Reconnected))):
         return
     value = _camera(server, event.camera)
     if isinstance(event, Disconnected):
