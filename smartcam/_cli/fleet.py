@@ -32,12 +32,12 @@ _EVENTS = {
 _READING = ("--interpret-as", "--y-down", "--calibration")
 
 
-class _Group(JsonErrors, click.Group):
+class FleetCommands(JsonErrors, click.Group):
     """Its commands tell a wrong use as JSON, too."""
 
 
 @click.group(
-    cls=_Group,
+    cls=FleetCommands,
     help="Show and use the cameras of a fleet together. URL is fleet://HOST[:PORT], or a fleet "
     "file: then agent and cameras are in this process, for this command only. PATTERN means "
     "cameras by their names: * is one part of a name, ** any number of them; default all. Needs "

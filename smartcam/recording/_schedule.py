@@ -7,6 +7,7 @@ where the application waits for triggers, or from a free run.
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
@@ -255,27 +256,27 @@ def _steps_without_frames(items: Iterable[Item], endian: str) -> list[_ReplaySte
     """
     if endian not in {"0", "1"}:
         raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
-    steps: list[list[_ReplayStep]] = []  # what belongs together
+    steps: list[_ReplayStep] = []
     triggered_at, size = None, 0
     for item in items:
         at = (item.received_at if isinstance(item, Result) else item.at).timestamp()
         match item:
             case Connected() | Reconnected():
-                steps.append([_ReplayStep(at, _What.CONNECTED)])
+                steps.append(_ReplayStep(at, _What.CONNECTED))
             case Disconnected():
-                steps.append([_ReplayStep(at, _What.LOST)])
+                steps.append(_ReplayStep(at, _What.LOST))
             case StatusChanged(status=status):
-                steps.append([_ReplayStep(at, _What.STATUS, int(endian), status)])
+                steps.append(_ReplayStep(at, _What.STATUS, int(endian), status))
             case ApplicationChanged(application=application):
-                steps.append([_ReplayStep(at, _What.SWITCHED, application)])
+                steps.append(_ReplayStep(at, _What.SWITCHED, application))
             case Result():
                 size += len(item.raw)
-                container = _ReplayStep(at, _What.CONTAINER, item.application, data=item.raw)
-                trigger: list[_ReplayStep] = []
-                if item.triggered_at not in {None, triggered_at}:
-                    trigger = [_ReplayStep(at - (item.latency or 0.0), _What.TRIGGER)]
+                if item.triggered_at is None:
+                    steps.append(_ReplayStep(at, _What.ABORT))  # the inspection before is over
+                elif item.triggered_at != triggered_at:
+                    steps.append(_ReplayStep(at - (item.latency or 0.0), _What.TRIGGER))
                 triggered_at = item.triggered_at
-                steps.append([*trigger, container])
+                steps.append(_ReplayStep(at, _What.CONTAINER, item.application, data=item.raw))
             case _:
                 pass
         if size > MAX_REPLAY:
@@ -283,9 +284,35 @@ def _steps_without_frames(items: Iterable[Item], endian: str) -> list[_ReplaySte
                 f"recording: {size} bytes of containers until {at:.0f}, expected {MAX_REPLAY} at "
                 "most for a replay"
             )
-    # the agent's clock says when a result came, the program's when a status did
-    steps.sort(key=lambda together: together[-1].at)
-    return [step for together in steps for step in together]
+    return _on_one_clock(steps)
+
+
+_BY_AGENT = {_What.TRIGGER, _What.ABORT, _What.CONTAINER}
+
+
+def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
+    """Return steps with times that fit their order.
+
+    When a result came is said by the agent's clock, when something else happened by the program's.
+    """
+    least, most = -math.inf, math.inf  # what the agent's clock lacks
+    by_program, by_agent = -math.inf, -math.inf  # the last times
+    for step in steps:
+        if step.what is _What.CONTAINER:
+            by_agent = step.at
+            least = max(least, by_program - by_agent)
+        elif step.what not in _BY_AGENT:
+            by_program = step.at
+            most = min(most, by_program - by_agent)
+    lacks = max(min(0.0, most), least)
+    found: list[_ReplayStep] = []
+    last = -math.inf
+    for step in steps:
+        at = step.at + lacks if step.what in _BY_AGENT else step.at
+        if step.what is not _What.TRIGGER:
+            at = last = max(at, last)
+        found.append(step._replace(at=at))
+    return found
 
 
 def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:

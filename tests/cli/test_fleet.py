@@ -116,8 +116,8 @@ def test_live_shows_a_camera_of_a_fleet(fleet: str) -> None:
 
 def test_record_keeps_what_can_be_replayed(fleet: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    told = ("--every", "0.05", "--count", "3")
-    run("record", f"{fleet}/line1/text", "-o", str(path), *told).done()
+    often = ("--every", "0.05", "--count", "3")
+    run("record", f"{fleet}/line1/text", "-o", str(path), *often).done()
     recording = load_recording(path)
     assert (recording.counts.frames, recording.counts.errors) == (0, 0)
     assert [one.value for one in recording.results()][:3] == [{"text": "Hello World"}] * 3
@@ -144,8 +144,8 @@ def test_calibrate_a_camera_of_a_fleet(fleet: str, tmp_path: Path) -> None:
     lines = as_lines(ABOUT, {}, {}, *TOUCHES, {}, {})
     done = calibrating(f"{fleet}/line2/parts", tmp_path, lines, "--json").done()
     assert done.lines[-1]["result"]["points"] == 7
-    told = ("--calibration", str(tmp_path / "plane.json"), "--json")
-    told = (*told, "--interpret-as", "localizations")
+    told = ["--calibration", str(tmp_path / "plane.json"), "--json"]
+    told += ["--interpret-as", "localizations"]
     (line,) = run("trigger", f"{fleet}/line2/parts", *told).done().lines
     assert line["value"][0]["pose"]["position"]["x"] > 0.2  # of the robot
     mirrored = run("trigger", f"{fleet}/line2/mirrored", *told)
