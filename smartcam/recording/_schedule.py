@@ -304,7 +304,8 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
         elif step.what not in _BY_AGENT:
             by_program = step.at
             most = min(most, by_program - by_agent)
-    lacks = max(min(0.0, most), least)
+    # a status follows most results at once
+    lacks = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
     found: list[_ReplayStep] = []
     last = -math.inf
     for step in steps:
