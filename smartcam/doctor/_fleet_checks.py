@@ -195,17 +195,18 @@ async def reserve(exam: Examination) -> None:
     """Check ``reservation``: for triggers the camera has to be ours alone."""
     if not exam.wants_trigger:
         return
+    exam.wants_trigger = False  # until it is ours
     camera, limit = cast("FleetCamera[Any]", exam.patient), exam.options.step(10.0)
     try:
         await exam.stack.enter_async_context(camera.reserve(limit))
     except ResponseTimeoutError as exc:
-        exam.wants_trigger = False
         exam.fail(
             f"no triggers are sent: {exc}",
             "Wait for the program that has it, or leave out --trigger.",
             exit_code=Exit.RAN_OUT,
         )
         return
+    exam.wants_trigger = True
     exam.say("ok", "the camera is reserved, so that no other program's triggers come between")
 
 
