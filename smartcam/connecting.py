@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from smartcam.client import SmartCamera
-from smartcam.settings import FLEET_SCHEMES, CameraSettings
+from smartcam.settings import CameraSettings, is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -112,7 +112,7 @@ def connect(
     Raises:
         ConfigurationError: an address or option cannot work; nothing was tried.
     """
-    if url.strip().partition("://")[0].lower() in FLEET_SCHEMES:
+    if is_fleet(url):
         from smartcam.fleet._opening import fleet_camera
 
         return fleet_camera(url, dict(options), observers)

@@ -81,6 +81,11 @@ class Address(NamedTuple):
         return f"Address({', '.join(f'{name}={value!r}' for name, value in fields)})"
 
 
+def is_fleet(url: str) -> bool:
+    """Return whether a URL is that of a fleet, or of a camera of one."""
+    return url.strip().partition("://")[0].lower() in FLEET_SCHEMES
+
+
 def parse_address(url: str, *, model: str | None = None) -> Address:
     """Read a camera URL such as ``bvs://192.168.0.10?dialect=handbook``.
 
@@ -192,10 +197,11 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
             if scheme in protocol.schemes:
                 return protocol, url
         schemes = [one for protocol in _protocols() for one in protocol.schemes]
-        if scheme in FLEET_SCHEMES:
+        if is_fleet(url):
+            own = " or ".join(f"{one}://" for one in schemes)
             raise UnsupportedError(
-                f"{masked(url)} is a camera that an agent of a fleet shares: this wants the "
-                f"address of one at the wire, which begins with {' or '.join(schemes)}"
+                f"{masked(url)} is of a fleet, whose agent has the session with the camera: this "
+                f"wants the camera's own address, which begins with {own}"
             )
         schemes += FLEET_SCHEMES
         known = ", ".join(f"{one}://" for one in schemes)

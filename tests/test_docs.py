@@ -1,7 +1,8 @@
 """The documents: their examples run, their tables are complete, every page is in the contents.
 
 ``python`` blocks run as scripts of their own. ``console`` blocks run line by line, each block with
-an emulator of its own unless it starts one; what they show must be what is printed, numbers aside.
+an emulator of its own unless it starts one, or an agent of a fleet; what they show must be what is
+printed, numbers aside.
 A block of any language whose first line is ``# NAME.EXTENSION`` is a file, which the page's
 ``console`` blocks find in their folder.
 """
@@ -93,7 +94,7 @@ class Shell:
 
     def start(self, arguments: list[str]) -> Process:
         """Start a command; what needs an emulator gets the present one's address."""
-        if arguments[0] != "smartcam-emulator" and any(map(LOCAL.search, arguments)):
+        if not stays(arguments) and any(map(LOCAL.search, arguments)):
             if not self.address:
                 self.emulate(["smartcam-emulator"], 1)
             arguments = [LOCAL.sub(self.address, one) for one in arguments]
@@ -112,8 +113,11 @@ class Shell:
         return self._running.enter_context(process)
 
     def emulate(self, arguments: list[str], cameras: int) -> str:
-        """Start an emulator on a free port and return its first lines, one for each camera."""
+        """Start an emulator, or an agent, on a free port; return a first line for each camera."""
         free = ["0" if before == "--port" else one for before, one in pairs(arguments)]
+        for one in self.folder.glob("*.yaml"):  # an agent listens where its file says
+            text = one.read_text(encoding="utf-8")
+            one.write_text(LOCAL.sub("127.0.0.1:0", text), encoding="utf-8")
         process = self.start(free)
         printed = process.read_until(b"\n", count=cameras)
         address = LOCAL.search(printed)
@@ -133,6 +137,11 @@ class Shell:
     def end(self) -> None:
         """End what still runs."""
         self._running.close()
+
+
+def stays(arguments: list[str]) -> bool:
+    """Return whether a command runs as long as the commands below it."""
+    return arguments[0] == "smartcam-emulator" or arguments[:2] == ["smartcam", "serve"]
 
 
 def pairs(arguments: list[str]) -> list[tuple[str, str]]:
@@ -210,7 +219,7 @@ def test_console_block_runs(block: Block, shell: Shell) -> None:
         arguments = shlex.split(command)
         where = f"{block.page}:{line}: $ {command}\n"
         ends = {"^C", "--help", "--schema", "echo $?"}.intersection([*shown, *arguments, following])
-        if arguments[0] == "smartcam-emulator" and not ends:
+        if stays(arguments) and not ends:
             printed, ended = shell.emulate(arguments, len(shown) or 1), 0
         elif arguments[0] in {*MAINS, *MODULES, "cat", "head", "tail"}:
             printed, ended = shell.run(arguments, shown)

@@ -261,6 +261,11 @@ class _Sources:
         options = self.options
         with options.camera(str(self.url)) as unopened:
             async with unopened as camera:
+                if camera.settings.y_down != options.y_down:  # the agent of a fleet knows
+                    raise ConfigurationError(
+                        f"{camera.url}: its agent says y_down: true: give --y-down here, too, or "
+                        "what is calibrated is mirrored"
+                    )
                 result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
         found = result.value
         if not isinstance(found, list) or not all(isinstance(one, Localization) for one in found):

@@ -40,7 +40,7 @@ MAX_BROKEN = 4
 async def doctor(url: str, trigger: bool, options: Options) -> None:
     """Print what an examination finds, as it finds it; end with the exit code of the worst."""
     findings: list[Finding] = []
-    with options.tracing() as trace:
+    with options.tracing(url) as trace:
         examination = examine(
             url,
             application=options.application,

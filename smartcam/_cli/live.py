@@ -36,10 +36,12 @@ if TYPE_CHECKING:
 )
 async def live(url: str, control: bool, web: PageOptions, options: Options) -> None:
     """Serve a page of a camera."""
-    await serve(url, web, options, control=control)
+    await serve_page(url, web, options, control=control)
 
 
-async def serve(url: str, web: PageOptions, options: Options, *, control: bool = False) -> None:
+async def serve_page(
+    url: str, web: PageOptions, options: Options, *, control: bool = False
+) -> None:
     """Serve the page until the end; a camera that cannot be used at all ends it."""
     from smartcam.web import LiveSite
 

@@ -16,8 +16,9 @@ from smartcam._cli.running import run
 from smartcam._client.handshake import remarks
 from smartcam.connecting import connect
 from smartcam.doctor._context import FrameObserver
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, UnsupportedError
 from smartcam.models import jsonable
+from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound="Callable[..., Any]")
 
 CONNECTS = (
-    "Connecting takes the camera from another client, where it serves one: the newcomer wins."
+    "Connecting takes the camera from another client, where it serves one: the newcomer wins. One "
+    "of a fleet is shared."
 )
 
 
@@ -64,7 +66,8 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
     },
     "--name": {
         "metavar": "NAME",
-        "help": "The camera's name: in results, and as the frame of poses; default HOST:PORT.",
+        "help": "The camera's name: in results, and as the frame of poses; default HOST:PORT, or "
+        "that in the fleet.",
     },
     "--count": {"type": click.IntRange(min=1), "help": "End after so many results."},
     "--seconds": {"type": SECONDS, "help": "End after so many seconds."},
@@ -209,34 +212,53 @@ class Options:
         CalibrationError: the calibration's file is damaged, newer, or holds something else;
         ConfigurationError: a file cannot be opened, or an option cannot work.
         """
-        calibration = None
-        if self.calibration is not None:
-            from smartcam.calibration._files.load import load_calibration
-
-            what = f"--calibration {self.calibration}"
-            with naming(what):
-                calibration = load_calibration(self.calibration)
-            self.check_y_down(calibration, what)
-        with self.tracing() as trace:
+        with self.tracing(url) as trace:
             options: dict[str, Any] = {
+                **self.reading(fleet=is_fleet(url)),
                 "observers": [FrameObserver(trace)] if trace is not None else [],
                 "reconnect": None,
                 "name": self.name or "",
                 "application": self.application,
-                "interpret_as": self.interpret_as,
-                "calibration": calibration,
-                "y_down": self.y_down,
                 "connect_timeout": self.step(10.0),
                 "switch_timeout": self.step(10.0),
             }
             yield functools.partial(connect, url, **{**options, **other})
 
+    def reading(self, *, fleet: bool) -> dict[str, Any]:
+        """Return the options that say how results are read.
+
+        ``fleet``: the agent of a fleet may know what is not said here, such as ``y_down``. Raises
+        CalibrationError: the calibration's file is damaged, newer, or holds something else;
+        ConfigurationError: it cannot be opened, or was made with another ``--y-down``.
+        """
+        options: dict[str, Any] = {"interpret_as": self.interpret_as}
+        if self.y_down or not fleet:
+            options["y_down"] = self.y_down
+        if self.calibration is not None:
+            from smartcam.calibration._files.load import load_calibration
+
+            what = f"--calibration {self.calibration}"
+            with naming(what):
+                options["calibration"] = calibration = load_calibration(self.calibration)
+            if "y_down" in options:  # else the camera sees to it, which hears what the agent knows
+                self.check_y_down(calibration, what)
+        return options
+
     @contextmanager
-    def tracing(self) -> Iterator[Callable[[TraceEntry], None] | None]:
-        """Give what writes the trace file, None where none is wanted."""
+    def tracing(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
+        """Give what writes the trace file, None where none is wanted.
+
+        Raises UnsupportedError: the camera at ``url`` is one of a fleet; ConfigurationError: the
+        file cannot be written.
+        """
         if self.trace is None:
             yield None
             return
+        if is_fleet(url):
+            raise UnsupportedError(
+                f"--trace: frames of {url} are between the camera and its agent; a trace wants the "
+                "camera's own address, such as bvs://HOST"
+            )
         with naming(f"--trace {self.trace}"):
             stream = Path(self.trace).open("w", encoding="utf-8", buffering=1)  # noqa: SIM115
         failed: list[OSError] = []

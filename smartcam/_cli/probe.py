@@ -35,7 +35,7 @@ async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
     address = parse_address(host_or_url)
     answers: list[CameraAnswer] = []
     failed: list[str] = []
-    with options.tracing() as trace:
+    with options.tracing(host_or_url) as trace:
         timeout = options.step(10.0)
         async with aclosing(trials(address, timeout=timeout, trace=trace, go_on=go_on)) as tries:
             async for trial in tries:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, runs
+from smartcam._cli.running import first
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import camera_value, not_running
 from smartcam.backoff import Backoff
@@ -25,6 +26,7 @@ from smartcam.exceptions import (
     TriggerError,
     UnsupportedError,
 )
+from smartcam.fleet import FleetCamera
 from smartcam.recording import Recorder, load_recording, write_pcap
 from smartcam.recording import replay as replay_camera
 
@@ -41,7 +43,8 @@ _camera = click.option(
 
 @click.command(
     help="Record everything a camera says to an MCAP file, until Ctrl-C, --count or --seconds: "
-    "frames, results, events, errors. A lost link is made again, and the recording goes on. "
+    "frames, results, events, errors; of a fleet's camera no frames, and the results of every "
+    "program's triggers. A lost link is made again, and the recording goes on. "
     f"{CONNECTS}"
 )
 @click.argument("url")
@@ -72,7 +75,11 @@ async def _record(
         # subscribed, so that every container is interpreted
         results = unopened.results(max_queue=1)
         async with unopened as camera:
-            if every is None and not camera.capabilities.unasked_results:
+            if isinstance(camera, FleetCamera):
+                # its frames, which would tell, are its agent's
+                dialect = camera.capabilities.dialect
+                recorder.describe(camera.name, dialect=dialect, endian=camera.endian)
+            elif every is None and not camera.capabilities.unasked_results:
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some triggered "
                     "while it is recorded: --every SECONDS"
@@ -84,24 +91,9 @@ async def _record(
             if every is not None:
                 jobs.append(_trigger(camera, every, options.step(DEFAULT_TRIGGER_TIMEOUT)))
             async with counting(camera):
-                await _first(jobs, options.seconds)
+                await first(jobs, options.seconds)
     finally:
         await _end(recorder, unopened, options)
-
-
-async def _first(jobs: list[Coroutine[Any, Any, None]], seconds: float | None) -> None:
-    """Run jobs until the first is over, or for so many seconds; raise what it raised."""
-    tasks = [asyncio.create_task(job) for job in jobs]
-    try:
-        done, _ = await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        for task in tasks:
-            if task in done:
-                task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        # what a second one raised is the same loss again, and is not to be complained about
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def _watch_disk(recorder: Recorder) -> None:

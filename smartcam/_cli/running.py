@@ -33,7 +33,7 @@ from smartcam.exceptions import (
 from smartcam.models import jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterator
+    from collections.abc import Coroutine, Iterable, Iterator
 
 EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (ConfigurationError, 2),
@@ -117,12 +117,30 @@ def run(
     sys.exit(0)
 
 
-def error_json(error: Exception, text: str, code: int) -> str:
-    """Return an error as JSON: its class, its text, the exit code, and its public attributes."""
+async def first(jobs: Iterable[Coroutine[Any, Any, None]], seconds: float | None) -> None:
+    """Run jobs until the first is over, or for so many seconds; raise what it raised."""
+    tasks = [asyncio.create_task(job) for job in jobs]
+    try:
+        done, _ = await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        for task in tasks:
+            if task in done:
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        # what a second one raised is the same loss again, and is not to be complained about
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def error_json(error: Exception, text: str, code: int, **more: str) -> str:
+    """Return an error as JSON: its class, its text, the exit code, and its public attributes.
+
+    ``more``: what stands in front.
+    """
     said = {name: value for name, value in vars(error).items() if not name.startswith("_")}
     if isinstance(error, click.ClickException):
         said = {}  # click's own, with its context
-    value = {"error": type(error).__name__, "text": text, "exit_code": code, **said}
+    value = {**more, "error": type(error).__name__, "text": text, "exit_code": code, **said}
     return json.dumps(jsonable(value))
 
 

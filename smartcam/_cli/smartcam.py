@@ -11,18 +11,20 @@ from typing import TYPE_CHECKING
 import click
 
 import smartcam
-from smartcam._cli import demo, demo_pick
+from smartcam._cli import demo, demo_fleet, demo_pick
 from smartcam._cli.calibrate import calibrate
 from smartcam._cli.decode import decode, from_hex
 from smartcam._cli.dissector import dissector
 from smartcam._cli.doctor import doctor
+from smartcam._cli.fleet import fleet
 from smartcam._cli.image import image
-from smartcam._cli.live import live, serve
+from smartcam._cli.live import live, serve_page
 from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, application, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
 from smartcam._cli.running import JsonErrors
+from smartcam._cli.serve import serve
 from smartcam._cli.sheet import sheet
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import application_text, not_running, result_text, table_text
@@ -38,6 +40,7 @@ from smartcam.interpreters import resolve
 from smartcam.models import Status
 from smartcam.protocols._base import load_protocol
 from smartcam.registry import INTERPRETERS, PROTOCOLS
+from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -54,6 +57,7 @@ EPILOG = (
 
 TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
+    "A fleet": ("serve", "fleet"),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
     "Recordings": ("record", "replay", "pcap", "dissector"),
@@ -82,7 +86,8 @@ def command() -> None:
 
     A camera is named by its URL: bvs://HOST[:PORT] over TCP, bvs+udp://HOST[:PORT] over UDP,
     insight://[USER[:PASSWORD]@]HOST[:PORT]; ?dialect=NAME pins what is otherwise found out (see
-    "smartcam protocols").
+    "smartcam protocols"). fleet://HOST[:PORT]/NAME is a camera that "smartcam serve" shares with
+    any number of programs.
     """
 
 
@@ -130,14 +135,14 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
     if web.wanted:
         if options.count:
             raise click.UsageError("--count and --web do not go together")
-        await serve(url, web, options)
+        await serve_page(url, web, options)
         return
     each = options.step(DEFAULT_TRIGGER_TIMEOUT) if options.count else None
     with options.camera(url) as unopened:
         # subscribed before the session is there, so the first result is seen too
         results = unopened.results()
         async with unopened as camera:
-            if not camera.capabilities.unasked_results:
+            if not (camera.capabilities.unasked_results or is_fleet(url)):
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some: "
                     f"smartcam trigger {shlex.quote(camera.url)} --count N"
@@ -265,6 +270,13 @@ def _first_line(loaded: object) -> str:
     help="Calibrate a simulated robot against the camera instead, and pick seven parts with it.",
 )
 @click.option(
+    "--fleet",
+    "shared",
+    is_flag=True,
+    help="Have two agents share ten cameras, and three programs one of them, instead. Needs the "
+    'extra "fleet".',
+)
+@click.option(
     "--picture",
     type=click.Path(dir_okay=False),
     default="pick.svg",
@@ -279,12 +291,20 @@ def _first_line(loaded: object) -> str:
     help="With --pick: of all noise, and of where the table is.",
 )
 @runs(*OUTPUT)
-async def demo_command(pick: bool, picture: str, seed: int, options: Options) -> None:
+async def demo_command(pick: bool, shared: bool, picture: str, seed: int, options: Options) -> None:
     """Watch smartcam do its main job against an emulated camera over real TCP."""
-    await (demo_pick.pick(options, picture, seed) if pick else demo.demo(options))
+    if pick and shared:
+        raise click.UsageError("--pick and --fleet do not go together")
+    if shared:
+        await demo_fleet.demo(options)
+    else:
+        await (demo_pick.pick(options, picture, seed) if pick else demo.demo(options))
 
 
-for _one in (live, probe, doctor, image, decode, calibrate, sheet, record, replay, pcap, dissector):
+for _one in (
+    *(live, probe, doctor, image, decode, calibrate, sheet),
+    *(record, replay, pcap, dissector, serve, fleet),
+):
     command.add_command(_one)
 
 

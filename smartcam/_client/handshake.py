@@ -36,6 +36,7 @@ from smartcam.protocols.messages import (
     StatusReport,
     UnknownMessage,
 )
+from smartcam.settings import FLEET_SCHEMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -263,7 +264,12 @@ def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
 
 
 def remarks(address: Address) -> set[str]:
-    """Return what a user should know who asks for results at an address."""
+    """Return what a user should know who asks for results at an address.
+
+    Nothing where it is a fleet's: its agent was told.
+    """
+    if address.scheme in FLEET_SCHEMES:
+        return set()
     return {dialect.remark for dialects in tries_for(address) for dialect in dialects} - {""}
 
 

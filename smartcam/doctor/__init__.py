@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
+from smartcam.doctor import _fleet_checks as fleet_checks
 from smartcam.doctor import _result_checks as result_checks
 from smartcam.doctor import _session_checks as session_checks
 from smartcam.doctor import _state_checks as state_checks
@@ -26,7 +27,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.interpreters._base import resolve
-from smartcam.settings import parse_address
+from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable
@@ -44,6 +45,12 @@ NOTICE = Finding(
     severity="ok",
     text="connecting takes the camera from another client, where it serves one: the newcomer wins",
     cure="A program that uses smartcam takes it back by itself.",
+)
+
+SHARED = Finding(
+    check="notice",
+    severity="ok",
+    text="the camera is an agent's, which shares it: this examination takes it from nobody",
 )
 
 
@@ -71,10 +78,14 @@ def _switch(options: DoctorOptions) -> float:
     return 2 * options.step(10.0)  # the turn, and what is done in it
 
 
-_CHECKS = (
-    _DoctorCheck(
-        "name", session_checks.resolve, lambda options: options.step(10.0) + 1.0, in_session=False
-    ),
+def _once(options: DoctorOptions) -> float:
+    return options.step(10.0) + 1.0
+
+
+_NAME = _DoctorCheck("name", session_checks.resolve, _once, in_session=False)
+
+_AT_THE_WIRE = (
+    _NAME,
     _DoctorCheck(
         "session",
         session_checks.connect,
@@ -84,6 +95,19 @@ _CHECKS = (
         ),
         in_session=False,
     ),
+)
+
+_IN_A_FLEET = (
+    _NAME,
+    _DoctorCheck("bus", fleet_checks.reach, _switch, in_session=False),
+    _DoctorCheck(
+        "agent", fleet_checks.find, lambda options: 5 * fleet_checks.LOOKS_WITHIN, in_session=False
+    ),
+    _DoctorCheck("session", fleet_checks.connect, _switch, in_session=False),
+    _DoctorCheck("reservation", fleet_checks.reserve, _once),
+)
+
+_CHECKS = (
     _DoctorCheck("status", state_checks.look_at_status, _requests),
     _DoctorCheck(
         "application",
@@ -99,8 +123,9 @@ _CHECKS = (
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
     _DoctorCheck("clock", state_checks.look_at_clock, _requests),
 )
-"""In their order. The limits are there for a fault of ours: each step has a bound of its own. Their
-sum, and a second for the end of the session, bounds the whole."""
+"""In their order, behind those of a camera at the wire or in a fleet. The limits are there for a
+fault of ours: each step has a bound of its own. Their sum, and a second for the end of the session,
+bounds the whole."""
 
 
 async def examine(
@@ -153,11 +178,13 @@ async def examine(
         seconds=seconds,
         count=count,
     )
-    exam = Examination(options, parse_address(url), trace, Witness(), wants_trigger=trigger)
+    fleet = is_fleet(url)
+    address = fleet_checks.address_of(url) if fleet else parse_address(url)
+    exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
     exam.make_camera()  # which sees to it that the options can work
-    yield NOTICE
+    yield SHARED if fleet else NOTICE
     async with exam.stack, exam.borrowed:
-        for check in _CHECKS:
+        for check in (*(_IN_A_FLEET if fleet else _AT_THE_WIRE), *_CHECKS):
             goes_on = await _run(check, exam)
             for finding in exam.take():
                 yield finding
@@ -176,11 +203,11 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
             if not exam.patient.connected and check.name != "clock":
                 await exam.patient.query_application()  # raises why
     except LinkError as exc:
-        await session_checks.explain_loss(exam, exc)
+        await _explain_loss(exam, exc)
         return False
     except ResponseTimeoutError as exc:
         if not exam.patient.connected:  # an answer that did not come costs the session
-            await session_checks.explain_loss(exam, exc)
+            await _explain_loss(exam, exc)
             return False
         exam.fail(
             f"the camera did not get ready in time: {exc}",
@@ -199,3 +226,10 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
             exit_code=Exit.RAN_OUT,
         )
     return exam.camera is not None and exam.camera.connected
+
+
+async def _explain_loss(exam: Examination, error: SmartCamError) -> None:
+    if exam.in_fleet:
+        fleet_checks.explain_loss(exam, error)
+    else:
+        await session_checks.explain_loss(exam, error)

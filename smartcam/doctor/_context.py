@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from smartcam.client import SmartCamera
+from smartcam.connecting import connect
 from smartcam.doctor._findings import Exit, Finding, Severity
 from smartcam.exceptions import InterpretationError
 from smartcam.interpreters._base import Interpreter, Reader, run
 from smartcam.layout import Layout
 from smartcam.models import CameraEvent, Result, Status, StatusChanged
 from smartcam.observers import Observer
-from smartcam.settings import CameraSettings, parse_address
+from smartcam.settings import CameraSettings, is_fleet, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from smartcam.camera import Camera
     from smartcam.exceptions import SmartCamError
+    from smartcam.fleet._bus import Bus
     from smartcam.models import ByteOrder
     from smartcam.observers import TraceEntry
     from smartcam.settings import Address, CameraOptions
@@ -184,6 +186,7 @@ class Examination:
     stack: AsyncExitStack = field(default_factory=AsyncExitStack)  # what is undone at the end
     # an application that is loaded for the triggers, and goes back
     borrowed: AsyncExitStack = field(default_factory=AsyncExitStack)
+    bus: Bus | None = None  # that of a fleet, None before it answered
     camera: Camera | None = None  # the client, None before the session
     connected_at: float = 0.0  # loop time of the session
     wants_trigger: bool = False  # whether triggers are still wanted
@@ -259,13 +262,24 @@ class Examination:
             "connect_timeout": asked.step(10.0),
             "request_timeout": asked.step(5.0),
             "switch_timeout": asked.step(10.0),
-            "y_down": asked.y_down,
         }
+        if asked.y_down or not self.in_fleet:  # the agent may know it
+            options["y_down"] = asked.y_down
         if asked.interpreter is not None:
             options["interpret_as"] = Keeper(asked.interpreter)
-        settings = CameraSettings.make(self.address.url, None, options)
-        settings = settings.model_copy(update={"address": self.address})
         frames = [FrameObserver(self.trace)] if self.trace is not None else []
-        camera = SmartCamera(settings, observers=[self.witness, *frames])
+        observers = [self.witness, *frames]
+        camera: Camera
+        if self.in_fleet:
+            camera = connect(self.address.url, observers=observers, **options)
+        else:
+            settings = CameraSettings.make(self.address.url, None, options)
+            settings = settings.model_copy(update={"address": self.address})
+            camera = SmartCamera(settings, observers=observers)
         self.stack.push_async_callback(camera.close)
         return camera
+
+    @property
+    def in_fleet(self) -> bool:
+        """Whether an agent has the session with the camera."""
+        return is_fleet(self.address.url)

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.fleet._keys import Keys
+    from smartcam.models import CameraEvent
     from smartcam.settings import CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -90,6 +91,7 @@ class Agent:
         bus: an end of its own.
         cameras: options of the client of each camera, by the camera's name.
         history: results that are kept for each camera, and their bytes.
+        on_event: is told what happens to the cameras.
     """
 
     def __init__(
@@ -100,11 +102,12 @@ class Agent:
         cameras: dict[str, CameraSettings],
         *,
         history: tuple[int, int] = (10_000, 1 << 24),
+        on_event: Callable[[CameraEvent], None] = lambda _: None,
     ) -> None:
         self.name = name
         self.epoch: int = time.time_ns()
         self._keys, self._bus = keys, bus
-        self._cameras, self._history = cameras, history
+        self._cameras, self._history, self._on_event = cameras, history, on_event
         self.hosts: dict[str, Host] = {}
         self._programs: dict[str, Guest] = {}
         self._numbers = 0
@@ -161,7 +164,7 @@ class Agent:
             ConfigurationError: an option of it cannot work.
         """
         bus, keys, topics = self._bus, self._keys, self._plain.topics
-        host = Host(name, settings, bus, keys, self.epoch, self._history, topics)
+        host = Host(name, settings, bus, keys, self.epoch, self._history, self._on_event, topics)
         host.numbers = self._numbers_at.pop(name, host.numbers)
         self.hosts[name] = host
         running = self.begin(host.run(), f"smartcam.fleet.{name}")

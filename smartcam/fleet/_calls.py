@@ -209,7 +209,7 @@ async def _wait_connected(call: Call) -> Answer:
 
 async def _reserve(call: Call) -> Answer:
     reservation = (call.program, call.owner.call)
-    await call.host.gate.reserve(call.program, reservation, call.timeout)
+    await call.host.reserve(call.program, reservation, call.timeout)
     return NOTHING
 
 

@@ -203,10 +203,12 @@ class FleetCamera(Camera[ValueT]):
         if self._unreadable is not None:
             raise self._unreadable
         if not self.connected:
-            trouble = self._caller.trouble or self._trouble
+            trouble = self.trouble
             waited = self.settings.connect_timeout
             why = f"no agent of the fleet has this camera, or none answered within {waited:g} s"
-            raise self._not_reached(why if trouble is None else str(trouble)) from trouble
+            raise self._not_reached(
+                why if trouble is None else str(trouble).removeprefix(f"{self.name}: ")
+            ) from trouble
 
     def _not_reached(self, why: str) -> ConnectFailedError:
         address = self.settings.address
@@ -445,6 +447,13 @@ class FleetCamera(Camera[ValueT]):
         return self._linked and self._caller.met is not None
 
     @property
+    def trouble(self) -> LinkError | None:
+        """Why there is no session; None where there is one, and where nothing is known yet."""
+        if self.connected:
+            return None
+        return self._closed or self._caller.trouble or self._trouble
+
+    @property
     def status(self) -> Status:
         if self._status is None:
             raise self._again(
@@ -459,6 +468,11 @@ class FleetCamera(Camera[ValueT]):
     @property
     def protocol_version(self) -> int | None:
         return self._about.get("protocol_version")
+
+    @property
+    def endian(self) -> int:
+        """The byte order that the camera's status told when its agent was met."""
+        return int(self._about.get("endian", 0))
 
     @property
     def capabilities(self) -> Capabilities:

@@ -25,7 +25,7 @@ from smartcam.fleet._wire import (
 from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Sequence
+    from collections.abc import AsyncGenerator, Callable, Hashable, Sequence
 
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._keys import Keys
@@ -51,6 +51,7 @@ class Host:
         keys: of the fleet.
         epoch: of the agent.
         history: results that are kept, and their bytes.
+        on_event: is told what happens to the camera.
         topics: where it is said in JSON.
 
     Attributes:
@@ -70,6 +71,7 @@ class Host:
         keys: Keys,
         epoch: int,
         history: tuple[int, int],
+        on_event: Callable[[CameraEvent], None],
         topics: Topics,
     ) -> None:
         self.name = name
@@ -79,7 +81,7 @@ class Host:
         self.states = Log(MOST_STATES, MOST_STATE_BYTES)
         self.outcomes: dict[Owner, list[bytes]] = {}
         self.failure: SmartCamError | None = None
-        self._epoch = epoch
+        self._epoch, self._tell = epoch, on_event
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make()
@@ -190,12 +192,26 @@ class Host:
             try:
                 await stack.enter_async_context(self.gate.command(program, timeout))
             except TimeoutError as exc:
-                raise late(
-                    said,
-                    f"{self.name}: reserved by {self.gate.holder}, which did not let go within "
-                    f"{timeout:.3g} s; {said} was not done",
-                ) from exc
+                raise self._reserved(said, timeout) from exc
             yield
+
+    async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
+        """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
+
+        Raises:
+            ResponseTimeoutError: another program has it for ``timeout`` seconds more.
+        """
+        try:
+            await self.gate.reserve(program, reservation, timeout)
+        except TimeoutError as exc:
+            raise self._reserved("reserve", timeout) from exc
+
+    def _reserved(self, said: str, timeout: float) -> SmartCamError:
+        return late(
+            said,
+            f"{self.name}: reserved by {self.gate.holder}, which did not let go within "
+            f"{timeout:.3g} s; {said} was not done",
+        )
 
     # ------------------------------------------------------------------ what the camera is
 
@@ -243,6 +259,7 @@ class Host:
         self._say({"kind": "Status"})
 
     def _on_event(self, event: CameraEvent) -> None:
+        self._tell(event)
         if isinstance(event, StatusChanged):
             return  # a status tells that
         self.topics.on_event(event)

@@ -148,6 +148,7 @@ class Program:
 
 def _own_name() -> str:
     """Return what a person would call this process: its script, host and number."""
-    script = Path(sys.argv[0] if sys.argv else "").stem or "python"
+    path = Path(sys.argv[0] if sys.argv else "")
+    script = (path.parent.name if path.stem == "__main__" else path.stem) or "python"
     text = f"{script}-{socket.gethostname().partition('.')[0]}-{os.getpid()}".lower()
     return "".join(one if one.isascii() and (one.isalnum() or one == "-") else "_" for one in text)

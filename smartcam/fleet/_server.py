@@ -7,14 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from smartcam._server import Server
+from smartcam.camera import DEFAULT_MAX_QUEUE
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+from smartcam.models import CameraEvent
+from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
+    from typing import Literal
+
     from smartcam.emulator._wire_camera import WireCamera
     from smartcam.fleet._bus import Bus
     from smartcam.fleet._file import Planned
@@ -47,6 +52,7 @@ class FleetServer(Server):
         self._listen, self._connect = listen, connect = with_ports(listen), connect
         self._bus = bus or ZenohEnd(Link(listen, connect, self.file.certificates))
         self._agent: Agent | None = None
+        self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
 
     async def start(self) -> None:
@@ -67,7 +73,14 @@ class FleetServer(Server):
                 url = planned.entry.url or await self._emulate(planned, stack)
                 cameras[planned.name] = planned.entry.settings(planned.name, url)
             history = (file.history.results, file.history.bytes)
-            agent = Agent(file.agent_name, Keys(file.fleet), self._bus, cameras, history=history)
+            agent = Agent(
+                file.agent_name,
+                Keys(file.fleet),
+                self._bus,
+                cameras,
+                history=history,
+                on_event=self._tell,
+            )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
             self._agent, self._stack = agent, stack.pop_all()
@@ -76,6 +89,8 @@ class FleetServer(Server):
         """End the sessions with Disconnect, and leave the bus. Harmless when done twice."""
         self._agent = None
         await self._stack.aclose()
+        for stream in self._events:
+            stream.end(None)
 
     async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
         """Start an emulated camera; return its URL."""
@@ -100,6 +115,21 @@ class FleetServer(Server):
         """Wait until every camera was tried once, well or not; bounded by ``connect_timeout``."""
         if self._agent is not None:
             await self._agent.wait_tried()
+
+    def events(
+        self,
+        *,
+        max_queue: int = DEFAULT_MAX_QUEUE,
+        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
+    ) -> Subscription[CameraEvent]:
+        """Subscribe to what happens to its cameras: :meth:`smartcam.Camera.events` of them all."""
+        stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
+        self._events.add(stream)
+        return stream
+
+    def _tell(self, event: CameraEvent) -> None:
+        for stream in self._events:
+            stream.offer(event, 0.0)
 
     @property
     def name(self) -> str:

@@ -14,6 +14,7 @@ import functools
 import json
 import logging
 import os
+import re
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -532,5 +533,9 @@ def _close_late(opening: asyncio.Future[Any]) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """Return what the engine says without its source's places."""
-    return str(error).partition(" at /")[0].strip(" .")
+    """Return what the engine says without its source's places, or the system's own words."""
+    text = str(error).partition(" at /")[0].strip(" .")
+    system = re.search(r": ([^:]+) \(os error \d+\)", text)
+    if system is not None:
+        return system[1]
+    return "nothing there answers as a fleet's bus" if "Unable to connect" in text else text

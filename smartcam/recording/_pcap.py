@@ -14,13 +14,13 @@ from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.exceptions import ConfigurationError, RecordingError
+from smartcam.exceptions import ConfigurationError, RecordingError, UnsupportedError
 from smartcam.models import Disconnected
 from smartcam.observers import TraceEntry
 from smartcam.protocols._base import Transport
 from smartcam.recording._form import load_extra, nanoseconds
 from smartcam.registry import PROTOCOLS
-from smartcam.settings import parse_address
+from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -89,13 +89,18 @@ def write_pcap(
 
     Raises:
         ConfigurationError: no such camera, or the file is there already or cannot be made.
+        UnsupportedError: a camera is a fleet's, whose frames are its agent's.
         RecordingError: it cannot be written to its end: the disk is full, or a frame fits into no
             packet.
         MissingExtraError: dpkt is not installed.
     """
     dpkt = load_extra("dpkt")
-    if camera is not None:
-        recording.camera(camera)
+    for known in [*recording.cameras.values()] if camera is None else [recording.camera(camera)]:
+        if is_fleet(known.url):
+            raise UnsupportedError(
+                f"recording {recording.path}: camera {known.name!r} is a fleet's, so no frames of "
+                "it are recorded, which packets are made of"
+            )
     path = Path(path)
     try:
         stream = path.open("wb" if overwrite else "xb")
@@ -123,9 +128,11 @@ def write_pcap(
 def _packets(recording: Recording, camera: str | None, dpkt: Any) -> Iterator[_Packet]:
     wires: dict[str, _Capture] = {}
     for index, known in enumerate(recording.cameras.values()):
-        wires[known.name] = _Capture(known, dpkt, index)
+        if not is_fleet(known.url):
+            wires[known.name] = _Capture(known, dpkt, index)
     for item in recording.items(camera):
-        yield from wires[item.camera].packets(item)
+        if item.camera in wires:
+            yield from wires[item.camera].packets(item)
     for wire in wires.values():
         yield from wire.end()
 

@@ -36,7 +36,7 @@ from smartcam.recording._form import (
     nanoseconds,
     topic_of,
 )
-from smartcam.settings import parse_address
+from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -399,6 +399,8 @@ class _File:
 
 
 def _address_facts(url: str) -> dict[str, str]:
+    if is_fleet(url):  # its own dialect is known to the agent
+        return {"url": url, "protocol": "fleet"}
     try:
         address = parse_address(url)
     except ConfigurationError:  # a plug-in's that is no longer there

@@ -30,6 +30,7 @@ from smartcam.interpreters._base import resolve
 from smartcam.protocols import messages as m
 from smartcam.recording._replay_lines import ReplayedLines
 from smartcam.recording._schedule import CONDITIONS, plan_replay
+from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -418,7 +419,8 @@ def replay(
     """Return an emulated camera that plays a recording, of whatever protocol.
 
     One of frames is a :class:`ReplayedCamera`. One of lines gives the n-th of equal lines what the
-    recorded n-th one got, after the same time.
+    recorded n-th one got, after the same time. One of a fleet's camera has no frames: its results
+    are played.
 
     Args:
         recording: what to play.
@@ -438,7 +440,7 @@ def replay(
             f"recording {recording.path}: there was no session with camera {known.name!r}"
         )
     check_speed(speed)
-    kind = emulated_class(known.protocol)
+    kind = EmulatedCamera if is_fleet(known.url) else emulated_class(known.protocol)
     given: dict[str, Any] = {"camera": camera, "speed": speed, "loop": loop, "on_over": on_over}
     if issubclass(kind, LineCamera):
         check_options(LineCamera, options)

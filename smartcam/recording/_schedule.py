@@ -1,4 +1,4 @@
-"""What a replay does, worked out from a recording's frames; pure.
+"""What a replay does, worked out from a recording's frames, or results where it has none; pure.
 
 A container belongs to the oldest trigger without one. Others came unasked: by the digital input,
 where the application waits for triggers, or from a free run.
@@ -7,17 +7,27 @@ where the application waits for triggers, or from a free run.
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 from smartcam.exceptions import ConfigurationError, RecordingError
-from smartcam.models import Disconnected, Status
+from smartcam.models import (
+    ApplicationChanged,
+    Connected,
+    Disconnected,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+)
 from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Transport, Verdict
+from smartcam.protocols._bvs import BVS, HANDBOOK
 from smartcam.recording._form import status_of
 from smartcam.registry import PROTOCOLS
-from smartcam.settings import parse_address
+from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -91,8 +101,15 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     """
     known = recording.camera(camera)
     dialect, transport = _spoken(recording, known)
-    steps = list(_steps(recording.items(known.name), dialect))
-    maker = _ScheduleMaker(_free_running(steps))
+    items = recording.items(known.name)
+    if is_fleet(known.url):
+        steps = _steps_without_frames(items, known.facts.get("endian", "0"))
+        free = _free_running(steps)
+        steps = _settled(steps, free)
+    else:
+        steps = list(_steps(items, dialect))
+        free = _free_running(steps)
+    maker = _ScheduleMaker(free)
     for step in steps:
         maker.take(step)
     maker.finish()
@@ -139,6 +156,15 @@ def _spoken(
         raise ConfigurationError(
             f"recording {recording.path}: there was no session with camera {camera.name!r}"
         )
+    if is_fleet(camera.url):
+        found = BVS.dialects.get(camera.dialect or HANDBOOK.name)
+        if found is None:
+            raise ConfigurationError(
+                f"recording {recording.path}: camera {camera.name!r} of a fleet speaks dialect "
+                f"{camera.dialect}, expected one of bvs; no frames of it are recorded, which would "
+                "be played line by line"
+            )
+        return found, "tcp"
     address = parse_address(camera.url)
     if address.protocol != "bvs" or address.dialect is None:
         raise ConfigurationError(
@@ -217,6 +243,94 @@ def _steps(items: Iterable[Item], dialect: FramedDialect) -> Iterator[_ReplaySte
         elif step.what in {_What.SWITCHED, _What.NAMED}:
             active = step.number
         yield step
+
+
+def _steps_without_frames(items: Iterable[Item], endian: str) -> list[_ReplayStep]:
+    """Return the steps of a camera of a fleet, of which there are results and events, in order.
+
+    A trigger stands in front of the first of its results; one without a result is left out.
+
+    Raises:
+        ConfigurationError: ``endian`` is no number.
+        RecordingError: there is too much of them.
+    """
+    if endian not in {"0", "1"}:
+        raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
+    steps: list[_ReplayStep] = []
+    triggered_at, size = None, 0
+    for item in items:
+        at = (item.received_at if isinstance(item, Result) else item.at).timestamp()
+        match item:
+            case Connected() | Reconnected():
+                steps.append(_ReplayStep(at, _What.CONNECTED))
+            case Disconnected():
+                steps.append(_ReplayStep(at, _What.LOST))
+            case StatusChanged(status=status):
+                steps.append(_ReplayStep(at, _What.STATUS, int(endian), status))
+            case ApplicationChanged(application=application):
+                steps.append(_ReplayStep(at, _What.SWITCHED, application))
+            case Result():
+                size += len(item.raw)
+                if item.triggered_at is None:
+                    steps.append(_ReplayStep(at, _What.ABORT))  # the inspection before is over
+                elif item.triggered_at != triggered_at:
+                    steps.append(_ReplayStep(at - (item.latency or 0.0), _What.TRIGGER))
+                triggered_at = item.triggered_at
+                steps.append(_ReplayStep(at, _What.CONTAINER, item.application, data=item.raw))
+            case _:
+                pass
+        if size > MAX_REPLAY:
+            raise RecordingError(
+                f"recording: {size} bytes of containers until {at:.0f}, expected {MAX_REPLAY} at "
+                "most for a replay"
+            )
+    return _on_one_clock(steps)
+
+
+_BY_AGENT = {_What.TRIGGER, _What.ABORT, _What.CONTAINER}
+
+
+def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
+    """Return steps with times that fit their order.
+
+    When a result came is said by the agent's clock, when something else happened by the program's.
+    """
+    least, most = -math.inf, math.inf  # what the agent's clock lacks
+    by_program, by_agent = -math.inf, -math.inf  # the last times
+    for step in steps:
+        if step.what is _What.CONTAINER:
+            by_agent = step.at
+            least = max(least, by_program - by_agent)
+        elif step.what not in _BY_AGENT:
+            by_program = step.at
+            most = min(most, by_program - by_agent)
+    # a status follows most results at once
+    lacks = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
+    found: list[_ReplayStep] = []
+    last = -math.inf
+    for step in steps:
+        at = step.at + lacks if step.what in _BY_AGENT else step.at
+        if step.what is not _What.TRIGGER:
+            at = last = max(at, last)
+        found.append(step._replace(at=at))
+    return found
+
+
+def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
+    """Return steps whose statuses say nothing of single inspections: their times are too coarse."""
+    settled: list[_ReplayStep] = []
+    active: int | None = None
+    for step in steps:
+        if step.what in {_What.SWITCHED, _What.CONTAINER}:
+            active = step.number
+        if step.what is _What.STATUS:
+            bits = step.bits & ~(Status.OVERTRIGGERED | Status.WAITING_FOR_TRIGGER)
+            if Status.RUNNING in bits and active not in free:
+                bits |= Status.WAITING_FOR_TRIGGER
+            settled.append(step._replace(bits=bits))
+        else:
+            settled.append(step)
+    return settled
 
 
 def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:

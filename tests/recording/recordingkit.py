@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import smartcam
-from smartcam.models import CameraEvent, Connected
+from smartcam.models import CameraEvent, Connected, Result
 from smartcam.observers import TraceEntry
 from smartcam.recording import Recorder, load_recording
 
@@ -61,14 +61,16 @@ def session(url: str = URL, *names: str, endian: int = 0) -> list[TraceEntry | C
 
 
 def write(
-    path: Path, items: Iterable[TraceEntry | CameraEvent], *, interpret_as: str | None = None
+    path: Path, items: Iterable[TraceEntry | CameraEvent | Result], **facts: object
 ) -> Recording:
     """Record items as a client would, and load the file."""
     with Recorder(path) as recorder:
-        recorder.describe("left", interpret_as=interpret_as)
+        recorder.describe("left", **facts)
         for item in items:
             if isinstance(item, TraceEntry):
                 recorder.on_frame(item)
+            elif isinstance(item, Result):
+                recorder.on_result(item)
             else:
                 recorder.on_state(item)
     return load_recording(path)

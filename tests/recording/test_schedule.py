@@ -10,7 +10,16 @@ from typing import Any
 import pytest
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.models import CameraEvent, Connected, Disconnected, Reconnected, Status
+from smartcam.models import (
+    ApplicationChanged,
+    CameraEvent,
+    Connected,
+    Disconnected,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+)
 from smartcam.observers import TraceEntry
 from smartcam.recording._schedule import Change, ReplayPlan, Take, plan_replay
 from tests.recording.recordingkit import URL, at, container, frame, session, status, write
@@ -208,3 +217,73 @@ def test_plan_camera_that_cannot_be_emulated_is_refused(
 ) -> None:
     with pytest.raises(ConfigurationError, match=text):
         plan_replay(write(tmp_path / "run.mcap", items))
+
+
+# ---------------------------------------------------------------------- without frames
+
+FLEET = "fleet://plant-server:7447/left"
+RUNS = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+
+
+def shared(seconds: float, data: bytes, latency: float | None = None, ago: float = 0.0) -> Result:
+    """Return a result of application 5; ``ago``: how long before it that its trigger was sent."""
+    trigger = None if latency is None else at(seconds - (ago or latency))
+    return Result("left", 5, None, 1, trigger, at(seconds), latency, data, None)
+
+
+def met(status: Status = RUNS) -> list[CameraEvent | Result]:
+    """Return what a program is told first, at 0 s of its own clock."""
+    return [
+        Connected(camera="left", at=at(0), url=FLEET),
+        ApplicationChanged(camera="left", at=at(0), application=5, previous=None),
+        StatusChanged(camera="left", at=at(0), status=status, previous=None),
+    ]
+
+
+def changed(seconds: float, status: Status) -> StatusChanged:
+    return StatusChanged(camera="left", at=at(seconds), status=status, previous=None)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 3600.0, -3600.0])
+def test_plan_of_a_fleets_camera_has_its_results_whatever_the_agents_clock_says(
+    tmp_path: Path, ahead: float
+) -> None:
+    items = [
+        *met(),
+        changed(1.01, Status.RUNNING),
+        shared(1.5 + ahead, b"a", 0.5),
+        shared(1.6 + ahead, b"b", 0.6, 0.6),  # of the same trigger
+        changed(1.61, RUNS | Status.OVERHEAT),
+        shared(3.0 + ahead, b"c"),
+        shared(4.25 + ahead, b"d", 0.25),
+        Disconnected(camera="left", at=at(5), reason="closed", expected=True),
+    ]
+    made = plan_replay(write(tmp_path / "run.mcap", items, dialect="b16", endian=1))
+    app = made.applications[5]
+    assert rounded(app.triggered) == [([b"a", b"b"], 0.5, 0, 0), ([b"d"], 0.25, 0, 0)]
+    assert [take.containers for take in app.unasked] == [[b"c"]]
+    assert app.unasked[0].gap == pytest.approx(3.0, abs=0.05)
+    assert (made.active, made.running, made.endian) == (5, True, 1)
+    assert (made.dialect, made.transport) == ("b16", "tcp")
+    assert [(one.condition, one.on) for one in made.changes] == [(Status.OVERHEAT, True)]
+    assert made.changes[0].at == pytest.approx(1.61, abs=0.05)
+
+
+def test_plan_of_a_fleets_free_run_counts_from_the_one_before(tmp_path: Path) -> None:
+    items = [*met(Status.RUNNING), shared(-0.001, b"a"), shared(0.1, b"b"), shared(0.3, b"c")]
+    app = plan_replay(write(tmp_path / "run.mcap", items)).applications[5]
+    assert not app.waits
+    gaps = [take.gap for take in app.unasked]
+    assert gaps == pytest.approx([0.0, 0.101, 0.2], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("facts", "text"),
+    [({"dialect": "native"}, "of a fleet speaks dialect native"), ({"endian": 2}, "endian 2 came")],
+)
+def test_plan_of_a_fleets_camera_that_cannot_be_played_is_refused(
+    tmp_path: Path, facts: dict[str, Any], text: str
+) -> None:
+    recording = write(tmp_path / "run.mcap", [*met(), shared(1, b"a")], **facts)
+    with pytest.raises(ConfigurationError, match=text):
+        plan_replay(recording)

@@ -1,0 +1,224 @@
+"""``smartcam demo --fleet``: agents, cameras and programs, each on their own, step by step."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import smartcam
+from smartcam._cli.demo import TANGRAM, Steps
+from smartcam._cli.texts import table_text
+from smartcam.exceptions import ConnectionLostError, SmartCamError
+
+if TYPE_CHECKING:
+    from asyncio.subprocess import Process
+    from collections.abc import AsyncGenerator
+
+    from smartcam._cli.options import Options
+    from smartcam.fleet import Fleet, FleetCamera
+    from smartcam.models import Result
+
+SHARED = "line1/cam1"
+CAMERAS = {"north": ("line1", 6), "south": ("line2", 4)}
+"""Of each agent: where they stand, and how many."""
+
+BY_ROBOT, BY_HAND = 9, 3
+"""Triggers of two programs, at the same time."""
+
+PATIENCE = 30.0
+"""Seconds for anything; only what has gone wrong takes as long."""
+
+SOON = 0.3
+"""Seconds that somebody waits for a camera that another program has for itself."""
+
+
+async def demo(options: Options) -> None:
+    """Start agents, share a camera, reserve it, trigger all, end agents."""
+    from smartcam.fleet import open
+    from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+
+    ZenohEnd(Link())  # without the engine it ends here
+    say = Steps(options)
+    (endpoint,) = with_ports(["tcp/127.0.0.1:0"])
+    url = f"fleet://{endpoint.partition('/')[2]}"
+    async with contextlib.AsyncExitStack() as stack, asyncio.timeout(4 * PATIENCE):
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        agents: dict[str, Process] = {}
+        for name, place in (("north", "listen"), ("south", "connect")):
+            line, count = CAMERAS[name]
+            cameras = {f"{line}/**": {"emulated": {"count": count}, "application": TANGRAM}}
+            file = Path(folder) / f"{name}.yaml"
+            # JSON is YAML, too
+            file.write_text(json.dumps({"agent": name, place: endpoint, "cameras": cameras}))
+            agents[name] = await stack.enter_async_context(_agent(file, count))
+            doing = "is the router, too" if place == "listen" else "joins it there"
+            say.step(
+                f"Agent {name}, process {agents[name].pid}, has {count} emulated cameras and "
+                f"{doing}: {url}",
+                agent=name,
+                url=url,
+            )
+        fleet = await stack.enter_async_context(open(url))
+        _show_fleet(fleet, say)
+        programs = [
+            await stack.enter_async_context(smartcam.connect(f"{url}/{SHARED}", name=name))
+            for name in ("robot", "dashboard", "recorder")
+        ]
+        robot, dashboard, recorder = programs
+        await _share(robot, dashboard, recorder, say)
+        await _reserve(fleet[SHARED], dashboard, say)
+        await _trigger_all(fleet, say)
+        await _kill(fleet, agents["south"], robot, say)
+        await _end(agents["north"], robot, say)
+
+
+@contextlib.asynccontextmanager
+async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
+    """Run an agent in a process of its own; its cameras are there."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "smartcam", "serve", str(file), "--json"),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    try:
+        for _ in range(cameras):
+            async with asyncio.timeout(PATIENCE):
+                line = await process.stdout.readline() if process.stdout is not None else b""
+            if not line:
+                raise ConnectionLostError(f"the agent of {file.name} did not start")
+        yield process
+    finally:
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.terminate()
+        try:
+            async with asyncio.timeout(PATIENCE):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+
+
+def _show_fleet(fleet: Fleet, say: Steps) -> None:
+    cameras = fleet.cameras()
+    say.step(f"The whole fleet by one URL, {len(cameras)} cameras:", agents=fleet.agents())
+    rows = [
+        (one.name, *fleet.agents(one.name), one.active_application, str(one.status))
+        for one in cameras
+    ]
+    say.detail(
+        table_text(("camera", "agent", "application", "status"), rows),
+        cameras=[one.url for one in cameras],
+    )
+
+
+async def _share(
+    robot: smartcam.Camera, dashboard: smartcam.Camera, recorder: smartcam.Camera, say: Steps
+) -> None:
+    say.step(
+        f"Three programs use {SHARED}, each with a connection of its own: a robot triggers, a "
+        "dashboard watches and triggers by hand, a recorder takes every result:"
+    )
+    statuses, recorded = dashboard.statuses(), recorder.results()
+
+    async def trigger(camera: smartcam.Camera, times: int) -> list[int]:
+        return [(await camera.trigger(timeout=PATIENCE)).number for _ in range(times)]
+
+    async def record() -> list[int]:
+        return [(await anext(recorded)).number for _ in range(BY_ROBOT + BY_HAND)]
+
+    async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group:
+        recording = group.create_task(record())
+        moving = group.create_task(trigger(robot, BY_ROBOT))
+        pressing = group.create_task(trigger(dashboard, BY_HAND))
+    for name, task in (("robot", moving), ("dashboard", pressing), ("recorder", recording)):
+        numbers = task.result()
+        say.detail(
+            f"   {name:9} results {', '.join(map(str, numbers))}", program=name, numbers=numbers
+        )
+    owned = sorted([*moving.result(), *pressing.result()])
+    each = "each is one's own" if owned == recording.result() else "they are NOT one's own"
+    account, seen = recorded.statistics(), statuses.statistics().offered
+    say.detail(f"   {len(owned)} triggers, {len(set(owned))} results: {each}", own=owned)
+    say.detail(
+        f"   the recorder's account: sent {account.offered + account.missed} = taken "
+        f"{account.taken} + dropped {account.dropped} + queued {account.queued} + missed "
+        f"{account.missed}; the dashboard saw {seen} statuses",
+        account=account,
+        statuses=seen,
+    )
+
+
+async def _reserve(camera: FleetCamera[Any], other: smartcam.Camera, say: Steps) -> None:
+    say.step(
+        f"One program has {SHARED} for itself; the dashboard's trigger waits, and says for whom:"
+    )
+    async with camera.reserve(PATIENCE):
+        try:
+            await other.trigger(timeout=SOON)
+        except SmartCamError as exc:
+            say.detail(f"   {exc}", error=type(exc).__name__, reason=str(exc))
+    result = await other.trigger(timeout=PATIENCE)
+    say.detail(f"   and when it is given back: result {result.number}", number=result.number)
+
+
+async def _trigger_all(fleet: Fleet, say: Steps) -> None:
+    loop = asyncio.get_running_loop()
+    begin = loop.time()
+    outcomes = await fleet.trigger(timeout=PATIENCE)
+    taken = loop.time() - begin
+    results: list[Result] = [one for one in outcomes.values() if not isinstance(one, SmartCamError)]
+    say.step(
+        f"All cameras triggered at once: {len(results)} results of {len(outcomes)} cameras after "
+        f"{1e3 * taken:.0f} ms, each inspection about {1e3 * (results[0].latency or 0):.0f} ms",
+        results=len(results),
+        cameras=len(outcomes),
+    )
+
+
+async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, say: Steps) -> None:
+    say.step("Agent south is killed. Every program learns of it at once:")
+    events, loop = fleet.events(), asyncio.get_running_loop()
+    await _drain(events)
+    begin = loop.time()
+    agent.kill()
+    left: list[str] = []
+    async with asyncio.timeout(PATIENCE):
+        while "AgentLeft" not in left or left.count("CameraLeft") < CAMERAS["south"][1]:
+            left.append(type(await anext(events)).__name__)
+    gone = left.count("CameraLeft")
+    say.detail(
+        f"   {1e3 * (loop.time() - begin):.0f} ms later: {gone} cameras and their agent are gone; "
+        f"there are {len(fleet)}, of {', '.join(fleet.agents())}",
+        gone=gone,
+        left=len(fleet),
+    )
+    result = await robot.trigger(timeout=PATIENCE)
+    say.detail(f"   the robot goes on: result {result.number}", number=result.number)
+
+
+async def _drain(events: Any) -> None:
+    """Take what is there already: everybody who was there at first."""
+    while events.statistics().queued:
+        await anext(events)
+
+
+async def _end(agent: Process, robot: smartcam.Camera, say: Steps) -> None:
+    gone = robot.events()
+    agent.terminate()
+    async with asyncio.timeout(PATIENCE):
+        while not isinstance(await anext(gone), smartcam.Disconnected):
+            pass
+        await agent.wait()
+    try:
+        await robot.trigger()
+    except SmartCamError as exc:
+        say.step(
+            f"Agent north ends; its cameras get their Disconnect. The robot's next trigger: {exc}",
+            error=type(exc).__name__,
+        )

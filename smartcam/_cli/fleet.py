@@ -1,0 +1,171 @@
+"""``smartcam fleet``: all cameras of a fleet, or those of a pattern."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.decode import from_hex
+from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.running import JsonErrors, error_json, exit_code, first
+from smartcam._cli.terminal import tinted
+from smartcam._cli.texts import result_text, table_text
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import SmartCamError
+from smartcam.fleet._keys import meets
+from smartcam.models import jsonable
+
+if TYPE_CHECKING:
+    from smartcam.fleet import Fleet, FleetCamera, FleetEvent, FleetResults
+    from smartcam.models import Result
+    from smartcam.streams import Subscription
+
+_EVENTS = {
+    "AgentJoined": "agent {agent}: is there",
+    "AgentLeft": "agent {agent}: is gone",
+    "CameraJoined": "{camera}: shared by agent {agent}",
+    "CameraLeft": "{camera}: shared no more by agent {agent}",
+}
+"""What is said of an event, by the name of its class."""
+
+_READING = ("--interpret-as", "--y-down", "--calibration")
+
+
+class FleetCommands(JsonErrors, click.Group):
+    """Its commands tell a wrong use as JSON, too."""
+
+
+@click.group(
+    cls=FleetCommands,
+    help="Show and use the cameras of a fleet together. URL is fleet://HOST[:PORT], or a fleet "
+    "file: then agent and cameras are in this process, for this command only. PATTERN means "
+    "cameras by their names: * is one part of a name, ** any number of them; default all. Needs "
+    'the extra "fleet", but for a file.',
+)
+def fleet() -> None:
+    """Have the commands of a fleet."""
+
+
+def _opened(url: str, options: Options) -> Fleet:
+    from smartcam.fleet import open
+
+    return open(url, connect_timeout=options.step(10.0), **options.reading(fleet=True))
+
+
+# ---------------------------------------------------------------------- list
+
+
+@fleet.command(name="list", help="List the cameras, and which have no session with their agents.")
+@click.argument("url")
+@click.argument("pattern", default="**")
+@runs("--timeout", *OUTPUT)
+async def list_(url: str, pattern: str, options: Options) -> None:
+    async with _opened(url, options) as opened:
+        found = [_camera(opened, one) for one in opened.cameras(pattern)]
+    if options.as_json:
+        for value in found:
+            options.show(value, "")
+        return
+    if not found:
+        click.echo(f"no camera of the fleet is {pattern}")
+        return
+    head = ("camera", "agent", "application", "status", "url")
+    click.echo(table_text(head, [_row(value) for value in found]))
+    for value in found:
+        if value["reason"] is not None:
+            click.echo(value["reason"])
+
+
+def _camera(opened: Fleet, camera: FleetCamera[Any]) -> dict[str, Any]:
+    """Return what is known of a camera, for JSON."""
+    there = camera.connected
+    return {
+        "camera": camera.name,
+        "agents": opened.agents(camera.name),
+        "connected": there,
+        "application": camera.active_application if there else None,
+        "status": camera.status if there else None,
+        "url": camera.url,
+        "reason": None if camera.trouble is None else str(camera.trouble),
+    }
+
+
+def _row(value: dict[str, Any]) -> tuple[str, ...]:
+    application, status = "", "not connected"
+    if value["connected"]:
+        application, status = str(value["application"]), str(value["status"])
+    return value["camera"], ", ".join(value["agents"]), application, status, value["url"]
+
+
+# ---------------------------------------------------------------------- watch
+
+
+@fleet.command(
+    help="Print results of all cameras as they come, and which agents and cameras come and go, "
+    "until Ctrl-C, --count results or --seconds."
+)
+@click.argument("url")
+@click.argument("pattern", default="**")
+@runs(*_READING, "--count", "--seconds", "--timeout", *OUTPUT, interrupted=0)
+async def watch(url: str, pattern: str, options: Options) -> None:
+    async with _opened(url, options) as opened:
+        results, events = opened.results(pattern), opened.events()
+        jobs = [_show_results(results, options), _show_events(events, pattern, options)]
+        await first(jobs, options.seconds)
+
+
+async def _show_results(results: FleetResults[Any], options: Options) -> None:
+    done = 0
+    async for result in results:
+        options.show(result, _named_text)
+        done += 1
+        if done == options.count:
+            return
+
+
+async def _show_events(events: Subscription[FleetEvent], pattern: str, options: Options) -> None:
+    async for event in events:
+        fields: dict[str, Any] = jsonable(event)
+        if meets(pattern, fields.get("camera", pattern)):
+            kind = type(event).__name__
+            options.show({"event": kind, **fields}, _EVENTS[kind].format(**fields))
+
+
+def _named_text(result: Result) -> str:
+    return f"{result.camera}: {result_text(result)}"
+
+
+# ---------------------------------------------------------------------- trigger
+
+
+@fleet.command(
+    help="Trigger all cameras at the same time, and print one outcome for each by name: its "
+    "result, or why there is none. Exit code: 0 if all gave results, else that of the first error."
+)
+@click.argument("url")
+@click.argument("pattern", default="**")
+@click.option("--input", "input_hex", metavar="HEX", help="Input data for the inspections.")
+@runs(*_READING, "--timeout", *OUTPUT)
+async def trigger(url: str, pattern: str, input_hex: str | None, options: Options) -> None:
+    data = None if input_hex is None else from_hex(input_hex, "--input")
+    timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
+    async with _opened(url, options) as opened:
+        outcomes = await opened.trigger(pattern, timeout=timeout, input=data)
+    codes: list[int] = []
+    for name, outcome in sorted(outcomes.items()):
+        if isinstance(outcome, SmartCamError):
+            codes.append(exit_code(outcome))
+            _show_error(name, outcome, codes[-1], options)
+        else:
+            options.show(outcome, _named_text)
+    if codes:
+        raise SystemExit(codes[0])
+
+
+def _show_error(name: str, error: SmartCamError, code: int, options: Options) -> None:
+    text = str(error)
+    if options.as_json:
+        click.echo(error_json(error, text, code, camera=name))
+    else:
+        click.echo(f"{name}: {tinted('error', 'error:')} {text.removeprefix(f'{name}: ')}")

@@ -1,0 +1,224 @@
+"""Checks on the way to a camera of a fleet: host, bus, agent, and the agent's session with it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from typing import TYPE_CHECKING, Any, cast
+
+from smartcam._suggestions import did_you_mean
+from smartcam.doctor._findings import Exit
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectFailedError,
+    ConnectionLostError,
+    ResponseTimeoutError,
+)
+from smartcam.fleet._address import FleetAddress
+from smartcam.fleet._keys import Keys
+from smartcam.fleet._zenoh import ZenohEnd
+
+if TYPE_CHECKING:
+    from smartcam.doctor._context import Examination
+    from smartcam.exceptions import SmartCamError
+    from smartcam.fleet import FleetCamera
+    from smartcam.settings import Address
+
+LOOKS_WITHIN = 1.0
+"""Seconds in which an agent that has just been started, or joined its router, shows up."""
+
+LOOK_AGAIN = 0.1
+
+MOST_LISTED = 20
+"""Cameras that a finding names."""
+
+SERVE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
+LISTENS = (
+    "Without one it is tcp/127.0.0.1:7447, which only programs on the same computer reach; "
+    "tcp/0.0.0.0:7447 is for all."
+)
+
+
+def address_of(url: str) -> Address:
+    """Return the address of a camera of a fleet.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    address = FleetAddress.parse(url)
+    if not address.camera:
+        raise ConfigurationError(
+            f"doctor: {url!r:.200} names no camera: expected fleet://HOST[:PORT]/CAMERA; "
+            "smartcam fleet list URL tells which there are"
+        )
+    return address.of(address.camera)
+
+
+# ---------------------------------------------------------------------- the bus
+
+
+async def reach(exam: Examination) -> None:
+    """Check ``bus``: whether something takes a connection there, and answers as a bus does."""
+    address, limit = FleetAddress.parse(exam.address.url), exam.options.step(10.0)
+    place, cure = exam.host_and_port, SERVE.format(host=exam.address.host) + LISTENS
+    try:
+        async with asyncio.timeout(limit):
+            _, writer = await asyncio.open_connection(exam.address.host, exam.address.port)
+    except TimeoutError:
+        exam.fail(
+            f"nobody answers at {place} within {limit:g} s",
+            "Look at address, network, cable, power and firewall.",
+        )
+        return
+    except OSError as exc:
+        why = os.strerror(exc.errno) if exc.errno else exc
+        exam.fail(f"nothing takes a connection at {place}: {why}", cure)
+        return
+    writer.transport.abort()
+    end = ZenohEnd(address.link)
+    begin = asyncio.get_running_loop().time()
+    try:
+        await end.open(limit)
+    except ConnectFailedError as exc:
+        tls = address.scheme == "fleet+tls"
+        exam.fail(
+            f"something listens at {place}, and it is no bus of a fleet: {exc.attempts[0]}",
+            "Look at the certificates: their authority, the host's name in the agent's, and "
+            "whether this program's is one of its clients."
+            if tls
+            else "Something else has this port, or it wants TLS (fleet+tls://). " + cure,
+        )
+        return
+    exam.stack.push_async_callback(end.close)
+    exam.bus = end
+    taken = 1e3 * (asyncio.get_running_loop().time() - begin)
+    exam.say(
+        "ok",
+        f"the bus at {place} answers, after {taken:.1f} ms",
+        url=address._replace(camera="").url,
+    )
+
+
+# ---------------------------------------------------------------------- the agent
+
+
+async def find(exam: Examination) -> None:
+    """Check ``agent``: whether one is there, and has the camera."""
+    address = FleetAddress.parse(exam.address.url)
+    cameras = await _cameras(exam, address)
+    agents = sorted({agent for _, agent, _ in cameras})
+    named = address.fleet
+    of = "" if named is None else f" of the fleet {named}"
+    if not cameras:
+        exam.fail(
+            f"the bus answers, and no agent{of} is there",
+            "Something is a router there, and no smartcam serve has joined it. Is it running, and "
+            "does the connect: of its fleet file name this router?"
+            + ("" if named is None else f" Is it of the fleet {named} (fleet: {named})?"),
+        )
+        return
+    sharing = [(fleet, agent) for fleet, agent, name in cameras if name == address.camera]
+    fleets = sorted({fleet for fleet, _ in sharing})
+    details: dict[str, Any] = {"agents": agents, "cameras": len({one[2] for one in cameras})}
+    if not sharing:
+        names = sorted({name for _, _, name in cameras})
+        listed = ", ".join(names[:MOST_LISTED]) + (" ..." if len(names) > MOST_LISTED else "")
+        exam.fail(
+            f"no agent{of} has a camera {address.camera}{did_you_mean(address.camera, names)}",
+            f"Agents there: {', '.join(agents)}. Their cameras: {listed}.",
+            **details,
+        )
+    elif len(fleets) > 1:
+        exam.fail(
+            f"several fleets have a camera {address.camera}: {', '.join(fleets)}",
+            f"Say which one is meant: ?fleet={fleets[0]}.",
+            **details,
+        )
+    else:
+        names = [agent for _, agent in sharing]
+        several = len(names) > 1
+        exam.say(
+            "hint" if several else "ok",
+            f"agent{'s' if several else ''} {', '.join(names)} of the fleet {fleets[0]} "
+            f"{'have' if several else 'has'} this camera; cameras there: {details['cameras']}",
+            "A camera serves one client: one of them takes it from the other." if several else "",
+            **details,
+        )
+
+
+async def _cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, str, str]]:
+    """Return fleet, agent and name of all cameras; that who has just come is there, too."""
+    bus, loop = exam.bus, asyncio.get_running_loop()
+    if bus is None:
+        raise LookupError("there is no bus; what uses it comes behind what reaches it")
+    end = loop.time() + LOOKS_WITHIN
+    pattern = Keys(address.fleet or "*").camera("*", "**")
+    while True:
+        found: list[tuple[str, str, str]] = []
+        for key in await bus.present(pattern, max(LOOK_AGAIN, end - loop.time())):
+            _, fleet, _, _, agent, *chunks = key.split("/")
+            found.append((fleet, agent, "/".join(chunks)))
+        if loop.time() > end or any(name == address.camera for *_, name in found):
+            return sorted(found)
+        await asyncio.sleep(LOOK_AGAIN)
+
+
+# ---------------------------------------------------------------------- the session
+
+
+async def connect(exam: Examination) -> None:
+    """Check ``session``: whether the agent answers, and has a session with the camera."""
+    loop = asyncio.get_running_loop()
+    camera = exam.make_camera()
+    try:
+        await camera.open()
+    except ConnectFailedError as exc:
+        lost = isinstance(exc.__cause__, ConnectionLostError)
+        exam.fail(
+            exc.attempts[0],
+            "Ask the doctor about the camera's own address, on the agent's host: the url: of its "
+            "fleet file, which smartcam serve --json prints, too."
+            if lost
+            else "The agent is there and does not answer: is it stopped, or so busy? Restart it.",
+        )
+        return
+    exam.camera, exam.connected_at = camera, loop.time()
+    exam.say(
+        "ok",
+        f"the agent has a session with the camera: dialect {camera.capabilities.dialect}, "
+        f"protocol version {camera.protocol_version}",
+        protocol_version=camera.protocol_version,
+    )
+
+
+async def reserve(exam: Examination) -> None:
+    """Check ``reservation``: for triggers the camera has to be ours alone."""
+    if not exam.wants_trigger:
+        return
+    exam.wants_trigger = False  # until it is ours
+    camera, limit = cast("FleetCamera[Any]", exam.patient), exam.options.step(10.0)
+    try:
+        await exam.stack.enter_async_context(camera.reserve(limit))
+    except ResponseTimeoutError as exc:
+        exam.fail(
+            f"no triggers are sent: {exc}",
+            "Wait for the program that has it, or leave out --trigger.",
+            exit_code=Exit.RAN_OUT,
+        )
+        return
+    exam.wants_trigger = True
+    exam.say("ok", "the camera is reserved, so that no other program's triggers come between")
+
+
+def explain_loss(exam: Examination, error: SmartCamError) -> None:
+    """Say why a session is over."""
+    age = asyncio.get_running_loop().time() - exam.connected_at
+    exam.check = "lost"
+    exam.fail(
+        f"the session ended after {age:.1f} s: {error}",
+        "Look at the agent: does smartcam serve still run, what does it say? And ask the doctor "
+        "about the camera's own address, on the agent's host.",
+        exit_code=Exit.RAN_OUT if isinstance(error, ResponseTimeoutError) else Exit.NO_SESSION,
+        after=age,
+        error=str(error),
+    )
