@@ -8,7 +8,6 @@ deadline, with the program's cancellation, and with the program itself.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import time
 from dataclasses import dataclass, field
@@ -263,13 +262,14 @@ class Agent:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
         begun = now()
+        inside = False
+        told: list[bytes] | None = None
         try:
-            async with contextlib.AsyncExitStack() as stack:
-                if said in PASSES_GATE:
-                    await stack.enter_async_context(host.gate.command(call.program, call.timeout))
-                fields, blobs = await ACTIONS[said](
-                    call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
-                )
+            if said in PASSES_GATE:
+                await host.gate.enter(call.program, call.timeout)
+                inside = True
+                call = call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
+            fields, blobs = await ACTIONS[said](call)
         except TimeoutError as exc:
             error: BaseException = exc
             if not isinstance(exc, SmartCamError):
@@ -287,7 +287,17 @@ class Agent:
             reply, blobs = {"error": to_fields(exc)}, []
         else:
             reply = {"answer": fields}
-        host.flush()
+            if said == "trigger":
+                told = host.untold
+        finally:
+            if inside:
+                host.gate.leave(call.program)
+        if told:  # others hear of it a little later
+            reply["told"] = len(told)
+            blobs = [*blobs, *told]
+            host.flush(states=False)
+        else:
+            host.flush()
         reply |= {"states": host.states.following, "results": host.results.following}
         self._reply(call.program, call.owner.call, reply, blobs)
 

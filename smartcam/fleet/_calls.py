@@ -65,13 +65,17 @@ class Call(NamedTuple):
         return value
 
 
+_PLAIN = Carrier()
+
+
 async def _trigger(call: Call) -> Answer:
     layouts = call.argument("layouts", str, dict)
     if isinstance(layouts, dict):
         layouts = {int(key): text for key, text in layouts.items()}
     data = call.blobs[0] if call.blobs else None
     wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
-    request = TriggerRequest(Carrier(call.owner, layouts), data, wanted, wait)
+    carrier = _PLAIN.of(call.owner) if layouts is None else Carrier(call.owner, layouts)
+    request = TriggerRequest(carrier, data, wanted, wait)
     outcomes = call.host.outcomes
     runs = outcomes[call.owner] = []
     try:

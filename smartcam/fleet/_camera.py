@@ -451,6 +451,8 @@ class FleetCamera(Camera[ValueT]):
         deadline = self._deadline(limit)
         self._require_session()
         reply = await self._caller.call(do, deadline, arguments, blobs, call)
+        if "told" in reply.fields:
+            self._receiver.take_told(reply)
         await self._reach(reply, deadline)
         return reply
 
@@ -480,7 +482,7 @@ class FleetCamera(Camera[ValueT]):
                 results=request.results,
                 wait=request.wait,
             )
-            if len(reply.blobs) != 1:
+            if not reply.blobs:
                 raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
             return self._receiver.outcomes(own, decode_runs(reply.blobs[0], "a trigger's results"))
         finally:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +23,7 @@ from smartcam.fleet._wire import (
     Run,
     encode,
     encode_runs,
+    encode_state,
     timestamp,
 )
 from smartcam.models import StatusChanged, jsonable
@@ -39,6 +39,10 @@ if TYPE_CHECKING:
 
 MOST_STATES = 1000
 MOST_STATE_BYTES = 1 << 19
+HOLD = 0.005
+"""Seconds that a status may wait for others, so that one message tells them. The program whose
+trigger it belongs to hears of it with the reply."""
+
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
 """Seconds behind the last results after which their numbers are told again: the last of them may
 have been lost on the way, and nothing else would tell."""
@@ -82,11 +86,12 @@ class Host:
         self._epoch = epoch
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self._camera = self._make()
-        self._states_out: Publisher = bus.publisher(keys.states(name))
+        self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
         self._fresh: list[bytes] = []  # runs that are not said yet
         self._fresh_states: list[bytes] = []
         self._flushing = False
+        self._held: asyncio.TimerHandle | None = None  # says the states
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
 
@@ -138,6 +143,7 @@ class Host:
         await self._camera.close()
         if self._reminder is not None:
             self._reminder.cancel()
+        self._flush_states()
         self._states_out.close()
         self._results_out.close()
 
@@ -193,7 +199,7 @@ class Host:
     # ------------------------------------------------------------------ what comes
 
     def _on_status(self, status: Status) -> None:
-        self._say({"kind": "Status"})
+        self._say({"kind": "Status"}, hold=HOLD)
 
     def _on_event(self, event: CameraEvent) -> None:
         if isinstance(event, StatusChanged):
@@ -202,14 +208,17 @@ class Host:
         del fields["camera"]
         self._say({"kind": type(event).__name__, "event": fields})
 
-    def _say(self, fields: dict[str, Any]) -> None:
-        """Say what happened, and what the camera is now."""
+    def _say(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
+        """Say what happened, and what the camera is now; in ``hold`` seconds, or with the next."""
         clock = time.monotonic()
         said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
-        data = json.dumps(said, separators=(",", ":")).encode()
+        data = encode_state(said)
         self.states.add(1, clock, data)
         self._fresh_states.append(data)
-        self._flush_soon()
+        if hold and self._held is None:
+            self._held = asyncio.get_running_loop().call_later(hold, self._flush_states)
+        elif not hold:
+            self._flush_states()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool) -> None:
         """Keep results that came together, and say them at the end of this turn of the loop."""
@@ -238,20 +247,32 @@ class Host:
             self.outcomes[owner].append(data)
         if self._results_out.heard:
             self._fresh.append(data)
-            self._flush_soon()
+            if not self._flushing:
+                self._flushing = True
+                asyncio.get_running_loop().call_soon(self._flush_results)
 
-    def _flush_soon(self) -> None:
-        if not self._flushing:
-            self._flushing = True
-            asyncio.get_running_loop().call_soon(self.flush)
+    @property
+    def untold(self) -> list[bytes]:
+        """States that are not said yet."""
+        return self._fresh_states
 
-    def flush(self) -> None:
-        """Say what is not said yet."""
-        self._flushing = False
+    def flush(self, *, states: bool = True) -> None:
+        """Say what is not said yet; without ``states`` only results."""
+        if states:
+            self._flush_states()
+        self._flush_results()
+
+    def _flush_states(self) -> None:
+        if self._held is not None:
+            self._held.cancel()
+            self._held = None
         if self._fresh_states:
             fresh, self._fresh_states = self._fresh_states, []
             following = self.states.following
             self._states_out.put(encode({"epoch": self._epoch, "following": following}, fresh))
+
+    def _flush_results(self) -> None:
+        self._flushing = False
         if self._fresh:
             fresh, self._fresh = self._fresh, []
             self._results_out.put(encode_runs(self._epoch, self.results.following, fresh))

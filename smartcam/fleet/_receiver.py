@@ -299,12 +299,25 @@ class Receiver:
         try:
             message = decode(payload, what)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
+            self._count(payload)
+            if epoch == self.epoch and following <= self._states.expected:
+                return  # it came with replies
             states = [state(one) for one in message.blobs]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
             logger.warning("%s ! %s: %s", self._name, what, exc)
             return
-        self._count(payload)
         self._states.receive(epoch, following, states)
+        self._wake()
+
+    def take_told(self, reply: Message) -> None:
+        """Take the states at the end of a reply, which are not said to all yet."""
+        try:
+            told, following = int(reply.fields["told"]), int(reply.fields["states"])
+            states = [state(one) for one in reply.blobs[len(reply.blobs) - told :]]
+        except (KeyError, TypeError, ValueError) as exc:
+            logger.warning("%s ! what the agent says with a reply: %s", self._camera, exc)
+            return
+        self._states.receive(int(reply.fields.get("epoch", 0)), following, states)
         self._wake()
 
     def _hear_results(self, key: str, payload: bytes) -> None:

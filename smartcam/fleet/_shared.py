@@ -6,6 +6,7 @@ which program's trigger brought it. A layout matters only as far as it has an ``
 
 from __future__ import annotations
 
+import copy
 import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -52,6 +53,12 @@ class Carrier(Interpretation):
     def __init__(self, owner: Owner = NOBODY, layouts: Any = None) -> None:
         super().__init__(layouts, lenient=True, y_down=False)
         self._carried = Carried(owner, b"")
+
+    def of(self, owner: Owner) -> Carrier:
+        """Return the same for another's trigger, which costs less than a new one."""
+        other = copy.copy(self)
+        other._carried = Carried(owner, b"")  # noqa: SLF001 - its own class
+        return other
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
