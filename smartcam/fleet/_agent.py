@@ -61,11 +61,13 @@ class Guest:
         number: by which results say whose they are.
         tasks: its calls under way.
         entered: what its temporary switches go back to.
+        told: the number up to which it has heard of states with its replies, by camera.
     """
 
     number: int
     tasks: dict[int, asyncio.Task[None]] = field(default_factory=dict[int, "asyncio.Task[None]"])
     entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
+    told: dict[str, int] = field(default_factory=dict[str, int])
     _known: set[int] = field(default_factory=set[int])
     _floor: int = 0
 
@@ -130,7 +132,7 @@ class Agent:
             for name, settings in self._cameras.items():
                 host = Host(name, settings, bus, keys, self.epoch, self._history)
                 self.hosts[name] = host
-                self._start(host.run(), f"smartcam.fleet.{name}")
+                self._own(asyncio.create_task(host.run(), name=f"smartcam.fleet.{name}"))
             declared.append(bus.be_present(keys.agent(self.name)))
             declared.extend(bus.be_present(keys.camera(self.name, name)) for name in self.hosts)
         except BaseException:
@@ -156,11 +158,14 @@ class Agent:
         """Wait until each camera was tried once, well or not; bounded."""
         await asyncio.gather(*(host.tried(FIRST_TRY) for host in self.hosts.values()))
 
-    def _start(self, work: Any, name: str) -> asyncio.Task[None]:
-        task = asyncio.get_running_loop().create_task(work, name=name)
+    def _own(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        return task
+
+    def _end(self, call: asyncio.Task[None]) -> None:
+        """Cancel a call, which nobody else looks after from now on."""
+        self._own(call)
+        call.cancel()
 
     # ------------------------------------------------------------------ programs
 
@@ -174,7 +179,7 @@ class Agent:
         if guest is None:
             return
         for task in guest.tasks.values():
-            task.cancel()
+            self._end(task)
         for host in self.hosts.values():
             host.gate.forget(program)
         if going_back:
@@ -240,25 +245,25 @@ class Agent:
         owner = Owner(guest.number, number)
         arguments: Any = fields.get("arguments", {})
         call = Call(host, program, owner, arguments, message.blobs, timeout, guest.entered)
-        task = self._start(self._do(said, call), f"smartcam.fleet.{host.name}.{said}")
-        guest.tasks[number] = task
-        task.add_done_callback(lambda _: guest.tasks.pop(number, None))
+        guest.tasks[number] = asyncio.get_running_loop().create_task(
+            self._do(said, call, guest), name=f"smartcam.fleet.{host.name}.{said}"
+        )
 
     def _cancel(self, host: Host, program: str, number: int) -> None:
         guest = self._programs.get(program)
         if guest is None:
             return
         guest.is_new(number)  # if it comes yet, it comes too late
-        task = guest.tasks.get(number)
+        task = guest.tasks.pop(number, None)
         if task is not None:
-            task.cancel()
+            self._end(task)
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
         if entered is not None:  # it was done, and its program does not know
             camera, before = entered
             camera.leave(before)
 
-    async def _do(self, said: str, call: Call) -> None:
+    async def _do(self, said: str, call: Call, guest: Guest) -> None:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
         begun = now()
@@ -288,13 +293,15 @@ class Agent:
         else:
             reply = {"answer": fields}
             if said == "trigger":
-                told = host.untold
+                told = host.untold(guest.told.get(host.name, 0))
         finally:
             if inside:
                 host.gate.leave(call.program)
+            guest.tasks.pop(call.owner.call, None)
         if told:  # others hear of it a little later
             reply["told"] = len(told)
             blobs = [*blobs, *told]
+            guest.told[host.name] = host.states.following
             host.flush(states=False)
         else:
             host.flush()

@@ -391,7 +391,7 @@ class FleetCamera(Camera[ValueT]):
         elif status == previous:
             return
         self._heard_status = True
-        if status != previous:
+        if status != previous and self._listeners.sees_events:
             self._listeners.publish(
                 StatusChanged(camera=self.name, at=at, status=status, previous=previous)
             )
@@ -618,6 +618,8 @@ class FleetCamera(Camera[ValueT]):
 
 
 def _time(said: dict[str, Any]) -> datetime:
+    if "event" not in said:
+        return datetime.now(UTC)
     try:
         return datetime.fromisoformat(said["event"]["at"])
     except (KeyError, TypeError, ValueError):

@@ -251,10 +251,10 @@ class Host:
                 self._flushing = True
                 asyncio.get_running_loop().call_soon(self._flush_results)
 
-    @property
-    def untold(self) -> list[bytes]:
-        """States that are not said yet."""
-        return self._fresh_states
+    def untold(self, since: int) -> list[bytes]:
+        """Return the states that are not said yet, from number ``since`` on."""
+        fresh = self._fresh_states
+        return fresh[max(0, since - self.states.following + len(fresh)) :]
 
     def flush(self, *, states: bool = True) -> None:
         """Say what is not said yet; without ``states`` only results."""

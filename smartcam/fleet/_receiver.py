@@ -64,7 +64,7 @@ def state(data: bytes) -> State:
     Raises:
         ValueError: it is nothing of the kind.
     """
-    said: Any = json.loads(data)
+    said: Any = json.loads(str(data, "utf-8"))
     if not isinstance(said, dict) or not isinstance(said.get("number"), int):
         raise ValueError(f"no state: {data[:40]!r}")  # noqa: TRY004 - as json's own
     return State(said["number"], said)
@@ -300,9 +300,10 @@ class Receiver:
             message = decode(payload, what)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
             self._count(payload)
-            if epoch == self.epoch and following <= self._states.expected:
-                return  # it came with replies
-            states = [state(one) for one in message.blobs]
+            known = 0  # those that came with replies
+            if epoch == self.epoch:
+                known = max(0, self._states.expected - following + len(message.blobs))
+            states = [state(one) for one in message.blobs[known:]]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
             logger.warning("%s ! %s: %s", self._name, what, exc)
             return

@@ -6,7 +6,6 @@ which program's trigger brought it. A layout matters only as far as it has an ``
 
 from __future__ import annotations
 
-import copy
 import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -56,8 +55,8 @@ class Carrier(Interpretation):
 
     def of(self, owner: Owner) -> Carrier:
         """Return the same for another's trigger, which costs less than a new one."""
-        other = copy.copy(self)
-        other._carried = Carried(owner, b"")  # noqa: SLF001 - its own class
+        other = Carrier.__new__(Carrier)
+        other.__dict__ = {**self.__dict__, "_carried": Carried(owner, b"")}
         return other
 
     def __call__(
