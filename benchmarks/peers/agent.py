@@ -16,12 +16,17 @@ from smartcam.fleet import FleetFile
 __all__ = ["fleet_file"]
 
 
+HISTORY = 250_000
+"""Results that the agent keeps: a whole round, so that none is lost on a machine that is busy."""
+
+
 def fleet_file(cameras: dict[str, int]) -> FleetFile:
     """Return a fleet of cameras, by their ports."""
     urls = {name: f"bvs://127.0.0.1:{port}?dialect=handbook" for name, port in cameras.items()}
     return FleetFile.model_validate(
         {
             "listen": "tcp/127.0.0.1:0",
+            "history": {"results": HISTORY, "bytes": 100 * HISTORY},
             "cameras": {name: {"url": url} for name, url in urls.items()},
         }
     )

@@ -100,7 +100,7 @@ class Zenoh:
 
     def close(self) -> None:
         """End the session."""
-        self._session.close()
+        cast("Any", self._session).close()
 
 
 class Echo(asyncio.Protocol):
