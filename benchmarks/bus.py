@@ -36,7 +36,7 @@ from benchmarks.peers.echo import RESULTS, Zenoh, asking
 from benchmarks.yardsticks import BareClient
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable
+    from collections.abc import Awaitable, Callable, Iterable, Iterator
 
     from smartcam.models import SubscriberStatistics
 
@@ -71,16 +71,23 @@ def run(plan: Plan) -> Iterable[Comparison]:
         return
     with contextlib.ExitStack() as stack:
         cameras = {how: stack.enter_context(peer("trigger", how)) for how in HOW}
-        cameras["free"] = stack.enter_context(peer("stream"))
-        shared = (f"{name}={port}" for name, port in cameras.items())
-        agent = Control(stack.enter_context(peer("agent", *shared)))
+        agent = stack.enter_context(_agent(cameras))
+        # a link that is not alone in its process gives way to the others after each few results
+        streaming = {"free": stack.enter_context(peer("stream"))}
+        alone = stack.enter_context(_agent(streaming))
         echoes = {
             name: Control(stack.enter_context(peer("echo", kind)))
             for name, kind in ((ZENOH, "zenoh"), (TCP, "tcp"))
         }
         for how in HOW:
             yield from asyncio.run(_triggers(plan, how, cameras[how], agent, echoes))
-        yield from asyncio.run(_stream(plan, cameras["free"], agent, echoes))
+        yield from asyncio.run(_stream(plan, streaming["free"], alone, echoes))
+
+
+@contextlib.contextmanager
+def _agent(cameras: dict[str, int]) -> Iterator[Control]:
+    with peer("agent", *(f"{name}={port}" for name, port in cameras.items())) as control:
+        yield Control(control)
 
 
 class Meter:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,12 @@ MOST_STATE_BYTES = 1 << 19
 HOLD = 0.005
 """Seconds that a status may wait for others, so that one message tells them. The program whose
 trigger it belongs to hears of it with the reply."""
+
+GATHER = 0.002
+"""Seconds between two messages with results, at least: those that come faster go together."""
+
+FULL = 1 << 16
+"""Bytes of results that go at once, however soon after the last."""
 
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
 """Seconds behind the last results after which their numbers are told again: the last of them may
@@ -90,7 +97,9 @@ class Host:
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
         self._fresh: list[bytes] = []  # runs that are not said yet
         self._fresh_states: list[bytes] = []
-        self._flushing = False
+        self._fresh_bytes = 0
+        self._due: asyncio.Handle | None = None  # says the results
+        self._said_at = -math.inf
         self._held: asyncio.TimerHandle | None = None  # says the states
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
@@ -143,7 +152,7 @@ class Host:
         await self._camera.close()
         if self._reminder is not None:
             self._reminder.cancel()
-        self._flush_states()
+        self.flush()
         self._states_out.close()
         self._results_out.close()
 
@@ -221,7 +230,7 @@ class Host:
             self._flush_states()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool) -> None:
-        """Keep results that came together, and say them at the end of this turn of the loop."""
+        """Keep results that came together, and say them: soon, with what comes meanwhile."""
         first = results[0]
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (OWNED if first.triggered_at is not None else 0)
@@ -247,9 +256,14 @@ class Host:
             self.outcomes[owner].append(data)
         if self._results_out.heard:
             self._fresh.append(data)
-            if not self._flushing:
-                self._flushing = True
-                asyncio.get_running_loop().call_soon(self._flush_results)
+            self._fresh_bytes += len(data)
+            if self._fresh_bytes >= FULL:
+                self._flush_results()
+            elif self._due is None:
+                loop = asyncio.get_running_loop()
+                at = self._said_at + GATHER
+                call = self._flush_results
+                self._due = loop.call_at(at, call) if at > loop.time() else loop.call_soon(call)
 
     def untold(self, since: int) -> list[bytes]:
         """Return the states that are not said yet, from number ``since`` on."""
@@ -272,8 +286,11 @@ class Host:
             self._states_out.put(encode({"epoch": self._epoch, "following": following}, fresh))
 
     def _flush_results(self) -> None:
-        self._flushing = False
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
         if self._fresh:
+            self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
             fresh, self._fresh = self._fresh, []
             self._results_out.put(encode_runs(self._epoch, self.results.following, fresh))
             self._remind(0)
