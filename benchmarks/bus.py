@@ -57,6 +57,8 @@ ZENOH, TCP = "zenoh", "asyncio TCP"
 BATCHES, ITEMS = "batch=True", "item by item"
 HOW = ("together", "apart")
 RATE = 20_000
+LIMIT = 60.0
+"""Seconds until a stream that is not through is an error."""
 
 CPU = "CPU time of agent and program together, the engine's threads included"
 BARE = "a question and an answer as long as a trigger's, or batches; both sides together"
@@ -71,17 +73,16 @@ def run(plan: Plan) -> Iterable[Comparison]:
         return
     with contextlib.ExitStack() as stack:
         cameras = {how: stack.enter_context(peer("trigger", how)) for how in HOW}
-        agent = stack.enter_context(_agent(cameras))
-        # a link that is not alone in its process gives way to the others after each few results
-        streaming = {"free": stack.enter_context(peer("stream"))}
-        alone = stack.enter_context(_agent(streaming))
+        cameras["free"] = stack.enter_context(peer("stream"))
+        # one each: a link that is not alone in its process gives way to the others again and again
+        agents = {name: stack.enter_context(_agent({name: port})) for name, port in cameras.items()}
         echoes = {
             name: Control(stack.enter_context(peer("echo", kind)))
             for name, kind in ((ZENOH, "zenoh"), (TCP, "tcp"))
         }
         for how in HOW:
-            yield from asyncio.run(_triggers(plan, how, cameras[how], agent, echoes))
-        yield from asyncio.run(_stream(plan, streaming["free"], alone, echoes))
+            yield from asyncio.run(_triggers(plan, how, cameras[how], agents[how], echoes))
+        yield from asyncio.run(_stream(plan, cameras["free"], agents["free"], echoes))
 
 
 @contextlib.contextmanager
@@ -153,6 +154,7 @@ async def _triggers(
     async def triggers(camera: smartcam.Camera) -> float:
         """Return the time of one in the middle, microseconds."""
         took: list[float] = []
+        result: Any = None
         for _ in range(count):
             begin = time.perf_counter()
             result = await camera.trigger()
@@ -219,7 +221,8 @@ async def _stream(
         """Return how many came in a second."""
         begin = time.perf_counter()
         taking = _items if name == ITEMS else _batches
-        account = await taking(camera, count)
+        async with asyncio.timeout(LIMIT):  # one that is lost never comes
+            account = await taking(camera, count)
         took = time.perf_counter() - begin
         assert (account.taken, account.dropped, account.missed) == (count, 0, 0), account
         return count / took
