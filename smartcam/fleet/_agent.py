@@ -8,7 +8,6 @@ deadline, with the program's cancellation, and with the program itself.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import time
 from dataclasses import dataclass, field
@@ -62,11 +61,13 @@ class Guest:
         number: by which results say whose they are.
         tasks: its calls under way.
         entered: what its temporary switches go back to.
+        told: the number up to which it has heard of states with its replies, by camera.
     """
 
     number: int
     tasks: dict[int, asyncio.Task[None]] = field(default_factory=dict[int, "asyncio.Task[None]"])
     entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
+    told: dict[str, int] = field(default_factory=dict[str, int])
     _known: set[int] = field(default_factory=set[int])
     _floor: int = 0
 
@@ -190,9 +191,17 @@ class Agent:
     def begin(self, work: Any, name: str) -> asyncio.Task[None]:
         """Have something done in a task, which ends with the agent."""
         task = asyncio.get_running_loop().create_task(work, name=name)
+        self._own(task)
+        return task
+
+    def _own(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        return task
+
+    def _end(self, call: asyncio.Task[None]) -> None:
+        """Cancel a call, which nobody else looks after from now on."""
+        self._own(call)
+        call.cancel()
 
     # ------------------------------------------------------------------ programs
 
@@ -206,7 +215,7 @@ class Agent:
         if guest is None:
             return
         for task in guest.tasks.values():
-            task.cancel()
+            self._end(task)
         for host in self.hosts.values():
             host.gate.forget(program)
         if going_back:
@@ -278,36 +287,36 @@ class Agent:
         owner = Owner(guest.number, number)
         arguments: Any = fields.get("arguments", {})
         call = Call(host, program, owner, arguments, message.blobs, timeout, guest.entered)
-        task = self.begin(self._do(said, call), f"smartcam.fleet.{host.name}.{said}")
-        guest.tasks[number] = task
-        task.add_done_callback(lambda _: guest.tasks.pop(number, None))
+        guest.tasks[number] = asyncio.get_running_loop().create_task(
+            self._do(said, call, guest), name=f"smartcam.fleet.{host.name}.{said}"
+        )
 
     def _cancel(self, host: Host, program: str, number: int) -> None:
         guest = self._programs.get(program)
         if guest is None:
             return
         guest.is_new(number)  # if it comes yet, it comes too late
-        task = guest.tasks.get(number)
+        task = guest.tasks.pop(number, None)
         if task is not None:
-            task.cancel()
+            self._end(task)
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
         if entered is not None:  # it was done, and its program does not know
             camera, before = entered
             camera.leave(before)
 
-    async def _do(self, said: str, call: Call) -> None:
+    async def _do(self, said: str, call: Call, guest: Guest) -> None:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
         begun = now()
+        inside = False
+        told: list[bytes] | None = None
         try:
-            async with contextlib.AsyncExitStack() as stack:
-                if said in PASSES_GATE:
-                    turn = host.turn(call.program, said, call.timeout)
-                    await stack.enter_async_context(turn)
-                fields, blobs = await ACTIONS[said](
-                    call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
-                )
+            if said in PASSES_GATE:
+                await host.enter(call.program, said, call.timeout)
+                inside = True
+                call = call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
+            fields, blobs = await ACTIONS[said](call)
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
                 logger.exception("%s ! %s failed", host.name, said)
@@ -315,7 +324,19 @@ class Agent:
             blobs = []
         else:
             reply = {"answer": fields}
-        host.flush()
+            if said == "trigger":
+                told = host.untold(guest.told.get(host.name, 0))
+        finally:
+            if inside:
+                host.gate.leave(call.program)
+            guest.tasks.pop(call.owner.call, None)
+        if told:  # others hear of it a little later
+            reply["told"] = len(told)
+            blobs = [*blobs, *told]
+            guest.told[host.name] = host.states.following
+            host.flush(states=False)
+        else:
+            host.flush()
         reply |= {"states": host.states.following, "results": host.results.following}
         self._reply(call.program, call.owner.call, reply, blobs)
 

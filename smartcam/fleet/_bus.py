@@ -63,8 +63,16 @@ class Bus(abc.ABC):
         """Say something that somebody waits for; never blocks."""
 
     @abc.abstractmethod
-    def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
-        """Return what says things under ``key``; ``on_heard`` is told when that changes."""
+    def publisher(
+        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+    ) -> Publisher:
+        """Return what says things under ``key``.
+
+        Args:
+            key: where.
+            on_heard: is told whether anybody hears it, when that changes.
+            urgent: in one line with what :meth:`put` says; else behind it.
+        """
 
     @abc.abstractmethod
     def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
@@ -202,7 +210,9 @@ class MemoryEnd(Bus):
             for one in end.matching(end.heard, key):
                 self._loop.call_soon(_call, one, key, payload)
 
-    def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
+    def publisher(
+        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+    ) -> Publisher:
         return _MemoryPublisher(self, self.publishers, key, on_heard)
 
     def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:

@@ -292,21 +292,19 @@ class Caller:
             fields |= {"epoch": met.epoch, "deadline": self.clock(deadline), "timeout": timeout}
             deadline += grace(timeout)
         waiting = program.expect(number, self)
+        timer = asyncio.get_running_loop().call_at(deadline, _expire, waiting)
         try:
             self.counters.bytes_sent += program.send(key, fields, blobs)
             self.counters.frames_sent += 1
-            async with asyncio.timeout_at(deadline):
-                reply = await waiting
+            reply = await waiting
         except TimeoutError as exc:
-            if waiting.done() and not waiting.cancelled():
-                reply = waiting.result()
-            else:
-                self._cancel(key, number)
-                raise self._silence(do, deadline - begun) from exc
+            self._cancel(key, number)
+            raise self._silence(do, deadline - begun) from exc
         except asyncio.CancelledError:
             self._cancel(key, number)
             raise
         finally:
+            timer.cancel()
             program.forget(number)
         self.counters.frames_received += 1
         if reply.fields.get("stranger") and self.met is met and met is not None:
@@ -342,6 +340,11 @@ class Caller:
             "done is unknown",
             waited=waited,
         )
+
+
+def _expire(waiting: asyncio.Future[Message]) -> None:
+    if not waiting.done():
+        waiting.set_exception(TimeoutError())
 
 
 def _unknown(error: LinkError) -> LinkError:

@@ -65,15 +65,20 @@ class Call(NamedTuple):
         return value
 
 
+_PLAIN = Carrier()
+
+
 async def _trigger(call: Call) -> Answer:
     layouts = call.argument("layouts", str, dict)
     if isinstance(layouts, dict):
         layouts = {int(key): text for key, text in layouts.items()}
     data = call.blobs[0] if call.blobs else None
     wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
-    each = bool(call.argument("by_application", bool))
-    carrier = Carrier(call.owner, layouts, by_application=each)
-    expected = call.argument("expected", int)
+    expected, each = call.argument("expected", int), bool(call.argument("by_application", bool))
+    if layouts is None and not each:
+        carrier = _PLAIN.of(call.owner)
+    else:
+        carrier = Carrier(call.owner, layouts, by_application=each)
     request = TriggerRequest(carrier, data, wanted, wait, expected)
     application = call.argument("application", int)
     runs = await outcomes(call.host, call.owner, request, application, call.timeout)

@@ -430,7 +430,7 @@ class FleetCamera(Camera[ValueT]):
         elif status == previous:
             return
         self._heard_status = True
-        if status != previous:
+        if status != previous and self._listeners.sees_events:
             self._listeners.publish(
                 StatusChanged(camera=self.name, at=at, status=status, previous=previous)
             )
@@ -497,6 +497,8 @@ class FleetCamera(Camera[ValueT]):
         deadline = self._deadline(limit)
         self._require_session()
         reply = await self._caller.call(do, deadline, arguments, blobs, call, limit)
+        if "told" in reply.fields:
+            self._receiver.take_told(reply)
         await self._reach(reply, deadline)
         return reply
 
@@ -527,7 +529,7 @@ class FleetCamera(Camera[ValueT]):
                 results=request.results,
                 wait=request.wait,
             )
-            if len(reply.blobs) != 1:
+            if not reply.blobs:
                 raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
             return self._receiver.outcomes(own, decode_runs(reply.blobs[0], "a trigger's results"))
         finally:
@@ -669,6 +671,8 @@ class FleetCamera(Camera[ValueT]):
 
 
 def _time(said: dict[str, Any]) -> datetime:
+    if "event" not in said:
+        return datetime.now(UTC)
     try:
         return datetime.fromisoformat(said["event"]["at"])
     except (KeyError, TypeError, ValueError):

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.models import Result, SubscriberStatistics
 
+
 @dataclass(frozen=True, slots=True)
 class FleetEvent:
     """Something that happened to a fleet.

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import contextlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Hashable
+    from collections.abc import Hashable
 
 
 @dataclass(eq=False, slots=True)
@@ -32,14 +31,25 @@ class Gate:
     _active: collections.Counter[str] = field(default_factory=collections.Counter[str])
     _line: collections.deque[_Waiting] = field(default_factory=collections.deque["_Waiting"])
 
-    @contextlib.asynccontextmanager
-    async def command(self, program: str, timeout: float) -> AsyncGenerator[None]:
-        """A command of ``program`` runs as long as the body; TimeoutError after ``timeout`` s."""
-        await self._pass(program, None, timeout)
-        try:
-            yield
-        finally:
-            self._active[program] -= 1
+    async def enter(self, program: str, timeout: float) -> None:
+        """Let a command of ``program`` begin; it ends with :meth:`leave`.
+
+        Raises:
+            TimeoutError: not within ``timeout`` seconds.
+        """
+        if not self._line and self.holder in {None, program}:
+            self._active[program] += 1
+        else:
+            await self._pass(program, None, timeout)
+
+    def leave(self, program: str) -> None:
+        """A command of ``program`` has ended."""
+        left = self._active[program] - 1
+        if left:
+            self._active[program] = left
+        else:
+            del self._active[program]
+        if self._line:
             self._grant()
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
@@ -84,7 +94,7 @@ class Gate:
             elif reservation is not None:
                 self.release(reservation)
             else:
-                self._active[program] -= 1
+                self.leave(program)
             self._grant()
             raise
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
+import math
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.interpretation import Interpretation
@@ -20,12 +20,13 @@ from smartcam.fleet._wire import (
     Run,
     encode,
     encode_runs,
+    encode_state,
     timestamp,
 )
 from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Hashable, Sequence
+    from collections.abc import Callable, Hashable, Sequence
 
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._keys import Keys
@@ -36,6 +37,16 @@ if TYPE_CHECKING:
 
 MOST_STATES = 1000
 MOST_STATE_BYTES = 1 << 19
+HOLD = 0.005
+"""Seconds that a status may wait for others, so that one message tells them. The program whose
+trigger it belongs to hears of it with the reply."""
+
+GATHER = 0.002
+"""Seconds between two messages with results, at least: those that come faster go together."""
+
+FULL = 1 << 16
+"""Bytes of results that go at once, however soon after the last."""
+
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
 """Seconds behind the last results after which their numbers are told again: the last of them may
 have been lost on the way, and nothing else would tell."""
@@ -87,11 +98,14 @@ class Host:
         self._camera = self._make()
         self._fresh: list[bytes] = []  # runs that are not said yet
         self._fresh_states: list[bytes] = []
-        self._flushing = False
+        self._fresh_bytes = 0
+        self._due: asyncio.Handle | None = None  # says the results
+        self._said_at = -math.inf
+        self._held: asyncio.TimerHandle | None = None  # says the states
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
         self._over = False  # there will be no session any more
-        self._states_out: Publisher = bus.publisher(keys.states(name))
+        self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
 
     @property
@@ -156,6 +170,7 @@ class Host:
         await self._camera.close()
         if self._reminder is not None:
             self._reminder.cancel()
+        self.flush()
         self._states_out.close()
         self._results_out.close()
         self.topics.close()
@@ -180,20 +195,17 @@ class Host:
             ) from self.failure
         return self._camera
 
-    @contextlib.asynccontextmanager
-    async def turn(self, program: str, said: str, timeout: float) -> AsyncGenerator[None]:
-        """A command of ``program`` has its turn as long as the body runs.
+    async def enter(self, program: str, said: str, timeout: float) -> None:
+        """Let a command of ``program`` begin, as :meth:`Gate.enter` does.
 
         Raises:
             ResponseTimeoutError, TriggerTimeoutError: another program has reserved the camera for
                 ``timeout`` seconds more.
         """
-        async with contextlib.AsyncExitStack() as stack:
-            try:
-                await stack.enter_async_context(self.gate.command(program, timeout))
-            except TimeoutError as exc:
-                raise self._reserved(said, timeout) from exc
-            yield
+        try:
+            await self.gate.enter(program, timeout)
+        except TimeoutError as exc:
+            raise self._reserved(said, timeout) from exc
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
@@ -256,7 +268,7 @@ class Host:
 
     def _on_status(self, status: Status) -> None:
         self.topics.on_status(status)
-        self._say({"kind": "Status"})
+        self._say({"kind": "Status"}, hold=HOLD)
 
     def _on_event(self, event: CameraEvent) -> None:
         self._tell(event)
@@ -275,18 +287,21 @@ class Host:
             self._over = True
             self._say({"kind": "Over"})
 
-    def _say(self, fields: dict[str, Any]) -> None:
-        """Say what happened, and what the camera is now."""
+    def _say(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
+        """Say what happened, and what the camera is now; in ``hold`` seconds, or with the next."""
         clock = asyncio.get_running_loop().time()
         said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
-        data = json.dumps(said, separators=(",", ":")).encode()
+        data = encode_state(said)
         self.states.add(1, clock, data)
         self._fresh_states.append(data)
-        self._flush_soon()
+        if hold and self._held is None:
+            self._held = asyncio.get_running_loop().call_later(hold, self._flush_states)
+        elif not hold:
+            self._flush_states()
         self.topics.on_state()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
-        """Keep results that came together, and say them at the end of this turn of the loop."""
+        """Keep results that came together, and say them: soon, with what comes meanwhile."""
         first = results[0]
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (LATE if late else 0)
@@ -312,22 +327,42 @@ class Host:
             self.outcomes[owner].append(data)
         if self._results_out.heard:
             self._fresh.append(data)
-            self._flush_soon()
+            self._fresh_bytes += len(data)
+            if self._fresh_bytes >= FULL:
+                self._flush_results()
+            elif self._due is None:
+                loop = asyncio.get_running_loop()
+                at = self._said_at + GATHER
+                call = self._flush_results
+                self._due = loop.call_at(at, call) if at > loop.time() else loop.call_soon(call)
         self.topics.on_run(run)
 
-    def _flush_soon(self) -> None:
-        if not self._flushing:
-            self._flushing = True
-            asyncio.get_running_loop().call_soon(self.flush)
+    def untold(self, since: int) -> list[bytes]:
+        """Return the states that are not said yet, from number ``since`` on."""
+        fresh = self._fresh_states
+        return fresh[max(0, since - self.states.following + len(fresh)) :]
 
-    def flush(self) -> None:
-        """Say what is not said yet."""
-        self._flushing = False
+    def flush(self, *, states: bool = True) -> None:
+        """Say what is not said yet; without ``states`` only results."""
+        if states:
+            self._flush_states()
+        self._flush_results()
+
+    def _flush_states(self) -> None:
+        if self._held is not None:
+            self._held.cancel()
+            self._held = None
         if self._fresh_states:
             fresh, self._fresh_states = self._fresh_states, []
             following = self.states.following
             self._states_out.put(encode({"epoch": self._epoch, "following": following}, fresh))
+
+    def _flush_results(self) -> None:
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
         if self._fresh:
+            self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
             fresh, self._fresh = self._fresh, []
             self._results_out.put(encode_runs(self._epoch, self.results.following, fresh))
             self._remind(0)

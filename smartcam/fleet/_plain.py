@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import contextlib
 import json
 import logging
 from dataclasses import dataclass, field
@@ -389,17 +388,20 @@ class Plain:
     ) -> dict[str, Any]:
         service, loop = order.service, asyncio.get_running_loop()
         self._numbers += 1
-        async with contextlib.AsyncExitStack() as stack:
-            if service.command and (service is not STOP or host.name in self._added):
-                program = f"{request.program or 'a program'} without smartcam"
-                left = deadline - loop.time()
-                await stack.enter_async_context(host.turn(program, order.name, left))
+        program = f"{request.program or 'a program'} without smartcam"
+        gated = service.command and (service is not STOP or host.name in self._added)
+        if gated:
+            await host.enter(program, order.name, deadline - loop.time())
+        try:
             left = max(0.0, deadline - loop.time())
             owner = Owner(self._program, self._numbers)
             answer = await service.do(Work(host, host.topics, request, left, owner))
             if service is STOP and host.name in self._added:
                 self._added.discard(host.name)
                 await self._agent.unshare(host.name)
+        finally:
+            if gated:
+                host.gate.leave(program)
         return answer
 
     # ------------------------------------------------------------------ cameras that Setup adds

@@ -63,7 +63,7 @@ def state(data: bytes) -> State:
     Raises:
         ValueError: it is nothing of the kind.
     """
-    said: Any = json.loads(data)
+    said: Any = json.loads(str(data, "utf-8"))
     if not isinstance(said, dict) or not isinstance(said.get("number"), int):
         raise ValueError(f"no state: {data[:40]!r}")  # noqa: TRY004 - as json's own
     return State(said["number"], said)
@@ -298,12 +298,26 @@ class Receiver:
         try:
             message = decode(payload, what)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
-            states = [state(one) for one in message.blobs]
+            self._count(payload)
+            known = 0  # those that came with replies
+            if epoch == self.epoch:
+                known = max(0, self._states.expected - following + len(message.blobs))
+            states = [state(one) for one in message.blobs[known:]]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
             logger.warning("%s ! %s: %s", self._name, what, exc)
             return
-        self._count(payload)
         self._states.receive(epoch, following, states)
+        self._wake()
+
+    def take_told(self, reply: Message) -> None:
+        """Take the states at the end of a reply, which are not said to all yet."""
+        try:
+            told, following = int(reply.fields["told"]), int(reply.fields["states"])
+            states = [state(one) for one in reply.blobs[len(reply.blobs) - told :]]
+        except (KeyError, TypeError, ValueError) as exc:
+            logger.warning("%s ! what the agent says with a reply: %s", self._camera, exc)
+            return
+        self._states.receive(int(reply.fields.get("epoch", 0)), following, states)
         self._wake()
 
     def _hear_results(self, key: str, payload: bytes) -> None:

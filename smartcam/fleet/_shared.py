@@ -62,6 +62,12 @@ class Carrier(Interpretation):
     def by_application(self) -> bool:
         return self._each
 
+    def of(self, owner: Owner) -> Carrier:
+        """Return the same for another's trigger, which costs less than a new one."""
+        other = Carrier.__new__(Carrier)
+        other.__dict__ = {**self.__dict__, "_carried": Carried(owner, b"")}
+        return other
+
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
     ) -> Interpreted:

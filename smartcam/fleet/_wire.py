@@ -41,13 +41,19 @@ class Message(NamedTuple):
 
 
 _LENGTH = struct.Struct("<I")
+_as_json = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+
+
+def encode_state(fields: dict[str, Any]) -> bytes:
+    """Return what happened as bytes: one of a message's byte strings."""
+    return _as_json(fields).encode()
 
 
 def encode(fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> bytes:
     """Return a message as bytes."""
     if blobs:
         fields = {**fields, "blobs": [len(one) for one in blobs]}
-    head = json.dumps(fields, separators=(",", ":"), allow_nan=False).encode()
+    head = _as_json(fields).encode()
     return b"".join((_LENGTH.pack(len(head)), head, *blobs))
 
 
@@ -62,7 +68,7 @@ def decode(payload: bytes, what: str) -> Message:
         end = _LENGTH.size + size
         if end > len(payload):
             raise ValueError(f"{size} bytes of JSON were announced, {len(payload)} came in all")
-        fields: Any = json.loads(payload[_LENGTH.size : end])
+        fields: Any = json.loads(str(payload[_LENGTH.size : end], "utf-8"))
         if not isinstance(fields, dict):
             raise TypeError(f"a JSON object was expected, not {type(fields).__name__}")
         known = cast("dict[str, Any]", fields)

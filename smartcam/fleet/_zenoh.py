@@ -167,6 +167,10 @@ class ZenohEnd(Bus):
         self._sender: ThreadPoolExecutor | None = None
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
+        zenoh = self._zenoh
+        how = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
+        self._dropping = {**how, "congestion_control": zenoh.CongestionControl.DROP}
+        self._blocking = {**how, "congestion_control": zenoh.CongestionControl.BLOCK}
 
     # ------------------------------------------------------------------ life
 
@@ -263,18 +267,15 @@ class ZenohEnd(Bus):
     # ------------------------------------------------------------------ what is said
 
     def put(self, key: str, payload: bytes) -> None:
-        zenoh, session = self._zenoh, self._session
+        session = self._session
         if session is None:
             return
-        how: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
-        if len(payload) > LONG:
-            how["congestion_control"] = zenoh.CongestionControl.BLOCK
-            if self._sender is None:
-                self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
-            self._sender.submit(_put, session, key, payload, how)
+        if len(payload) <= LONG:
+            _put(session, key, payload, self._dropping)
             return
-        how["congestion_control"] = zenoh.CongestionControl.DROP
-        _put(session, key, payload, how)
+        if self._sender is None:
+            self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
+        self._sender.submit(_put, session, key, payload, self._blocking)
 
     def reply(self, query: Any, replies: list[tuple[str, bytes]]) -> None:
         """Answer a query, and end it; never waits.
@@ -295,16 +296,21 @@ class ZenohEnd(Bus):
         with self._lock:
             self._replying -= 1
 
-    def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
-        return _Publisher(self, key, on_heard)
+    def publisher(
+        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+    ) -> Publisher:
+        return _Publisher(self, key, on_heard, urgent=urgent)
 
     def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
         in_loop, full = self._in_loop, self._full
 
+        key = None if "*" in pattern else pattern  # which saves asking for it
+
         def on_sample(sample: Any) -> None:
             payload = sample.payload.to_bytes()
             if not full(len(payload)):
-                in_loop(declared.call, len(payload), hear, str(sample.key_expr), payload)
+                said = key or str(sample.key_expr)
+                in_loop(declared.call, len(payload), hear, said, payload)
 
         declared = _Declared(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, _direct(on_sample)))
@@ -436,7 +442,9 @@ class _Declared(Handle):
 
 
 class _Publisher(Publisher):
-    def __init__(self, end: ZenohEnd, key: str, on_heard: Callable[[bool], None] | None) -> None:
+    def __init__(
+        self, end: ZenohEnd, key: str, on_heard: Callable[[bool], None] | None, *, urgent: bool
+    ) -> None:
         zenoh = end.engine
         self._end = end
         self._heard = False
@@ -446,7 +454,7 @@ class _Publisher(Publisher):
             return session.declare_publisher(
                 key,
                 congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.DATA,
+                priority=zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA,
                 express=False,
             )
 
