@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import asyncio
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -257,5 +257,5 @@ PASSES_GATE = COMMANDS - {"reserve", "release", "leave"}
 
 
 def now() -> float:
-    """Return the agent's clock, seconds; only differences mean anything."""
-    return time.monotonic()
+    """Return the agent's clock, its loop's, seconds; only differences mean anything."""
+    return asyncio.get_running_loop().time()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import time
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.interpretation import Interpretation
@@ -204,7 +203,7 @@ class Host:
 
     def _say(self, fields: dict[str, Any]) -> None:
         """Say what happened, and what the camera is now."""
-        clock = time.monotonic()
+        clock = asyncio.get_running_loop().time()
         said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
         data = json.dumps(said, separators=(",", ":")).encode()
         self.states.add(1, clock, data)
@@ -217,7 +216,7 @@ class Host:
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (OWNED if first.triggered_at is not None else 0)
         cells = first.value.cells
-        clock = time.monotonic()
+        clock = asyncio.get_running_loop().time()
         run = Run(
             self.results.following,
             first.application,
