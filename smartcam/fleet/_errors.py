@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any, cast
 
 import smartcam.exceptions
@@ -46,7 +47,10 @@ def from_fields(fields: Any) -> SmartCamError:
 
 
 def _like(default: object, value: Any) -> Any:
-    """Return a value of JSON as what stands there by default: it has no tuples."""
+    """Return a value of JSON as what stands there by default: it has no tuples, and no bytes."""
+    if isinstance(default, bytes) and isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            return bytes.fromhex(value)
     return tuple(value) if isinstance(default, tuple) and isinstance(value, list) else value
 
 
