@@ -39,7 +39,7 @@ class Gate:
         try:
             yield
         finally:
-            self._active[program] -= 1
+            self._end(program)
             self._grant()
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
@@ -84,9 +84,15 @@ class Gate:
             elif reservation is not None:
                 self.release(reservation)
             else:
-                self._active[program] -= 1
+                self._end(program)
             self._grant()
             raise
+
+    def _end(self, program: str) -> None:
+        """A command has ended; programs without any are not kept."""
+        self._active[program] -= 1
+        if not self._active[program]:
+            del self._active[program]
 
     def _grant(self) -> None:
         while self._line and self._may(self._line[0]):
