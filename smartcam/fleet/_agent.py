@@ -61,23 +61,29 @@ class Guest:
     Attributes:
         number: by which results say whose they are.
         tasks: its calls under way.
+        floor: calls up to this one are not done, or not again.
         entered: what its temporary switches go back to.
     """
 
     number: int
+    floor: int = 0
     tasks: dict[int, asyncio.Task[None]] = field(default_factory=dict[int, "asyncio.Task[None]"])
     entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
     _known: set[int] = field(default_factory=set[int])
-    _floor: int = 0
+
+    @property
+    def last(self) -> int:
+        """The highest number of a call that was seen."""
+        return max(self._known, default=self.floor)
 
     def is_new(self, call: int) -> bool:
         """Whether a call has not been seen; it is known from now on."""
-        if call <= self._floor or call in self._known:
+        if call <= self.floor or call in self._known:
             return False
         self._known.add(call)
         if len(self._known) > KNOWN_CALLS:
             kept = sorted(self._known)[KNOWN_CALLS // 2 :]
-            self._floor = kept[0] - 1
+            self.floor = kept[0] - 1
             self._known = set(kept)
         return True
 
@@ -108,6 +114,7 @@ class Agent:
         self._cameras, self._history = cameras, history
         self.hosts: dict[str, Host] = {}
         self._programs: dict[str, Guest] = {}
+        self._gone: dict[str, int] = {}  # programs that left, oldest first: their last call
         self._numbers = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._declared: list[Handle] = []
@@ -174,6 +181,9 @@ class Agent:
         guest = self._programs.pop(program, None)
         if guest is None:
             return
+        self._gone[program] = guest.last
+        if len(self._gone) > MOST_PROGRAMS:
+            del self._gone[next(iter(self._gone))]
         for task in guest.tasks.values():
             task.cancel()
         for host in self.hosts.values():
@@ -182,13 +192,14 @@ class Agent:
             for camera, before in guest.entered.values():
                 camera.leave(before)
 
-    def _guest(self, program: str) -> Guest:
-        known = self._programs.get(program)
-        if known is None:
+    def _guest(self, program: str, call: int) -> Guest | None:
+        """Return who says hello; None where that was said before it left, and comes only now."""
+        known, left = self._programs.get(program), self._gone.get(program, 0)
+        if known is None and call > left:
             if len(self._programs) >= MOST_PROGRAMS:
                 raise LocalProtocolError(f"{self.name}: {MOST_PROGRAMS} programs are here already")
             self._numbers += 1
-            known = self._programs[program] = Guest(self._numbers)
+            known = self._programs[program] = Guest(self._numbers, left)
         return known
 
     # ------------------------------------------------------------------ calls
@@ -214,7 +225,7 @@ class Agent:
             self._cancel(host, program, int(fields["cancel"]))
             return
         said = str(fields["do"])
-        guest = self._guest(program) if said == "hello" else self._programs.get(program)
+        guest = self._guest(program, number) if said == "hello" else self._programs.get(program)
         if guest is None or fields.get("epoch", self.epoch) != self.epoch:
             stranger = ConnectionLostError(
                 f"{host.name}: the agent {self.name} was restarted, or took this program for "

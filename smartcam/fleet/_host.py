@@ -81,13 +81,13 @@ class Host:
         self._epoch = epoch
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self._camera = self._make()
-        self._states_out: Publisher = bus.publisher(keys.states(name))
-        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
         self._fresh: list[bytes] = []  # runs that are not said yet
         self._fresh_states: list[bytes] = []
         self._flushing = False
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
+        self._states_out: Publisher = bus.publisher(keys.states(name))
+        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
 
     @property
     def camera(self) -> SharedCamera:

@@ -1,0 +1,273 @@
+"""A command is done once per call, over a bus that loses, doubles, delays and mixes up."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from random import Random
+from typing import Any
+
+import pytest
+
+from smartcam.exceptions import (
+    ConnectionLostError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.fleet._wire import decode
+from smartcam.models import Disconnected, Reconnected
+from smartcam.streams import Subscription
+from tests.client.clientkit import gone
+from tests.fleet.fleetkit import NAME, NumberedCamera, Plant, end_of, until
+from tests.fleet.lossy_bus import Fate, LossyBus, as_said, chance_of, only
+
+
+def token(number: int) -> dict[str, bytes]:
+    """Return the input that tells which call it is."""
+    return {"input": number.to_bytes(4, "little")}
+
+
+def slow(seconds: float) -> NumberedCamera:
+    return NumberedCamera(time=seconds)
+
+
+async def _runs(results: Subscription[Any]) -> AsyncIterator[int]:
+    for _ in range(results.statistics().queued):
+        yield (await anext(results)).value.run
+
+
+class Recorded:
+    """A bus whose commands are kept, to be said again."""
+
+    def __init__(self) -> None:
+        self.bus = LossyBus(self.fate)
+        self.said: list[tuple[str, bytes]] = []
+
+    def fate(self, key: str, payload: bytes) -> Sequence[float]:
+        if key.split("/")[2] in {"command", "ask"}:
+            self.said.append((key, payload))
+        return (0.0,)
+
+    def calls(self, do: str) -> list[tuple[str, bytes]]:
+        return [one for one in self.said if decode(one[1], "it").fields.get("do") == do]
+
+
+async def test_doubled_calls_and_replies_are_one() -> None:
+    bus = LossyBus(lambda _key, _payload: (0.0, 0.0, 0.01))
+    async with Plant(bus=bus) as plant, plant.camera() as camera:
+        for number in range(1, 51):
+            result = await camera.trigger(timeout=1.0)
+            assert result.value.run == number == plant.box.runs  # type: ignore[attr-defined]
+        await asyncio.sleep(0.1)
+        assert plant.box.runs == 50  # type: ignore[attr-defined]
+
+
+async def test_lost_reply_is_a_timeout_that_does_not_guess() -> None:
+    bus = LossyBus()
+    async with Plant(bus=bus) as plant, plant.camera() as camera:
+        bus.fate = only("reply", lambda *_: ())
+        error = await gone(camera.trigger(timeout=0.5))
+        assert isinstance(error, TriggerTimeoutError)
+        assert "whether the camera was triggered is unknown" in str(error)
+        assert "agent" in str(error)
+        error = await gone(camera.start(timeout=0.5))
+        assert isinstance(error, ResponseTimeoutError)
+        assert "whether it was done is unknown" in str(error)
+        bus.fate = as_said
+        assert (await camera.trigger(timeout=1.0)).value.run == 2
+
+
+async def test_lost_command_is_a_timeout_and_nothing_was_done() -> None:
+    bus = LossyBus()
+    async with Plant(bus=bus) as plant, plant.camera() as camera:
+        bus.fate = only("command", lambda *_: ())
+        assert isinstance(await gone(camera.trigger(timeout=0.5)), TriggerTimeoutError)
+        bus.fate = as_said
+        assert (await camera.trigger(timeout=1.0)).value.run == 1
+
+
+async def test_call_that_comes_after_its_deadline_is_not_done() -> None:
+    bus = LossyBus()
+    async with Plant(bus=bus) as plant, plant.camera() as camera:
+        bus.fate = only("command", lambda *_: (5.0,))
+        assert isinstance(await gone(camera.trigger(timeout=0.5)), TriggerTimeoutError)
+        bus.fate = as_said
+        await asyncio.sleep(10.0)
+        assert (await camera.trigger(timeout=1.0)).value.run == 1
+
+
+async def test_cancelled_call_that_comes_after_its_cancellation_is_not_done() -> None:
+    bus = LossyBus()
+    late = [True]
+
+    def overtaken(_key: str, _payload: bytes) -> Sequence[float]:
+        return (1.0,) if late.pop() else (0.0,)
+
+    async with Plant(bus=bus) as plant, plant.camera() as camera:
+        late.insert(0, False)
+        bus.fate = only("command", overtaken)
+        task = asyncio.create_task(camera.trigger(timeout=60.0))
+        await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.wait({task})
+        bus.fate = as_said
+        await asyncio.sleep(5.0)
+        assert (await camera.trigger(timeout=1.0)).value.run == 1
+
+
+async def test_late_double_is_not_done_after_the_agent_was_restarted() -> None:
+    record = Recorded()
+    async with Plant(bus=record.bus) as plant, plant.camera() as camera:
+        for number in range(1, 4):
+            await camera.trigger(2, timeout=60.0, **token(number))
+        await plant.stop_agent()
+        await plant.start_agent()
+        await camera.wait_connected()
+        for key, payload in record.calls("trigger"):
+            end_of(camera).put(key, payload)
+        result = await camera.trigger(2, timeout=60.0, **token(4))
+        assert result.value.token == 4
+        assert [*plant.box.inputs.values()] == [1, 2, 3, 4]  # type: ignore[attr-defined]
+
+
+async def test_late_double_is_not_done_after_its_program_was_cut_off_and_came_back() -> None:
+    """The agent forgets a program that is gone, and yet does nothing of before for it."""
+    record = Recorded()
+    async with Plant(bus=record.bus) as plant, plant.camera() as camera:
+        for number in range(1, 4):
+            await camera.trigger(2, timeout=60.0, **token(number))
+        end_of(camera).detach()
+        await asyncio.sleep(0.1)
+        end_of(camera).attach()
+        await camera.wait_connected()
+        for key, payload in record.calls("trigger"):
+            end_of(camera).put(key, payload)
+        result = await camera.trigger(2, timeout=60.0, **token(4))
+        assert result.value.token == 4
+        assert [*plant.box.inputs.values()] == [1, 2, 3, 4]  # type: ignore[attr-defined]
+
+
+async def test_double_of_a_program_that_is_gone_is_not_done_and_nothing_of_it_is_kept() -> None:
+    record = Recorded()
+    async with Plant(bus=record.bus) as plant:
+        async with plant.camera() as camera:
+            await camera.trigger(timeout=60.0)
+        await asyncio.sleep(0.1)
+        assert plant.agent._programs == {}
+        other = plant.bus.end()
+        await other.open(1.0)
+        for key, payload in [*record.said]:
+            other.put(key, payload)
+        await asyncio.sleep(1.0)
+        assert plant.box.runs == 1  # type: ignore[attr-defined]
+        assert plant.agent._programs == {}
+        await other.close()
+
+
+async def test_agent_that_is_restarted_ends_calls_at_once_and_is_met_again() -> None:
+    async with Plant(slow(5.0)) as plant, plant.camera() as camera:
+        events, results = camera.events(), camera.results()
+        calls = [asyncio.create_task(camera.trigger(timeout=600.0)) for _ in range(3)]
+        await asyncio.sleep(1.0)
+        begun = asyncio.get_running_loop().time()
+        plant.end.detach()  # it is gone without a word
+        errors = await asyncio.gather(*calls, return_exceptions=True)
+        assert asyncio.get_running_loop().time() - begun < 0.1
+        for error in errors:
+            assert isinstance(error, ConnectionLostError)
+            assert "agent" in str(error)
+            assert "unknown" in str(error)
+        assert not camera.connected
+        assert isinstance(await gone(camera.trigger(timeout=1.0)), ConnectionLostError)
+        await plant.stop_agent()
+        await until(lambda: not plant.box.sessions)
+        await plant.start_agent()
+        await camera.wait_connected()
+        assert camera.status == await camera.query_status() if False else camera.connected
+        result = await camera.trigger(timeout=600.0)
+        assert result.value.run == plant.box.runs  # type: ignore[attr-defined]
+        kinds = [type(await anext(events)) for _ in range(events.statistics().queued)]
+        assert [kind for kind in kinds if kind in {Disconnected, Reconnected}] == [
+            Disconnected,
+            Reconnected,
+        ]
+        # of the run of before its end may come, too, which is nobody's now
+        assert [run async for run in _runs(results)][-1] == result.value.run
+
+
+async def test_status_is_right_after_an_agent_was_restarted() -> None:
+    async with Plant() as plant, plant.camera() as camera:
+        before = camera.status
+        await plant.stop_agent()
+        await until(lambda: not camera.connected)
+        plant.box.device.stop()
+        await plant.start_agent()
+        await camera.wait_connected()
+        assert camera.status == plant.agent.hosts[NAME].camera.status != before
+
+
+async def test_agent_of_the_same_name_whose_presence_never_ended_is_met_anew() -> None:
+    """One that was cut off, and another start of it elsewhere before its lease was over."""
+    async with Plant() as plant, plant.camera() as camera:
+        results = camera.results()
+        first = await camera.trigger(timeout=1.0)
+        assert (await anext(results)).number == first.number
+        plant.agent.epoch -= 10**9
+        plant.agent._forget(camera._program.name)  # as one that was started anew, it knows nobody
+        error = await gone(camera.trigger(timeout=1.0))
+        assert isinstance(error, ConnectionLostError)
+        assert "restarted" in str(error)
+        await camera.wait_connected()
+        assert (await camera.trigger(timeout=1.0)).value.run == 2
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 9))])
+async def test_storm_of_calls_does_each_once_at_most(seed: int) -> None:
+    """Ten programs over a bus that does its worst; cancellations, timeouts, agents that restart."""
+    chance = Random(seed)  # noqa: S311
+    worst: Fate = chance_of(chance, lost=0.05, doubled=0.1, late=0.1, by=0.05)
+    bus = LossyBus()
+    plant = Plant(bus=bus)
+    ends: dict[int, str] = {}
+    tokens = iter(range(1, 10_000))
+
+    async def live(calls: int) -> None:
+        camera = plant.camera()
+        async with camera:
+            bus.fate = worst
+            for _ in range(calls):
+                await one_call(camera)
+
+    async def one_call(camera: object) -> None:
+        number = next(tokens)
+        task = asyncio.create_task(
+            camera.trigger(2, timeout=chance.uniform(0.02, 0.5), **token(number))  # type: ignore[attr-defined]
+        )
+        if chance.random() < 0.2:
+            asyncio.get_running_loop().call_later(chance.uniform(0, 0.1), task.cancel)
+        await asyncio.wait({task})
+        if task.cancelled():
+            ends[number] = "cancelled"
+            return
+        error = task.exception()
+        if error is None:
+            assert task.result().value.token == number  # its own, and never another's
+            ends[number] = "result"
+            return
+        assert isinstance(error, SmartCamError)
+        ends[number] = type(error).__name__
+        if isinstance(error, ConnectionLostError):
+            await gone(camera.wait_connected(timeout=5.0))  # type: ignore[attr-defined]
+
+    async with plant:
+        lives = [asyncio.create_task(live(30)) for _ in range(10)]
+        for _ in range(2):
+            await asyncio.sleep(chance.uniform(0.2, 1.0))
+            await plant.stop_agent()
+            await plant.start_agent()
+        await asyncio.gather(*lives)
+    done = [*plant.box.inputs.values()]  # type: ignore[attr-defined]
+    assert len(done) == len(set(done))
+    assert {number for number, end in ends.items() if end == "result"} <= {*done}
+    assert sum(end == "result" for end in ends.values()) > 50
