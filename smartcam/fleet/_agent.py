@@ -42,7 +42,7 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MOST_PROGRAMS = 4096
 MOST_CALLS = 256
-"""Calls of one program that may be under way at a time."""
+"""Calls of one program that may be under way at a time, for each camera of the agent."""
 
 KNOWN_CALLS = 4096
 """Numbers of calls that are remembered for each program; older ones are not done any more."""
@@ -241,9 +241,9 @@ class Agent:
             error = UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
         elif timeout < 0:
             error = _late(said, f"{host.name}: {said} came after its deadline; it was not done")
-        elif len(guest.tasks) >= MOST_CALLS:
+        elif len(guest.tasks) >= MOST_CALLS * len(self.hosts):
             error = LocalProtocolError(
-                f"{host.name}: {MOST_CALLS} calls of this program are under way"
+                f"{host.name}: {len(guest.tasks)} calls of this program are under way"
             )
         if error is not None:
             self._reply(program, number, {"error": to_fields(error)})

@@ -232,7 +232,7 @@ class Caller:
         self._ahead, self._measured = max(least, clock - now), now
 
     def clock(self, at: float) -> float:
-        """Return what the agent's clock says at a time of the loop's: that, or a little more."""
+        """Return what the agent's clock says at a time of the loop's: that, or a little less."""
         return at + self._ahead - DRIFT * max(0.0, at - self._measured)
 
     # ------------------------------------------------------------------ calls

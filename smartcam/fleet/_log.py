@@ -127,7 +127,8 @@ class Feed(Generic[NumberedT]):
 
     Args:
         take: gets each thing once, in order of the numbers.
-        miss: is told how many could not be had any more.
+        miss: is told how many could not be had any more, and what came next; None where nothing
+            did.
         lacks: is called where something is missing; then who made the feed is to ask the agent for
             what follows ``expected``, and to :meth:`fill` it in.
         most_held: bytes that wait for what is missing before them; what comes beyond is dropped,
@@ -142,7 +143,7 @@ class Feed(Generic[NumberedT]):
     def __init__(
         self,
         take: Callable[[NumberedT], None],
-        miss: Callable[[int], None],
+        miss: Callable[[int, NumberedT | None], None],
         lacks: Callable[[], None],
         *,
         most_held: int = 1 << 23,
@@ -189,7 +190,7 @@ class Feed(Generic[NumberedT]):
         if first <= before and not things:
             first = max(following, stuck)  # it says that there is more, and has nothing to show
         if first > before:
-            self._miss(first - before)
+            self._miss(first - before, things[0] if things else None)
             self.expected = first
         for thing in things:
             if thing.next > self.expected:

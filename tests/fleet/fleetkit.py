@@ -28,11 +28,18 @@ PATIENCE = 60.0
 class NumberedCamera(EmulatedCamera):
     """An emulated camera whose results say which run made them, and whose input asked for it.
 
+    Application 1 takes no input, 2 does; with a ``rate``, 1 runs by itself.
+
+    Args:
+        time: seconds of a run, and of a switch.
+        rate: runs in a second.
+        **options: as an emulated camera has them.
+
     Attributes:
         inputs: the input of each run, by the run's number; None without.
     """
 
-    def __init__(self, *, time: float = 0.001, **options: Any) -> None:
+    def __init__(self, *, time: float = 0.001, rate: float | None = None, **options: Any) -> None:
         self.inputs: dict[int, int | None] = {}
         program = {
             "layout": LAYOUT,
@@ -42,7 +49,10 @@ class NumberedCamera(EmulatedCamera):
         }
         options.setdefault("running", True)
         super().__init__(
-            [Application(id=1, **program), Application(id=2, input="token: int32", **program)],
+            [
+                Application(id=1, rate=rate, **program),
+                Application(id=2, input="token: int32", **program),
+            ],
             builtins=False,
             **options,
         )
@@ -99,9 +109,7 @@ class Plant:
         """Start an agent: the first one, or the next after one that is gone."""
         self.end = self.bus.end()
         settings = CameraSettings.make(self.box.url, None, self.session)
-        self.agent = Agent(
-            name, Keys(FLEET), self.end, {NAME: settings}, history=self.history
-        )
+        self.agent = Agent(name, Keys(FLEET), self.end, {NAME: settings}, history=self.history)
         await self.agent.open(PATIENCE)
         await self.agent.wait_tried()
 
@@ -121,9 +129,7 @@ class Plant:
     async def cameras(self, count: int, **options: Any) -> AsyncIterator[list[FleetCamera[Any]]]:
         """Give so many open cameras, each of a program of its own."""
         async with contextlib.AsyncExitStack() as stack:
-            yield [
-                await stack.enter_async_context(self.camera(**options)) for _ in range(count)
-            ]
+            yield [await stack.enter_async_context(self.camera(**options)) for _ in range(count)]
 
 
 def end_of(camera: FleetCamera[Any]) -> MemoryEnd:

@@ -16,13 +16,9 @@ SHORT = [
     "/".join(chunks) for count in (1, 2, 3) for chunks in itertools.product(CHUNKS, repeat=count)
 ]
 NAMES = [
-    "/".join(chunks)
-    for count in range(1, 5)
-    for chunks in itertools.product("ab", repeat=count)
+    "/".join(chunks) for count in range(1, 5) for chunks in itertools.product("ab", repeat=count)
 ]
-PATTERNS = st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=4).map(
-    "/".join
-)
+PATTERNS = st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=4).map("/".join)
 
 
 def means(pattern: list[str], name: list[str]) -> bool:

@@ -140,8 +140,9 @@ class Ear:
     def take(self, things: Things) -> None:
         self.taken += [(things.epoch, number) for number in range(things.number, things.next)]
 
-    def miss(self, count: int) -> None:
+    def miss(self, count: int, then: Things | None) -> None:
         assert count > 0
+        assert then is None or then.number <= self.feed.expected + count <= then.next
         self.missed += count
 
     def lack(self) -> None:

@@ -9,12 +9,15 @@ from typing import Any
 
 import pytest
 
+from smartcam import fleet
 from smartcam.exceptions import (
     ConnectionLostError,
+    LocalProtocolError,
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
 )
+from smartcam.fleet import FleetFile
 from smartcam.fleet._wire import decode
 from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
@@ -222,7 +225,9 @@ async def test_agent_of_the_same_name_whose_presence_never_ended_is_met_anew() -
         assert (await camera.trigger(timeout=1.0)).value.run == 2
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 9))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 9))]
+)
 async def test_storm_of_calls_does_each_once_at_most(seed: int) -> None:
     """Ten programs over a bus that does its worst; cancellations, timeouts, agents that restart."""
     chance = Random(seed)  # noqa: S311
@@ -271,3 +276,18 @@ async def test_storm_of_calls_does_each_once_at_most(seed: int) -> None:
     assert len(done) == len(set(done))
     assert {number for number, end in ends.items() if end == "result"} <= {*done}
     assert sum(end == "result" for end in ends.values()) > 50
+
+
+async def test_as_many_calls_at_once_as_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a program may have under way grows with the cameras: a whole fleet is triggered."""
+    monkeypatch.setattr("smartcam.fleet._agent.MOST_CALLS", 2)
+    file = FleetFile.model_validate({"cameras": {"line1/**": {"emulated": {"count": 5}}}})
+    async with fleet.open(file) as plant:
+        cameras = plant.cameras()
+        await asyncio.gather(*(one.start() for one in cameras))
+        outcomes = await plant.trigger("**", timeout=10.0)
+        assert [one for one in outcomes.values() if isinstance(one, SmartCamError)] == []
+        many = (cameras[0].trigger(timeout=10.0) for _ in range(50))
+        ends = await asyncio.gather(*many, return_exceptions=True)
+        refused = [one for one in ends if isinstance(one, LocalProtocolError)]
+        assert 0 < len(refused) <= 50 - 2
