@@ -223,6 +223,7 @@ class Agent:
         program, number = str(fields["program"]), int(fields["call"])
         if "cancel" in fields:
             self._cancel(host, program, int(fields["cancel"]))
+            self._reply(program, number, {"answer": {}})
             return
         said = str(fields["do"])
         guest = self._guest(program, number) if said == "hello" else self._programs.get(program)
@@ -285,10 +286,11 @@ class Agent:
             error: BaseException = exc
             if not isinstance(exc, SmartCamError):
                 holder = host.gate.holder
+                why = "commands of others" if holder is None else f"reserved by {holder}, which"
                 error = _late(
                     said,
-                    f"{host.name}: reserved by {holder}, which did not let go within "
-                    f"{call.timeout:.3g} s; {said} was not done",
+                    f"{host.name}: {why} did not let go within {call.timeout:.3g} s; "
+                    f"{said} was not done",
                 )
             reply: dict[str, Any] = {"error": to_fields(error)}
             blobs = []
