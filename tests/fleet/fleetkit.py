@@ -10,10 +10,11 @@ from typing import Any
 from smartcam import Backoff
 from smartcam.emulator import Application, EmulatedCamera, Run
 from smartcam.fleet._agent import Agent
-from smartcam.fleet._bus import MemoryBus, MemoryEnd
+from smartcam.fleet._bus import Bus, MemoryBus, MemoryEnd
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._program import Program
+from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
 from smartcam.settings import Address, CameraSettings
 
 FLEET = "plant"
@@ -76,6 +77,7 @@ class Plant:
     Args:
         box: the camera; a numbered one by default.
         bus: a bus that misbehaves, perhaps.
+        zenoh: the bus is Zenoh's, on a free port of this computer.
         history: results, and their bytes, that the agent keeps.
         session: options of the agent's session with the camera.
     """
@@ -85,15 +87,17 @@ class Plant:
         box: EmulatedCamera | None = None,
         *,
         bus: MemoryBus | None = None,
+        zenoh: bool = False,
         history: tuple[int, int] = (10_000, 1 << 24),
         **session: Any,
     ) -> None:
         self.box = NumberedCamera() if box is None else box
         self.bus = MemoryBus() if bus is None else bus
+        self.places = with_ports(["tcp/127.0.0.1:0"]) if zenoh else ()
         self.session = {"reconnect": FAST, "name": NAME, **session}
         self.history = history
         self.agent: Agent
-        self.end: MemoryEnd
+        self.end: Bus
         self._stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Plant:
@@ -107,7 +111,7 @@ class Plant:
 
     async def start_agent(self, name: str = "agent") -> None:
         """Start an agent: the first one, or the next after one that is gone."""
-        self.end = self.bus.end()
+        self.end = ZenohEnd(Link(listen=self.places)) if self.places else self.bus.end()
         settings = CameraSettings.make(self.box.url, None, self.session)
         self.agent = Agent(name, Keys(FLEET), self.end, {NAME: settings}, history=self.history)
         await self.agent.open(PATIENCE)
@@ -121,9 +125,15 @@ class Plant:
         """Return a camera of a program of its own, to be opened; ``end`` of it is its bus'."""
         options.setdefault("interpret_as", LAYOUT)
         options.setdefault("reconnect", FAST)
-        address = Address("fleet", "fleet", "localhost", 7447, path=NAME)
-        settings = CameraSettings.of(address, {"name": NAME, **options})
-        return FleetCamera(settings, NAME, Program(self.bus.end(), FLEET, NAME))
+        end = ZenohEnd(Link(connect=self.places)) if self.places else self.bus.end()
+        settings = CameraSettings.of(self.address, {"name": NAME, **options})
+        return FleetCamera(settings, NAME, Program(end, FLEET, NAME))
+
+    @property
+    def address(self) -> Address:
+        """The camera's; for programs elsewhere where the bus is Zenoh's."""
+        port = int(self.places[0].rpartition(":")[2]) if self.places else 7447
+        return Address("fleet", "fleet", "127.0.0.1", port, path=NAME)
 
     @contextlib.asynccontextmanager
     async def cameras(self, count: int, **options: Any) -> AsyncIterator[list[FleetCamera[Any]]]:

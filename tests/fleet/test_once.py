@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
-from random import Random
 from typing import Any
 
 import pytest
@@ -23,7 +22,7 @@ from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, NumberedCamera, Plant, end_of, until
-from tests.fleet.lossy_bus import Fate, LossyBus, as_said, chance_of, only
+from tests.fleet.lossy_bus import LossyBus, as_said, only
 
 
 def token(number: int) -> dict[str, bytes]:
@@ -223,59 +222,6 @@ async def test_agent_of_the_same_name_whose_presence_never_ended_is_met_anew() -
         assert "restarted" in str(error)
         await camera.wait_connected()
         assert (await camera.trigger(timeout=1.0)).value.run == 2
-
-
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 9))]
-)
-async def test_storm_of_calls_does_each_once_at_most(seed: int) -> None:
-    """Ten programs over a bus that does its worst; cancellations, timeouts, agents that restart."""
-    chance = Random(seed)  # noqa: S311
-    worst: Fate = chance_of(chance, lost=0.05, doubled=0.1, late=0.1, by=0.05)
-    bus = LossyBus()
-    plant = Plant(bus=bus)
-    ends: dict[int, str] = {}
-    tokens = iter(range(1, 10_000))
-
-    async def live(calls: int) -> None:
-        camera = plant.camera()
-        async with camera:
-            bus.fate = worst
-            for _ in range(calls):
-                await one_call(camera)
-
-    async def one_call(camera: object) -> None:
-        number = next(tokens)
-        task = asyncio.create_task(
-            camera.trigger(2, timeout=chance.uniform(0.02, 0.5), **token(number))  # type: ignore[attr-defined]
-        )
-        if chance.random() < 0.2:
-            asyncio.get_running_loop().call_later(chance.uniform(0, 0.1), task.cancel)
-        await asyncio.wait({task})
-        if task.cancelled():
-            ends[number] = "cancelled"
-            return
-        error = task.exception()
-        if error is None:
-            assert task.result().value.token == number  # its own, and never another's
-            ends[number] = "result"
-            return
-        assert isinstance(error, SmartCamError)
-        ends[number] = type(error).__name__
-        if isinstance(error, ConnectionLostError):
-            await gone(camera.wait_connected(timeout=5.0))  # type: ignore[attr-defined]
-
-    async with plant:
-        lives = [asyncio.create_task(live(30)) for _ in range(10)]
-        for _ in range(2):
-            await asyncio.sleep(chance.uniform(0.2, 1.0))
-            await plant.stop_agent()
-            await plant.start_agent()
-        await asyncio.gather(*lives)
-    done = [*plant.box.inputs.values()]  # type: ignore[attr-defined]
-    assert len(done) == len(set(done))
-    assert {number for number, end in ends.items() if end == "result"} <= {*done}
-    assert sum(end == "result" for end in ends.values()) > 50
 
 
 async def test_as_many_calls_at_once_as_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
