@@ -2,7 +2,7 @@
 
 What comes is put into one queue, and a burst wakes the event loop once. Nothing is said in a way
 that could make the loop wait: what does not fit into the engine's buffers is dropped there, and who
-hears it finds the gap by the numbers. Only what is long goes out in a thread, which may wait.
+hears it finds the gap by the numbers. What is long, or much, goes out in a thread, which may wait.
 """
 
 from __future__ import annotations
@@ -43,7 +43,16 @@ LONG = 1 << 16
 """Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
 
 MOST_WAITING = 1 << 26
-"""Bytes that wait for the event loop; results beyond are dropped, and asked for again later."""
+"""Bytes that wait for the event loop, or for the thread that says what is long; what comes beyond
+is dropped, and results are asked for again later."""
+
+CALM = 0.01
+"""Seconds in which a few things are said at once, and many together."""
+
+MOST_EXPRESS, MOST_SAID = 8, 64
+"""Messages in that time that each go out at once, and those that the loop says itself. The engine
+has room for 16 packets of a kind on their way: the next go in packets of many, up to a millisecond
+later, and what comes then is said by the thread, for the engine would drop it."""
 
 TURN = 64
 """Callbacks in one turn of the event loop."""
@@ -159,6 +168,8 @@ class ZenohEnd(Bus):
         self._told_dropped = False
         self._sender: ThreadPoolExecutor | None = None
         self._sending = 0
+        self._behind: collections.Counter[str] = collections.Counter()
+        self._calm_since, self._said = -CALM, 0
 
     # ------------------------------------------------------------------ life
 
@@ -259,15 +270,44 @@ class ZenohEnd(Bus):
         zenoh, session = self._zenoh, self._session
         if session is None:
             return
-        how: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
-        if len(payload) > LONG:
+        now = self._loop.time()
+        if now - self._calm_since > CALM:
+            self._calm_since, self._said = now, 0
+        self._said += 1
+        # what is said by itself goes out at once, a burst together: there is not room for many
+        express = self._said <= MOST_EXPRESS
+        how: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": express}
+        way = key if self._link.listen else ""  # a router has one to each who listens
+        if len(payload) > LONG or self._said > MOST_SAID or way in self._behind:
             how["congestion_control"] = zenoh.CongestionControl.BLOCK
-            if self._sender is None:
-                self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
-            self._sender.submit(_put, session, key, payload, how)
+            self._hand_over(way, session, key, payload, how)
             return
         how["congestion_control"] = zenoh.CongestionControl.DROP
         _put(session, key, payload, how)
+
+    def _hand_over(
+        self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]
+    ) -> None:
+        """Have a thread say it, which waits until there is room; what goes the same way then, too."""
+        if self._sender is None:
+            self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
+        size = len(payload)
+        if self._sending + size > MOST_WAITING:
+            logger.warning("%s ! %d bytes wait to be said; more is dropped", key, self._sending)
+            return
+
+        def say() -> None:
+            _put(session, key, payload, how)
+            with self._lock:
+                self._sending -= size
+                self._behind[way] -= 1
+                if not self._behind[way]:
+                    del self._behind[way]
+
+        with self._lock:
+            self._sending += size
+            self._behind[way] += 1
+        self._sender.submit(say)
 
     def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
         return _Publisher(self, key, on_heard)

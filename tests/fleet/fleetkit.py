@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from typing import Any
 
 from smartcam import Backoff
@@ -78,6 +78,7 @@ class Plant:
         box: the camera; a numbered one by default.
         bus: a bus that misbehaves, perhaps.
         zenoh: the bus is Zenoh's, on a free port of this computer.
+        engine: settings of the agent's end of it.
         history: results, and their bytes, that the agent keeps.
         session: options of the agent's session with the camera.
     """
@@ -88,12 +89,14 @@ class Plant:
         *,
         bus: MemoryBus | None = None,
         zenoh: bool = False,
+        engine: Mapping[str, Any] | None = None,
         history: tuple[int, int] = (10_000, 1 << 24),
         **session: Any,
     ) -> None:
         self.box = NumberedCamera() if box is None else box
         self.bus = MemoryBus() if bus is None else bus
         self.places = with_ports(["tcp/127.0.0.1:0"]) if zenoh else ()
+        self._engine = engine
         self.session = {"reconnect": FAST, "name": NAME, **session}
         self.history = history
         self.agent: Agent
@@ -111,7 +114,10 @@ class Plant:
 
     async def start_agent(self, name: str = "agent") -> None:
         """Start an agent: the first one, or the next after one that is gone."""
-        self.end = ZenohEnd(Link(listen=self.places)) if self.places else self.bus.end()
+        if self.places:
+            self.end = ZenohEnd(Link(listen=self.places), self._engine)
+        else:
+            self.end = self.bus.end()
         settings = CameraSettings.make(self.box.url, None, self.session)
         self.agent = Agent(name, Keys(FLEET), self.end, {NAME: settings}, history=self.history)
         await self.agent.open(PATIENCE)
