@@ -87,6 +87,7 @@ class Link:
             "listen/endpoints": list(self.listen),
             "connect/endpoints": list(self.connect),
             "connect/timeout_ms": 0,  # one try; later ones are made without end
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
             "connect/exit_on_failure": not self.listen,
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
