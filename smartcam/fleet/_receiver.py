@@ -310,6 +310,7 @@ class Receiver:
             logger.warning("%s ! %s: %s", self._name, what, exc)
             return
         self._count(payload)
+        self._see(epoch)
         self._states.receive(epoch, following, states)
         self._wake()
 
@@ -324,8 +325,15 @@ class Receiver:
         if not (listeners.hears_results or listeners.observed):
             self._leave_results()
             return
+        self._see(batch.epoch)
         self._results.receive(batch.epoch, batch.following, batch.runs)
         self._wake()
+
+    def _see(self, epoch: int) -> None:
+        """Look whether the agent was started anew, which presence does not tell where it is soon."""
+        met = self._caller.met
+        if met is not None and epoch > met.epoch:
+            self._caller.lose(f"the agent {met.agent} was restarted")
 
     def _count(self, payload: bytes) -> None:
         counters = self._caller.counters

@@ -17,6 +17,7 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet import FleetFile
+from smartcam.fleet._log import Log
 from smartcam.fleet._wire import decode
 from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
@@ -209,19 +210,50 @@ async def test_status_is_right_after_an_agent_was_restarted() -> None:
         assert camera.status == plant.agent.hosts[NAME].camera.status != before
 
 
-async def test_agent_of_the_same_name_whose_presence_never_ended_is_met_anew() -> None:
-    """One that was cut off, and another start of it elsewhere before its lease was over."""
+def as_started_anew(plant: Plant) -> None:
+    """Have an agent be as one of its name that was started before its end was seen.
+
+    It was cut off, say, and another start of it was there before its lease was over: presence is
+    told by name, so nobody sees a change.
+    """
+    agent, host = plant.agent, plant.agent.hosts[NAME]
+    agent.epoch += 1
+    host._epoch += 1
+    host.results, host.states = Log(100, 1 << 20), Log(100, 1 << 20)
+    for program in [*agent._programs]:
+        agent._forget(program)
+    agent._gone.clear()
+
+
+async def test_start_of_an_agent_that_nobody_saw_is_told_to_who_calls() -> None:
     async with Plant() as plant, plant.camera() as camera:
-        results = camera.results()
-        first = await camera.trigger(timeout=1.0)
-        assert (await anext(results)).number == first.number
-        plant.agent.epoch -= 10**9
-        plant.agent._forget(camera._program.name)  # as one that was started anew, it knows nobody
+        await camera.trigger(timeout=1.0)
+        as_started_anew(plant)
         error = await gone(camera.trigger(timeout=1.0))
         assert isinstance(error, ConnectionLostError)
-        assert "restarted" in str(error)
+        assert "was restarted" in str(error)
+        assert "trigger was not done" in str(error)
         await camera.wait_connected()
         assert (await camera.trigger(timeout=1.0)).value.run == 2
+
+
+async def test_start_of_an_agent_that_nobody_saw_is_seen_by_who_only_listens() -> None:
+    async with Plant() as plant, plant.camera() as camera:
+        results, events = camera.results(), camera.events()
+        await asyncio.sleep(0.1)
+        plant.box.device.trigger()
+        assert (await anext(results)).value.run == 1
+        as_started_anew(plant)
+        async with asyncio.timeout(60.0):
+            for run in (2, 3, 4):
+                plant.box.device.trigger()
+                result = await anext(results)
+                assert (result.value.run, result.number) == (run, run - 1)
+        kinds = [type(await anext(events)) for _ in range(events.statistics().queued)]
+        assert [kind for kind in kinds if kind in {Disconnected, Reconnected}] == [
+            Disconnected,
+            Reconnected,
+        ]
 
 
 async def test_as_many_calls_at_once_as_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
