@@ -1,11 +1,11 @@
-"""What tests of the fleet share: a numbered camera, an agent that shares it, programs that use it."""
+"""What tests of the fleet share: a numbered camera, its agent, programs that use it."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Mapping
-from typing import Any
+from typing import Any, Self
 
 from smartcam import Backoff
 from smartcam.emulator import Application, EmulatedCamera, Run
@@ -42,7 +42,7 @@ class NumberedCamera(EmulatedCamera):
 
     def __init__(self, *, time: float = 0.001, rate: float | None = None, **options: Any) -> None:
         self.inputs: dict[int, int | None] = {}
-        program = {
+        program: dict[str, Any] = {
             "layout": LAYOUT,
             "generator": self._values,
             "processing_time": time,
@@ -85,7 +85,7 @@ class Plant:
 
     def __init__(
         self,
-        box: EmulatedCamera | None = None,
+        box: NumberedCamera | None = None,
         *,
         bus: MemoryBus | None = None,
         zenoh: bool = False,
@@ -103,7 +103,7 @@ class Plant:
         self.end: Bus
         self._stack = contextlib.AsyncExitStack()
 
-    async def __aenter__(self) -> Plant:
+    async def __aenter__(self) -> Self:
         await self._stack.enter_async_context(self.box)
         await self.start_agent()
         self._stack.push_async_callback(self.stop_agent)
@@ -122,6 +122,11 @@ class Plant:
         self.agent = Agent(name, Keys(FLEET), self.end, {NAME: settings}, history=self.history)
         await self.agent.open(PATIENCE)
         await self.agent.wait_tried()
+
+    def cut_off_agent(self) -> None:
+        """Have it gone from the bus without a word."""
+        assert isinstance(self.end, MemoryEnd)
+        self.end.detach()
 
     async def stop_agent(self) -> None:
         """End it."""

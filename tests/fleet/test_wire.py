@@ -86,13 +86,13 @@ BATCH = encode_runs(9, 8, [RUN, RUN])
 
 @pytest.mark.parametrize("length", range(len(MESSAGE)))
 def test_no_part_of_a_message_is_one(length: int) -> None:
-    with pytest.raises(RemoteProtocolError, match="^a call is broken: "):
+    with pytest.raises(RemoteProtocolError, match=r"^a call is broken: "):
         decode(MESSAGE[:length], "a call")
 
 
 @pytest.mark.parametrize("length", range(len(BATCH)))
 def test_no_part_of_runs_is_one(length: int) -> None:
-    with pytest.raises(RemoteProtocolError, match="^a reply is broken: "):
+    with pytest.raises(RemoteProtocolError, match=r"^a reply is broken: "):
         decode_runs(BATCH[:length], "a reply")
 
 

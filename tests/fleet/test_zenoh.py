@@ -23,7 +23,7 @@ from smartcam.exceptions import ConnectFailedError, ConnectionLostError
 from smartcam.fleet import FleetCamera, _zenoh
 from smartcam.fleet._zenoh import LONG, Link, ZenohEnd, with_ports
 from smartcam.models import Connected, Disconnected, Reconnected
-from tests.client.clientkit import gone, until
+from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant
 from tests.fleet.partner import partner
 from tests.processes import printed_by
@@ -262,15 +262,18 @@ async def test_reservation_of_a_killed_program_ends_without_any_lease() -> None:
 
 @pytest.mark.long
 async def test_reservation_of_a_silent_program_ends_with_the_lease() -> None:
-    async with Plant(zenoh=True) as plant, plant.camera() as camera:
-        async with partner("holder", plant.address.url) as holder:
-            waiting = asyncio.create_task(camera.trigger(timeout=PATIENCE))
-            await until_waits(plant)
-            holder.signal(signal.SIGSTOP)
-            assert (await waiting).value.run == 1
-            assert plant.agent.hosts[NAME].gate.holder is None
-            holder.signal(signal.SIGCONT)
-            assert (await camera.trigger(timeout=PATIENCE)).value.run == 2
+    async with (
+        Plant(zenoh=True) as plant,
+        plant.camera() as camera,
+        partner("holder", plant.address.url) as holder,
+    ):
+        waiting = asyncio.create_task(camera.trigger(timeout=PATIENCE))
+        await until_waits(plant)
+        holder.signal(signal.SIGSTOP)
+        assert (await waiting).value.run == 1
+        assert plant.agent.hosts[NAME].gate.holder is None
+        holder.signal(signal.SIGCONT)
+        assert (await camera.trigger(timeout=PATIENCE)).value.run == 2
 
 
 async def until_waits(plant: Plant) -> None:
