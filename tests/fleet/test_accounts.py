@@ -96,7 +96,8 @@ async def test_results_over_a_bad_bus_come_all_in_order_to_each(seed: int, secon
     """Losses, doubles, delays and disorder; subscribers that come late, or are slow."""
     chance = Random(seed)  # noqa: S311
     bus = LossyBus()
-    async with sending(bus) as sender, sender.plant.cameras(5) as cameras:
+    history = (100_000, 1 << 26)  # more than ever is sent while lost questions are asked again
+    async with sending(bus, history=history) as sender, sender.plant.cameras(5) as cameras:
         bus.fate = chance_of(chance, lost=0.1, doubled=0.1, late=0.2, by=0.03)
         first = [Reader(cameras[0]), Reader(cameras[0], 0.0005)]
         idle = cameras[1].results(max_queue=10)
