@@ -15,6 +15,7 @@ import dataclasses
 import importlib
 import inspect
 import itertools
+import json
 import struct
 import textwrap
 import tomllib
@@ -22,10 +23,13 @@ import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel
+
 import smartcam
 from smartcam._client.handshake import load_protocol
 from smartcam.calibration._files.storage import Stored
 from smartcam.emulator import Quirks
+from smartcam.fleet._file import CameraEntry, Emulated, FleetFile, History, Retry
 from smartcam.protocols._base import POLICIES
 from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
 from smartcam.protocols._framed.dialect import MAX_SURPLUS
@@ -37,6 +41,8 @@ from smartcam.settings import CameraSettings
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from pydantic.fields import FieldInfo
+
     from smartcam.protocols._framed.dialect import FramedDialect, MessageRow
 
 project = "smartcam"
@@ -44,7 +50,7 @@ version = release = smartcam.__version__
 copyright = "the smartcam maintainers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["benchmarks/*", "_build"]
-html_extra_path = ["scenario.schema.json"]
+html_extra_path = ["fleet.schema.json", "scenario.schema.json"]
 html_theme = "furo"
 html_title = f"smartcam {release}"
 myst_heading_anchors = 4
@@ -81,7 +87,7 @@ LIMITS = (
     "_client.link.MAX_REST",
     "camera.DEFAULT_MAX_QUEUE",
     "camera.DEFAULT_MAX_QUEUE_BYTES",
-    "client.MAX_INTERPRETATIONS",
+    "camera.MAX_INTERPRETATIONS",
     "camera.DEFAULT_TRIGGER_TIMEOUT",
     "_client.handshake.MAX_EARLY",
     "_client.handshake.DETECTION_SHARE",
@@ -131,6 +137,21 @@ LIMITS = (
     "layout._yamls.MAX_BITS",
     "layout._yamls.MAX_NODES",
     "layout._yamls.MAX_YAML_TEXT",
+    "fleet._agent.MOST_CALLS",
+    "fleet._agent.KNOWN_CALLS",
+    "fleet._agent.FIRST_TRY",
+    "fleet._calls.MOST_FILLED",
+    "fleet._caller.HELLO_TIMEOUT",
+    "fleet._camera.REACH_TIMEOUT",
+    "fleet._errors.MAX_CHAIN",
+    "fleet._file.MOST_CAMERAS",
+    "fleet._fleet.MOST_AT_ONCE",
+    "fleet._program.LOOK_AGAIN",
+    "fleet._receiver.FILL_TIMEOUT",
+    "fleet._zenoh.LEASE",
+    "fleet._zenoh.LONG",
+    "fleet._zenoh.MOST_WAITING",
+    "fleet._zenoh.TURN",
     "recording._form.MAX_CAMERAS",
     "recording._form.MAX_MESSAGE",
     "recording._form.MAX_NAME",
@@ -401,6 +422,47 @@ def settings() -> str:
     return _table(("option", "default", "meaning"), rows)
 
 
+def fleet_file() -> str:
+    """Return the fields of a fleet file."""
+    return _fields(FleetFile)
+
+
+def fleet_camera() -> str:
+    """Return those of a camera in it."""
+    return _fields(CameraEntry)
+
+
+def fleet_emulated() -> str:
+    """Return those of emulated ones."""
+    return _fields(Emulated)
+
+
+def fleet_reconnect() -> str:
+    """Return those of its ``reconnect``."""
+    return _fields(Retry)
+
+
+def fleet_history() -> str:
+    """Return those of its ``history``."""
+    return _fields(History)
+
+
+def _fields(kind: type[BaseModel]) -> str:
+    rows = [
+        (f"`{name}`", field.description, _default(field))
+        for name, field in kind.model_fields.items()
+    ]
+    return _table(("field", "what it says", "default"), rows)
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "has to be there"
+    if field.default is None:
+        return ""
+    return "below" if isinstance(field.default, BaseModel) else f"`{json.dumps(field.default)}`"
+
+
 def transitions() -> str:
     """Return the session's states and what leads from one to another."""
     ways: dict[tuple[State, State], dict[Sender, list[str]]] = {}
@@ -481,6 +543,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, settings, transitions, policies, layers, limits),
+        *(fleet_file, fleet_camera, fleet_emulated, fleet_reconnect, fleet_history),
     )
 }
 """What ``{generated}`` knows."""

@@ -36,15 +36,17 @@ ROOMS = (
     Room("web", "pages in a browser", 0, 2),
     Room("recording", "files of what came", 2, 1, ("recording", "_dissector")),
     Room("conformance", "judges", 3, 1),
-    Room("calibration", "camera to robot", 0, 5),
+    Room("calibration", "camera to robot", 0, 7),
     Room("doctor", "what is wrong", 1, 2),
-    Room("client", "what a program uses", 1, 3, ("camera", "client", "connecting", "sync")),
-    Room("emulator", "cameras without one", 3, 3),
-    Room("_client", "how a client works", 1.5, 4),
-    Room("interpreters", "payload to value", 1, 5),
-    Room("protocols", "bytes to messages", 3, 5),
-    Room("layout", "what a payload holds", 1.5, 6),
-    Room("values", "models, errors, settings", 2, 7, VALUES + HELPERS),
+    Room("connecting", "from a URL to a camera", 2, 3, ("connecting", "sync")),
+    Room("fleet", "cameras, shared", 2, 4),
+    Room("client", "what a program uses", 1, 5, ("camera", "client")),
+    Room("emulator", "cameras without one", 3, 5),
+    Room("_client", "how a client works", 1.5, 6),
+    Room("interpreters", "payload to value", 1, 7),
+    Room("protocols", "bytes to messages", 3, 7),
+    Room("layout", "what a payload holds", 1.5, 8),
+    Room("values", "models, errors, settings", 2, 9, VALUES + HELPERS),
 )
 STEP = (190, 84)
 SIZE = (150, 46)
@@ -74,7 +76,8 @@ def _room(module: str) -> str:
             return room.title
     if any((ROOT / "smartcam").glob(f"{module}*")):
         raise LookupError(f"smartcam/{module} is in no room of the drawing")
-    return "client" if module in {"Camera", "SmartCamera", "connect"} else "values"
+    named = {"Camera": "client", "SmartCamera": "client", "connect": "connecting"}
+    return named.get(module, "values")
 
 
 def _imported(tree: ast.AST) -> set[str]:

@@ -58,7 +58,7 @@ class SmartCamera(Camera[ValueT]):
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
         super().__init__(settings, observers=observers)
         counters, listeners = self._counters, self._listeners
-        self._state = state = CameraState(settings.name, settings.application, listeners)
+        self._state = state = self._make_state()
         self._waits = waits = Waits(counters)
         self._connection = connection = Connection(settings.name, waits)
         patience = settings.request_timeout
@@ -90,6 +90,9 @@ class SmartCamera(Camera[ValueT]):
             keepalive,
             self._observers,
         )
+
+    def _make_state(self) -> CameraState:
+        return CameraState(self.settings.name, self.settings.application, self._listeners)
 
     def _require_session(self) -> None:
         self._connection.require_link()

@@ -92,7 +92,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         ConfigurationError: says which part is wrong and what is accepted.
     """
     protocol, full = _pick_protocol(url.strip(), model)
-    shown = _masked(url)
+    shown = masked(url)
     try:
         parts = urlsplit(full)
         port = parts.port if parts.port is not None else protocol.default_port
@@ -173,7 +173,7 @@ def _query(shown: str, query: str, protocol: Protocol) -> dict[str, str]:
 _LOGIN = frozenset({USER, PASSWORD})
 
 
-def _masked(url: str) -> str:
+def masked(url: str) -> str:
     """Return a URL without its password, for error texts."""
     begin = url.find("://") + 3 if "://" in url else 0
     login, at, host = url[begin:].rpartition("@")
@@ -194,13 +194,13 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         schemes = [one for protocol in _protocols() for one in protocol.schemes]
         if scheme in FLEET_SCHEMES:
             raise UnsupportedError(
-                f"{_masked(url)} is a camera that an agent of a fleet shares: this wants the "
+                f"{masked(url)} is a camera that an agent of a fleet shares: this wants the "
                 f"address of one at the wire, which begins with {' or '.join(schemes)}"
             )
         schemes += FLEET_SCHEMES
         known = ", ".join(f"{one}://" for one in schemes)
         raise ConfigurationError(
-            f"camera address {_masked(url)!r}: unknown scheme {scheme!r}; known are {known}"
+            f"camera address {masked(url)!r}: unknown scheme {scheme!r}; known are {known}"
             f"{did_you_mean(scheme, schemes)}"
         )
     if model is None:

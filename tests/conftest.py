@@ -24,7 +24,12 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 def pytest_asyncio_loop_factories(
     item: pytest.Item,
 ) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
-    """Give asynchronous tests a loop on a time of its own, those marked ``real_time`` the usual."""
+    """Give asynchronous tests a loop on a time of its own, those marked ``real_time`` the usual.
+
+    Those marked ``both_buses`` run on each: with the bus inside the process, and over Zenoh.
+    """
+    if item.get_closest_marker("both_buses"):
+        return {"timed": TimedLoop, "real": asyncio.SelectorEventLoop}
     if item.get_closest_marker("real_time"):
         return {"real": asyncio.SelectorEventLoop}
     return {"timed": TimedLoop}

@@ -177,7 +177,7 @@ def missing_line(shown: list[str], printed: str) -> str | None:
 
 
 @pytest.mark.parametrize("block", blocks("python", PAGES))
-def test_python_block_runs(block: Block, shell: Shell) -> None:
+def test_python_block_runs(block: Block, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     text = block.text
     if re.match(r"# ([\w-]+\.py)\n", text):
         compile(text, str(block.page), "exec", dont_inherit=True)
@@ -187,6 +187,12 @@ def test_python_block_runs(block: Block, shell: Shell) -> None:
             pytest.importorskip(name, reason=f"needs {name}, of the extra dev")
     if CAMERA in text:
         text = text.replace(CAMERA, shell.emulate(["smartcam-emulator"], 1).strip())
+    shown = files(block.page)
+    if any(name in text for name in shown):
+        for name, content in shown.items():  # an agent listens where its file says
+            path, port = shell.folder / name, "listen: tcp/127.0.0.1:0"
+            path.write_text(re.sub(r"listen: \S+:\d+", port, content), encoding="utf-8")
+        monkeypatch.chdir(shell.folder)
     # empty lines in front, so that a traceback names the page's own lines
     code = compile("\n" * (block.line - 1) + text, str(block.page), "exec", dont_inherit=True)
     exec(code, {"__name__": "__main__"})  # noqa: S102 - what stands in our own documents
@@ -234,7 +240,11 @@ def test_what_sh_blocks_name_is_there() -> None:
 def test_file_that_a_page_shows_is_run_by_a_command_of_it() -> None:
     for page in PAGES:
         shown = files(page)
-        users = [block.values[0].text for block in blocks("console", [page])]
+        users = [
+            block.values[0].text
+            for language in ("console", "python")
+            for block in blocks(language, [page])
+        ]
         users += shown.values()
         unused = [name for name in shown if not any(Path(name).stem in text for text in users)]
         assert unused == []

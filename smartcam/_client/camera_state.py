@@ -36,6 +36,7 @@ class CameraState:
         name: the camera's name.
         application: the one that results are expected from, None for any.
         listeners: who is told of another application.
+        shared: others use the camera, too, each of whom may expect another one.
 
     Attributes:
         status: the last one, None before the first; after a loss the one of before.
@@ -47,7 +48,9 @@ class CameraState:
         statuses_heard: how many statuses have come.
     """
 
-    def __init__(self, name: str, application: int | None, listeners: Listeners) -> None:
+    def __init__(
+        self, name: str, application: int | None, listeners: Listeners, *, shared: bool = False
+    ) -> None:
         self.status: Status | None = None
         self.endian: int = 0
         self.active: int | None = None
@@ -55,10 +58,16 @@ class CameraState:
         self.active_in_doubt: bool = False
         self.loads_by_others: int = 0
         self.statuses_heard: int = 0
+        self.shared: bool = shared
         self._name = name
         self._listeners = listeners
         self._heard_status = False  # in this session
         self._loaded_by_us = False
+
+    @property
+    def expected(self) -> int | None:
+        """The application that results are to be of, whoever gets them; None for any."""
+        return None if self.shared else self.wanted.application
 
     def begin_session(self) -> None:
         """Forget what only the session before has told."""

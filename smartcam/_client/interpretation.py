@@ -285,7 +285,7 @@ class _Calibrations:
                     f"the mapping has {sorted(known)}"
                 )
             given = [*known.values()] if application is None else [known[application]]
-        name = _without_poses(interpreter)
+        name = without_poses(interpreter)
         if name is not None and None not in given:
             raise ConfigurationError(
                 f"calibration: expected results{of} to be localizations, as with "
@@ -378,7 +378,7 @@ _WITHOUT_POSES = ("raw", "record", "strings50", "table")
 """Built-in interpreters whose values are no localizations, whatever comes."""
 
 
-def _without_poses(interpreter: Interpreter) -> str | None:
+def without_poses(interpreter: Interpreter) -> str | None:
     """Return an interpreter's name where it is one of those; a class made from one is not."""
     # exactly these types: what a user makes of one may give anything
     found = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))

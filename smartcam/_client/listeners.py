@@ -108,8 +108,15 @@ class Listeners:
         for stream in self.results:
             stream.offer_all(results, now, size)
 
-    def offer_result(self, result: Result, now: float, *, current: bool) -> None:
-        """Hand a result on; ``current`` where it is not known to be an older trigger's."""
+    def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
+        """Hand a result on.
+
+        Args:
+            result: it.
+            now: loop time.
+            current: it is not known to be an older trigger's.
+            late: it is known to be one's that was given up.
+        """
         if self.observed:
             self._observers.result(result)
         if self.results.references:

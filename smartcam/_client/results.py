@@ -271,7 +271,7 @@ class Results:
             return None
         if not self._listeners.streams_results:
             return None
-        if self._state.wanted.application not in {None, application}:
+        if self._state.expected not in {None, application}:
             return None
         name, first = self._name, self._counters.received + 1
         done = self.interpretation.burst(
@@ -311,7 +311,7 @@ class Results:
             older: it is known not to be of the trigger under way.
         """
         state, counters, pending = self._state, self._counters, self.pending
-        active, expected = state.active, state.wanted.application
+        active, expected = state.active, state.expected
         if container.application < 0:  # a quirk: it does not say whose it is
             known = m.UNNAMED_APPLICATION if active is None else active
             container = replace(container, application=known)
@@ -320,8 +320,11 @@ class Results:
         if active != container.application:
             state.set_active(container.application, at)
         if expected is not None and container.application != expected:
-            counters.count("wrong_application")
             self.give_up(self._wrong_application(container, expected))  # ours may still come
+            if state.shared:  # somebody else may want it
+                self._hand_on(container, None, "streamed", None, now, at)
+            else:
+                counters.count("wrong_application")
             return
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
@@ -368,7 +371,7 @@ class Results:
                 self._fail_unread(owner, error, number)
             return
         counters.count(fate)
-        listeners.offer_result(result, now, current=current)
+        listeners.offer_result(result, now, current=current, late=fate == "late")
         if owner is not None:
             owner.take(result)
             self._complete(owner, now)

@@ -75,12 +75,14 @@ class TriggerRequest(NamedTuple):
         input_data: sent right before it, None for none.
         results: how many results it is to have.
         wait: wait until the camera takes a trigger; else refuse where it does not.
+        expected: the application that its results are to be of; by default the one that was named.
     """
 
     interpretation: Interpretation
     input_data: bytes | None
     results: int
     wait: bool
+    expected: int | None = None
 
 
 def is_stopped(status: Status) -> bool:
@@ -163,8 +165,9 @@ class Triggers:
                 "be queued in the camera and would be taken for this one's; switch_application() "
                 "empties the queue"
             )
-        if state.wanted.application is not None and state.active != state.wanted.application:
-            await self._check_application(deadline)
+        expected = state.expected if request.expected is None else request.expected
+        if expected is not None and state.active != expected:
+            await self._check_application(expected, deadline)
         if self._doubtful is not None and self._doubtful is connection.link:
             await self._status.demand(deadline)
             await self._requests.fence(deadline)  # it has come by then, or is lost again
@@ -206,7 +209,7 @@ class Triggers:
             loop.time(),
             datetime.now(UTC),
             # where each application has its own interpreter none is read with another's layout
-            None if interpretation.by_application else state.active,
+            request.expected if interpretation.by_application else state.active,
         )
         return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
 
@@ -287,14 +290,14 @@ class Triggers:
         due = self._requests.due_after(deadline)
         self._requests.expect(m.TriggerAnswer, due).add_done_callback(on_answer)
 
-    async def _check_application(self, deadline: float) -> None:
-        """See to it that the application that was named is the active one.
+    async def _check_application(self, expected: int, deadline: float) -> None:
+        """See to it that an application is the active one.
 
         Raises:
             WrongApplicationError: somebody else has switched; nothing was sent but a Query.
         """
         await self._requests.fence(deadline)  # what is known may be old
-        active, expected = self._state.active, self._state.wanted.application
+        active = self._state.active
         if active != expected:
             raise WrongApplicationError(
                 f"{self._name}: application {active} is active, somebody else has switched; "

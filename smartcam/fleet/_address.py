@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl, urlsplit
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._zenoh import Link
-from smartcam.settings import FLEET_SCHEMES, Address
+from smartcam.settings import FLEET_SCHEMES, Address, masked
 
 if TYPE_CHECKING:
     from typing import Self
@@ -24,6 +24,7 @@ MOST_CHUNKS = 4
 MOST_NAME = 100
 _NAME = re.compile(rf"{CHUNK}(/{CHUNK}){{0,{MOST_CHUNKS - 1}}}")
 _PATTERN_CHUNK = re.compile(rf"\*\*|\*|{CHUNK}")
+_HOST = re.compile(r"[\w.:%-]+")
 _WORD = re.compile(CHUNK)
 _PARAMETERS = ("fleet", "certificates")
 
@@ -94,11 +95,14 @@ class FleetAddress(NamedTuple):
         Raises:
             ConfigurationError: says which part is wrong and what is accepted.
         """
-        what = f"fleet address {url!r:.200}"
+        shown = masked(url)
+        what = f"fleet address {shown!r:.200}"
         try:
             parts = urlsplit(url.strip())
             port = parts.port if parts.port is not None else DEFAULT_PORT
         except ValueError as exc:
+            if shown != url:  # the error may quote the password
+                raise ConfigurationError(f"{what} is no URL") from None
             raise ConfigurationError(f"{what}: {exc}") from exc
         if parts.scheme not in FLEET_SCHEMES:
             raise ConfigurationError(
@@ -110,6 +114,8 @@ class FleetAddress(NamedTuple):
                 f"{what} has no host: expected fleet://HOST[:PORT][/CAMERA] with the host of the "
                 "fleet's agent; on this computer it is localhost"
             )
+        if not _HOST.fullmatch(parts.hostname):
+            raise ConfigurationError(f"{what}: {parts.hostname!r:.80} is no host")
         wrong = {"a user": "@" in parts.netloc, "a fragment": parts.fragment, "port 0": port == 0}
         for part, there in wrong.items():
             if there:

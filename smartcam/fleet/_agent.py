@@ -18,17 +18,16 @@ from smartcam.exceptions import (
     ConnectionLostError,
     LocalProtocolError,
     ProtocolError,
-    ResponseTimeoutError,
     SmartCamError,
-    TriggerTimeoutError,
     UnsupportedError,
 )
 from smartcam.fleet._calls import ACTIONS, PASSES_GATE, Call, now
-from smartcam.fleet._errors import to_fields
+from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
+from smartcam.fleet._plain import Plain
 from smartcam.fleet._shared import Owner
-from smartcam.fleet._wire import Message, decode, encode
+from smartcam.fleet._wire import Message, decode, encode, grace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,8 +46,8 @@ MOST_CALLS = 256
 KNOWN_CALLS = 4096
 """Numbers of calls that are remembered for each program; older ones are not done any more."""
 
-MARGIN, MOST_MARGIN = 0.1, 0.1
-"""Share of a call's time, and seconds, that its answer has for its way."""
+KNOWN_CAMERAS = 1000
+"""Cameras shared no more whose numbers go on where they ended, should they come back."""
 
 FIRST_TRY = 30.0
 """Seconds that the first try to reach a camera is waited for at the start."""
@@ -118,6 +117,9 @@ class Agent:
         self._numbers = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._declared: list[Handle] = []
+        self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
+        self._numbers_at: dict[str, tuple[int, ...]] = {}  # of cameras that were shared before
+        self._plain = Plain(self, keys, bus)
 
     # ------------------------------------------------------------------ life
 
@@ -135,12 +137,10 @@ class Agent:
             for command in (True, False):
                 key = keys.call(self.name, "**", command=command)
                 declared.append(bus.subscribe(key, self._hears(command)))
-            for name, settings in self._cameras.items():
-                host = Host(name, settings, bus, keys, self.epoch, self._history)
-                self.hosts[name] = host
-                self._start(host.run(), f"smartcam.fleet.{name}")
+            self._plain.open()
             declared.append(bus.be_present(keys.agent(self.name)))
-            declared.extend(bus.be_present(keys.camera(self.name, name)) for name in self.hosts)
+            for name, settings in self._cameras.items():
+                self.share(name, settings)
         except BaseException:
             await self.close()
             raise
@@ -149,7 +149,8 @@ class Agent:
     async def close(self) -> None:
         """Leave the bus, end calls and sessions; bounded. Idempotent."""
         declared, self._declared = self._declared, []
-        for handle in declared:
+        self._plain.close()
+        for handle in (*declared, *(token for token, _ in self._shared.values())):
             handle.close()
         for program in [*self._programs]:
             self._forget(program, going_back=False)
@@ -160,11 +161,38 @@ class Agent:
         await asyncio.gather(*closing, return_exceptions=True)
         await self._bus.close()
 
+    def share(self, name: str, settings: CameraSettings) -> Host:
+        """Begin to have a session with a camera, and to share it.
+
+        Raises:
+            ConfigurationError: an option of it cannot work.
+        """
+        bus, keys, topics = self._bus, self._keys, self._plain.topics
+        host = Host(name, settings, bus, keys, self.epoch, self._history, topics)
+        host.numbers = self._numbers_at.pop(name, host.numbers)
+        self.hosts[name] = host
+        running = self.begin(host.run(), f"smartcam.fleet.{name}")
+        self._shared[name] = bus.be_present(keys.camera(self.name, name)), running
+        return host
+
+    async def unshare(self, name: str) -> None:
+        """End the session with a camera, and share it no more; bounded."""
+        host = self.hosts.pop(name)
+        token, running = self._shared.pop(name)
+        token.close()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        await host.close()
+        self._numbers_at[name] = host.numbers
+        if len(self._numbers_at) > KNOWN_CAMERAS:
+            del self._numbers_at[next(iter(self._numbers_at))]
+
     async def wait_tried(self) -> None:
         """Wait until each camera was tried once, well or not; bounded."""
         await asyncio.gather(*(host.tried(FIRST_TRY) for host in self.hosts.values()))
 
-    def _start(self, work: Any, name: str) -> asyncio.Task[None]:
+    def begin(self, work: Any, name: str) -> asyncio.Task[None]:
+        """Have something done in a task, which ends with the agent."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -198,9 +226,13 @@ class Agent:
         if known is None and call > left:
             if len(self._programs) >= MOST_PROGRAMS:
                 raise LocalProtocolError(f"{self.name}: {MOST_PROGRAMS} programs are here already")
-            self._numbers += 1
-            known = self._programs[program] = Guest(self._numbers, left)
+            known = self._programs[program] = Guest(self.next_program(), left)
         return known
+
+    def next_program(self) -> int:
+        """Return the number of another program, by which results say whose they are."""
+        self._numbers += 1
+        return self._numbers
 
     # ------------------------------------------------------------------ calls
 
@@ -236,12 +268,14 @@ class Agent:
             return
         if not guest.is_new(number):
             return  # it is done, or under way: a double
-        timeout = float(fields.get("deadline", now() + 1.0)) - now()
+        timeout, left = float(fields.get("timeout", 1.0)), 1.0
+        if "deadline" in fields:
+            left = float(fields["deadline"]) + grace(timeout) / 2 - now()
         error: SmartCamError | None = None
         if said not in ACTIONS or (said in COMMANDS) != command:
             error = UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
-        elif timeout < 0:
-            error = _late(said, f"{host.name}: {said} came after its deadline; it was not done")
+        elif left < 0:
+            error = late(said, f"{host.name}: {said} came after its deadline; it was not done")
         elif len(guest.tasks) >= MOST_CALLS * len(self.hosts):
             error = LocalProtocolError(
                 f"{host.name}: {len(guest.tasks)} calls of this program are under way"
@@ -249,11 +283,11 @@ class Agent:
         if error is not None:
             self._reply(program, number, {"error": to_fields(error)})
             return
-        timeout -= min(MARGIN * timeout, MOST_MARGIN)
+        timeout = min(timeout, left)
         owner = Owner(guest.number, number)
         arguments: Any = fields.get("arguments", {})
         call = Call(host, program, owner, arguments, message.blobs, timeout, guest.entered)
-        task = self._start(self._do(said, call), f"smartcam.fleet.{host.name}.{said}")
+        task = self.begin(self._do(said, call), f"smartcam.fleet.{host.name}.{said}")
         guest.tasks[number] = task
         task.add_done_callback(lambda _: guest.tasks.pop(number, None))
 
@@ -278,26 +312,16 @@ class Agent:
         try:
             async with contextlib.AsyncExitStack() as stack:
                 if said in PASSES_GATE:
-                    await stack.enter_async_context(host.gate.command(call.program, call.timeout))
+                    turn = host.turn(call.program, said, call.timeout)
+                    await stack.enter_async_context(turn)
                 fields, blobs = await ACTIONS[said](
                     call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
                 )
-        except TimeoutError as exc:
-            error: BaseException = exc
-            if not isinstance(exc, SmartCamError):
-                holder = host.gate.holder
-                why = "commands of others" if holder is None else f"reserved by {holder}, which"
-                error = _late(
-                    said,
-                    f"{host.name}: {why} did not let go within {call.timeout:.3g} s; "
-                    f"{said} was not done",
-                )
-            reply: dict[str, Any] = {"error": to_fields(error)}
-            blobs = []
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
                 logger.exception("%s ! %s failed", host.name, said)
-            reply, blobs = {"error": to_fields(exc)}, []
+            reply: dict[str, Any] = {"error": to_fields(exc)}
+            blobs = []
         else:
             reply = {"answer": fields}
         host.flush()
@@ -309,7 +333,3 @@ class Agent:
     ) -> None:
         said = {"call": number, "epoch": self.epoch, "clock": now(), **fields}
         self._bus.put(self._keys.reply(program), encode(said, blobs or ()))
-
-
-def _late(said: str, text: str) -> SmartCamError:
-    return TriggerTimeoutError(text) if said == "trigger" else ResponseTimeoutError(text)

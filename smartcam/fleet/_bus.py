@@ -104,11 +104,14 @@ class Question(abc.ABC):
 
     @abc.abstractmethod
     def reply(self, key: str, payload: bytes) -> None:
-        """Answer; several times if there is more than one key to answer for."""
+        """Answer; several times if there is more than one key to answer for.
+
+        It may be that nothing is said before the question is closed.
+        """
 
     @abc.abstractmethod
     def close(self) -> None:
-        """There is nothing more to say. Idempotent."""
+        """There is nothing more to say; never blocks. Idempotent."""
 
 
 # ---------------------------------------------------------------------- inside a process

@@ -17,6 +17,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._errors import from_fields
 from smartcam.fleet._keys import COMMANDS
+from smartcam.fleet._wire import grace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -105,7 +106,7 @@ class Caller:
 
     async def close(self, error: LinkError | None = None) -> None:
         """Look for it no more. Idempotent."""
-        self.finish(error or ConnectionClosedError(f"{self.name}: closed"))
+        self.finish(error or ConnectionClosedError(f"{self.name}: the connection is closed"))
         if self._watch is not None:
             self._watch.close()
         task, self._task = self._task, None
@@ -250,6 +251,7 @@ class Caller:
         arguments: dict[str, Any] | None = None,
         blobs: Sequence[bytes] = (),
         number: int | None = None,
+        timeout: float | None = None,
     ) -> Message:
         """Have something done by the agent; return its reply.
 
@@ -259,6 +261,7 @@ class Caller:
             arguments: by name.
             blobs: byte strings that belong to it.
             number: of the call; the next one by default.
+            timeout: seconds that the user gave; what there is until ``deadline`` by default.
 
         Raises:
             SmartCamError: as the agent says; or the agent is gone, or silent.
@@ -266,7 +269,9 @@ class Caller:
         Cancellation: the agent is told.
         """
         met = self.require()
-        reply = await self._exchange(do, deadline, met.agent, met, arguments, blobs, number)
+        reply = await self._exchange(
+            do, deadline, met.agent, met, arguments, blobs, number, timeout
+        )
         self.sample(float(reply.fields.get("clock", -1e300)))
         return reply
 
@@ -279,6 +284,7 @@ class Caller:
         arguments: dict[str, Any] | None = None,
         blobs: Sequence[bytes] = (),
         number: int | None = None,
+        timeout: float | None = None,
     ) -> Message:
         program = self.program
         begun = asyncio.get_running_loop().time()
@@ -286,7 +292,9 @@ class Caller:
         key = self._key(agent, do)
         fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments or {}}
         if met is not None:
-            fields |= {"epoch": met.epoch, "deadline": self.clock(deadline)}
+            timeout = deadline - begun if timeout is None else timeout
+            fields |= {"epoch": met.epoch, "deadline": self.clock(deadline), "timeout": timeout}
+            deadline += grace(timeout)
         waiting = program.expect(number, self)
         try:
             self.counters.bytes_sent += program.send(key, fields, blobs)

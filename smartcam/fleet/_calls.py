@@ -71,16 +71,33 @@ async def _trigger(call: Call) -> Answer:
         layouts = {int(key): text for key, text in layouts.items()}
     data = call.blobs[0] if call.blobs else None
     wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
-    request = TriggerRequest(Carrier(call.owner, layouts), data, wanted, wait)
-    outcomes = call.host.outcomes
-    runs = outcomes[call.owner] = []
-    try:
-        await call.host.require().trigger_for(
-            request, call.argument("application", int), call.argument("expected", int), call.timeout
-        )
-    finally:
-        del outcomes[call.owner]
+    each = bool(call.argument("by_application", bool))
+    carrier = Carrier(call.owner, layouts, by_application=each)
+    expected = call.argument("expected", int)
+    request = TriggerRequest(carrier, data, wanted, wait, expected)
+    application = call.argument("application", int)
+    runs = await outcomes(call.host, call.owner, request, application, call.timeout)
     return {}, [encode_runs(0, call.host.results.following, runs)]
+
+
+async def outcomes(
+    host: Host,
+    owner: Owner,
+    request: TriggerRequest,
+    application: int | None,
+    timeout: float,
+) -> list[bytes]:
+    """Trigger for somebody, and return the runs that came of it.
+
+    The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is whose trigger it is.
+    """
+    runs: list[bytes] = []
+    host.outcomes[owner] = runs
+    try:
+        await host.require().trigger_for(request, application, timeout)
+    finally:
+        del host.outcomes[owner]
+    return runs
 
 
 async def _switch_application(call: Call) -> Answer:
@@ -104,7 +121,10 @@ async def _leave(call: Call) -> Answer:
     found = call.entered.pop((call.host.name, call.wanted("entered", int)), None)
     if found is not None:
         camera, before = found
-        await camera.leave_and_wait(before)
+        if call.argument("wait", bool) is False:
+            camera.leave(before)  # a failure is told by the next command
+        else:
+            await camera.leave_and_wait(before)
     return NOTHING
 
 
@@ -184,7 +204,10 @@ async def _refresh(call: Call) -> Answer:
 
 async def _reserve(call: Call) -> Answer:
     reservation = (call.program, call.owner.call)
-    await call.host.gate.reserve(call.program, reservation, call.timeout)
+    try:
+        await call.host.gate.reserve(call.program, reservation, call.timeout)
+    except TimeoutError as exc:
+        raise call.host.not_granted("reserve", call.timeout) from exc
     return NOTHING
 
 

@@ -22,6 +22,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.fleet._caller import Caller, Met
+from smartcam.fleet._errors import from_fields
 from smartcam.fleet._receiver import FleetListeners, Own, Receiver
 from smartcam.fleet._wire import decode_runs
 from smartcam.models import (
@@ -107,6 +108,7 @@ class FleetCamera(Camera[ValueT]):
         self._status: Status | None = None
         self._heard_status = False  # in this session
         self._active: int | None = None
+        self._about: dict[str, Any] = {}  # what the agent said of the camera
         self._trouble: LinkError | None = None
         self._closed: LinkError | None = None
         self._watching: set[asyncio.Queue[Status | LinkError]] = set()
@@ -154,7 +156,9 @@ class FleetCamera(Camera[ValueT]):
             if self.settings.application is not None:
                 application = self.settings.application
                 await self._do("ensure", self.settings.switch_timeout, application=application)
-        except BaseException:
+        except BaseException as exc:
+            if isinstance(exc, LinkError):
+                self._finish(exc)
             await self.close()
             raise
         return self
@@ -207,7 +211,7 @@ class FleetCamera(Camera[ValueT]):
         return ConnectFailedError(text, host=address.host, port=address.port, attempts=(why,))
 
     async def close(self) -> None:
-        self._finish(ConnectionClosedError(f"{self.name}: closed"))
+        self._finish(ConnectionClosedError(f"{self.name}: the connection is closed"))
         await self._receiver.close()
         await self._caller.close()
         if not self._shared:
@@ -221,14 +225,14 @@ class FleetCamera(Camera[ValueT]):
         wanted = isinstance(error, ConnectionClosedError)
         if self._linked:
             self._linked = False
-            self._publish_end(str(error), expected=wanted)
+            self._publish_end("closed by this side" if wanted else str(error), expected=wanted)
         self._counters.end()
         self._fail(error)
         self._listeners.end(None if wanted else error)
 
     async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
         deadline = self._deadline(timeout)
-        if not self._opened and self._closed is None:
+        if not (self._opened or self._shared) and self._closed is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
@@ -292,6 +296,7 @@ class FleetCamera(Camera[ValueT]):
         """An agent has answered: this is what the camera is now."""
         hello = met.hello
         new = met.epoch != self._receiver.epoch
+        self._about = hello
         self._read_as(hello)
         self._receiver.meet(met)
         if new or not self._linked:
@@ -320,20 +325,21 @@ class FleetCamera(Camera[ValueT]):
     def _on_lost(self, error: LinkError) -> None:
         """The agent is gone."""
         self._receiver.lose()
-        self._lose(error)
+        self._lose(error, str(error))
 
-    def _lose(self, error: LinkError) -> None:
+    def _lose(self, error: LinkError, reason: str, *, expected: bool = False) -> None:
         self._trouble = error
         if not self._linked:
             self._stir(error)
             return
         self._linked = self._heard_status = False
-        self._counters.note_loss(error)
-        self._publish_end(str(error), expected=False)
+        if not expected:
+            self._counters.note_loss(error)
+            self._observers.error(self.name, error)
+        self._publish_end(reason, expected=expected)
         self._fail(error)
         if self.settings.reconnect is None:
             self._finish(error)
-            self._caller.finish(error)
 
     def _publish_end(self, reason: str, *, expected: bool) -> None:
         self._listeners.publish(
@@ -358,10 +364,14 @@ class FleetCamera(Camera[ValueT]):
             self._stir(self._status or Status(0))
         self._trying = bool(said.get("trying"))
         if not linked:
-            why = said.get("reason") or said.get("event", {}).get("reason") or said.get("failure")
+            error, event = self._trouble_of(said), said.get("event", {})
             self._lose(
-                ConnectionLostError(f"{self.name}: the agent has no session with the camera: {why}")
+                error,
+                str(event.get("reason") or error),
+                expected=bool(event.get("expected")),
             )
+            if said.get("over"):
+                self._finish(error)
         elif not self._linked:
             self._begin_session(said, at)
         status, application = said.get("status"), said.get("application")
@@ -375,8 +385,22 @@ class FleetCamera(Camera[ValueT]):
         if status is not None and linked:
             self._take_status(Status(int(status)), at, said["kind"])
 
+    def _trouble_of(self, said: dict[str, Any]) -> LinkError:
+        """Return why the agent has no session with the camera."""
+        if "error" not in said:
+            return ConnectionLostError(f"{self.name}: the agent has no session with the camera yet")
+        error = from_fields(said["error"])
+        if isinstance(error, LinkError) and not isinstance(error, ConnectFailedError):
+            return error
+        lost = ConnectionLostError(
+            f"{self.name}: the agent has no session with the camera: {error}"
+        )
+        lost.__cause__ = error
+        return lost
+
     def _begin_session(self, said: dict[str, Any], at: datetime) -> None:
         self._linked, self._trouble = True, None
+        self._about |= said.get("about", {})
         self._counters.begin(self._wire if not self._sessions else Counters())
         self._sessions += 1
         event = Connected if self._sessions == 1 else Reconnected
@@ -421,20 +445,15 @@ class FleetCamera(Camera[ValueT]):
 
     @property
     def protocol_version(self) -> int | None:
-        return self._hello.get("protocol_version")
+        return self._about.get("protocol_version")
 
     @property
     def capabilities(self) -> Capabilities:
-        said = self._hello.get("capabilities")
+        said = self._about.get("capabilities")
         if said is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
         known = Capabilities.__dataclass_fields__
         return Capabilities(**{key: value for key, value in said.items() if key in known})
-
-    @property
-    def _hello(self) -> dict[str, Any]:
-        met = self._caller.last
-        return met.hello if met is not None else {}
 
     # ------------------------------------------------------------------ calls
 
@@ -450,7 +469,7 @@ class FleetCamera(Camera[ValueT]):
         limit = self.settings.request_timeout if timeout is None else timeout
         deadline = self._deadline(limit)
         self._require_session()
-        reply = await self._caller.call(do, deadline, arguments, blobs, call)
+        reply = await self._caller.call(do, deadline, arguments, blobs, call, limit)
         await self._reach(reply, deadline)
         return reply
 
@@ -477,6 +496,7 @@ class FleetCamera(Camera[ValueT]):
                 application=application,
                 expected=expected,
                 layouts=interpretation.numbered_layouts(),
+                by_application=interpretation.by_application,
                 results=request.results,
                 wait=request.wait,
             )
@@ -503,10 +523,11 @@ class FleetCamera(Camera[ValueT]):
             yield self
         except BaseException:
             self._expected = before
-            self._caller.tell("leave", {"entered": number})
+            self._caller.tell("leave", {"entered": number, "wait": False})
             raise
         self._expected = before
-        await self._do("leave", limit, entered=number)
+        if self._closed is None:
+            await self._do("leave", limit, entered=number)
 
     @contextlib.asynccontextmanager
     async def reserve(self, timeout: float = 10.0) -> AsyncGenerator[Self]:

@@ -6,7 +6,12 @@ import contextlib
 from typing import Any, cast
 
 import smartcam.exceptions
-from smartcam.exceptions import ConnectionLostError, RemoteProtocolError, SmartCamError
+from smartcam.exceptions import (
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
 from smartcam.models import jsonable
 
 MAX_CHAIN = 8
@@ -21,7 +26,7 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
     fields: dict[str, Any] = {"kind": known, "text": str(error)}
     if known == "object":
         fields = {"kind": "SmartCamError", "text": f"{type(error).__name__}: {error}"}
-    attributes = {name: jsonable(value) for name, value in vars(error).items() if name[0] != "_"}
+    attributes = {name: _said(value) for name, value in vars(error).items() if name[0] != "_"}
     if attributes:
         fields["attributes"] = attributes
     if error.__cause__ is not None and depth:
@@ -40,18 +45,28 @@ def from_fields(fields: Any) -> SmartCamError:
     if isinstance(attributes, dict):
         for name, value in cast("dict[str, Any]", attributes).items():
             if name in vars(error):  # the kind's own, with their defaults
-                setattr(error, name, _like(getattr(error, name), value))
+                setattr(error, name, _meant(value))
     if "cause" in said:
         error.__cause__ = from_fields(said["cause"])
     return error
 
 
-def _like(default: object, value: Any) -> Any:
-    """Return a value of JSON as what stands there by default: it has no tuples, and no bytes."""
-    if isinstance(default, bytes) and isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            return bytes.fromhex(value)
-    return tuple(value) if isinstance(default, tuple) and isinstance(value, list) else value
+def _said(value: object) -> Any:
+    """Return an attribute's value as JSON, which has no tuples and no bytes."""
+    if isinstance(value, (tuple, bytes)):
+        return {type(value).__name__: jsonable(value)}
+    return jsonable(value)
+
+
+def _meant(value: Any) -> Any:
+    if isinstance(value, dict):
+        said = cast("dict[str, Any]", value)
+        if said.keys() == {"tuple"} and isinstance(said["tuple"], list):
+            return tuple(said["tuple"])
+        if said.keys() == {"bytes"} and isinstance(said["bytes"], str):
+            with contextlib.suppress(ValueError):
+                return bytes.fromhex(said["bytes"])
+    return cast("object", value)
 
 
 _KINDS: dict[str, type[SmartCamError]] = {
@@ -61,8 +76,7 @@ _KINDS: dict[str, type[SmartCamError]] = {
 }
 
 
-def agent_lost(agent: str, doing: str) -> ConnectionLostError:
-    """Return the error of a call whose agent went away: nobody knows what it still did."""
-    return ConnectionLostError(
-        f"{agent}: the agent went away during {doing}; whether the camera did it is unknown"
-    )
+def late(said: str, text: str) -> SmartCamError:
+    """Return the error of a call whose time was over before it was done."""
+    kind = TriggerTimeoutError if "trigger" in said.lower() else ResponseTimeoutError
+    return kind(text)

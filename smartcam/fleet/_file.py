@@ -3,33 +3,89 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, cast
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    WithJsonSchema,
+    model_validator,
+)
 
+from smartcam._client.interpretation import Interpretation
 from smartcam.backoff import Backoff
-from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._address import check_name, check_word
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.fleet._address import CHUNK, MOST_CHUNKS, MOST_NAME, check_name, check_word
 from smartcam.layout._yaml_files import read_model
-from smartcam.settings import CameraSettings, Seconds
+from smartcam.settings import CameraSettings, Seconds, masked, parse_address
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Iterable, Iterator, Sequence
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
-MOST_EMULATED = 10_000
+
+MOST_CAMERAS = 10_000
+"""Cameras of one agent; each emulated one has a port of its own."""
+
+CERTIFICATE_FILES = ("ca.pem", "cert.pem", "key.pem")
+
+_ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
+_PATTERN = "/**"
 
 
 def _word(text: str) -> str:
     return check_word(text, "name")
 
 
-Word = Annotated[str, AfterValidator(_word)]
+Word = Annotated[
+    str,
+    AfterValidator(_word),
+    WithJsonSchema({"type": "string", "pattern": f"^{CHUNK}$", "maxLength": MOST_NAME}),
+]
+
+
+def _endpoints(least_port: int) -> Any:
+    """Return what makes a list of one endpoint, or of several; ``least_port``: of their ports."""
+
+    def checked(given: object) -> list[str] | None:
+        if given is None:
+            return None
+        found: list[str] = []
+        for one in cast("list[object]", given) if isinstance(given, list) else [given]:
+            parts = _ENDPOINT.fullmatch(one) if isinstance(one, str) else None
+            if parts is None or not least_port <= int(parts[3]) <= 0xFFFF:
+                raise ValueError(
+                    f"expected tcp/HOST:PORT or tls/HOST:PORT, or a list of them; got {one!r:.80}"
+                )
+            found.append(parts[0])
+        return found
+
+    return PlainValidator(checked)
+
+
+_ENDPOINT_SCHEMA = {"type": "string", "pattern": f"^{_ENDPOINT.pattern}$"}
+_ENDPOINTS_SCHEMA = WithJsonSchema(
+    {
+        "anyOf": [
+            _ENDPOINT_SCHEMA,
+            {"type": "array", "items": _ENDPOINT_SCHEMA},
+            {"type": "null"},
+        ]
+    }
+)
 
 
 class _Fields(BaseModel):
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True)
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
 
 
 class Retry(_Fields):
@@ -41,11 +97,27 @@ class Retry(_Fields):
     jitter: float = Field(0.3, ge=0, le=1, description="share of a delay that is left to chance")
     attempts: int | None = Field(None, ge=1, description="tries until it is given up; none: never")
 
+    def backoff(self) -> Backoff:
+        """Return the same for a client.
+
+        Raises:
+            ConfigurationError: the values do not go together.
+        """
+        return Backoff(**self.model_dump())
+
+
+def _never(given: object) -> object:
+    return None if given is False else given
+
+
+def _or_false(schema: dict[str, Any]) -> None:
+    schema["anyOf"].append({"const": False})
+
 
 class Emulated(_Fields):
     """Emulated cameras, to try a plant on a desk."""
 
-    count: int = Field(1, ge=1, le=MOST_EMULATED, description="how many")
+    count: int = Field(1, ge=1, le=MOST_CAMERAS, description="how many")
     scenario: str | None = Field(
         None, description="a scenario file with one camera, beside this file; default as the demo's"
     )
@@ -54,6 +126,10 @@ class Emulated(_Fields):
 
 class CameraEntry(_Fields):
     """A camera, or several emulated ones."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        json_schema_extra={"oneOf": [{"required": ["url"]}, {"required": ["emulated"]}]}
+    )
 
     url: str | None = Field(None, description="where the camera is: bvs://HOST, insight://HOST")
     emulated: Emulated | None = Field(None, description="an emulated one instead")
@@ -77,15 +153,23 @@ class CameraEntry(_Fields):
     liveness_timeout: Seconds | None = Field(
         5.0, description="until a camera that gives no sign of life counts as gone"
     )
-    reconnect: Retry | Literal[False] = Field(
-        Retry.model_validate({}), description="when a lost camera is tried again; false: never"
+    reconnect: Annotated[Retry | None, BeforeValidator(_never)] = Field(
+        Retry.model_validate({}),
+        description="when a lost camera is tried again; false: never",
+        json_schema_extra=_or_false,
     )
 
     @model_validator(mode="after")
     def _one_of(self) -> CameraEntry:
         if (self.url is None) == (self.emulated is None):
-            raise ValueError("expected either url or emulated")
+            got = "neither" if self.url is None else "both"
+            raise ValueError(f"expected either url or emulated, got {got}")
         return self
+
+    def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
+        """Show all of it but a password, which is not for logs."""
+        for name, value in super().__repr_args__():
+            yield name, masked(value) if name == "url" and isinstance(value, str) else value
 
     def settings(self, name: str, url: str) -> CameraSettings:
         """Return what the session with a camera is told.
@@ -95,7 +179,7 @@ class CameraEntry(_Fields):
         """
         own = {"url", "emulated", "model", "reconnect"}
         options: dict[str, Any] = self.model_dump(exclude=own)
-        reconnect = Backoff(**self.reconnect.model_dump()) if self.reconnect else None
+        reconnect = None if self.reconnect is None else self.reconnect.backoff()
         return CameraSettings.make(
             url, self.model, {**options, "name": name, "reconnect": reconnect}
         )
@@ -122,6 +206,20 @@ class Planned(NamedTuple):
     nth: int
 
 
+def _named(given: object) -> object:
+    """Refuse what YAML has not read as a text: it takes 12 and yes for something else."""
+    if isinstance(given, dict):
+        for name in cast("dict[object, object]", given):
+            if not isinstance(name, str):
+                raise ValueError(f"the name {name!r:.40} is no text: put it in quotes")  # noqa: TRY004 - as pydantic wants
+    return given
+
+
+def _names(schema: dict[str, Any]) -> None:
+    tail = rf"(/{CHUNK}){{0,{MOST_CHUNKS - 1}}}(/\*\*)?"
+    schema["propertyNames"] = {"pattern": f"^{CHUNK}{tail}$", "maxLength": MOST_NAME}
+
+
 class FleetFile(_Fields):
     """The cameras that one agent shares."""
 
@@ -129,34 +227,26 @@ class FleetFile(_Fields):
     agent: Word | None = Field(
         None, description="name of this agent, unique in the fleet; default: host and process"
     )
-    listen: list[str] | str | None = Field(
+    listen: Annotated[list[str] | str | None, _endpoints(0), _ENDPOINTS_SCHEMA] = Field(
         None,
         description="endpoints to listen on; this agent is the router, too, then. "
-        "tcp/127.0.0.1:7447 where nothing is said to connect to",
+        "tcp/127.0.0.1:7447 where nothing is said to connect to; port 0 takes a free one",
     )
-    connect: list[str] | str | None = Field(
+    connect: Annotated[list[str] | str | None, _endpoints(1), _ENDPOINTS_SCHEMA] = Field(
         None, description="endpoints of routers or other agents, such as tls/plant-server:7447"
     )
     certificates: str | None = Field(
-        None, description="folder with ca.pem, cert.pem and key.pem, for tls endpoints"
+        None,
+        description="folder with ca.pem, cert.pem and key.pem, beside this file; for tls endpoints",
     )
     history: History = Field(
         History.model_validate({}), description="what is kept of each camera's last results"
     )
-    cameras: dict[str, CameraEntry] = Field(
+    cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
         description="by name, such as line1/cam3; emulated ones at a name that ends in /**",
         min_length=1,
+        json_schema_extra=_names,
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _as_lists(cls, data: Any) -> Any:
-        if not isinstance(data, dict):
-            return data
-        return {
-            key: [value] if key in {"listen", "connect"} and isinstance(value, str) else value
-            for key, value in data.items()
-        }
 
     @property
     def endpoints(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -179,30 +269,43 @@ class FleetFile(_Fields):
         """Return its cameras.
 
         Raises:
-            ValueError: a name cannot be one, or comes twice.
+            ValueError: a name cannot be one, or comes twice; or there are too many.
         """
         found: dict[str, Planned] = {}
         for name, entry in self.cameras.items():
-            for planned in _planned(name, entry):
-                if planned.name in found:
-                    raise ValueError(f"{name}: there is a camera {planned.name} already")
-                found[planned.name] = planned
+            _add(found, name, entry)
         return [*found.values()]
 
 
-def _planned(name: str, entry: CameraEntry) -> list[Planned]:
-    if not name.endswith("/**"):
-        if entry.emulated is not None and entry.emulated.count > 1:
-            raise ValueError(
-                f"{name}: {entry.emulated.count} cameras want a name such as {name}/**"
-            )
-        return [Planned(check_name(name), entry, 0)]
+def _add(found: dict[str, Planned], name: str, entry: CameraEntry) -> None:
+    """Add the cameras of an entry to those that are there."""
+    for planned in _planned(name, entry):
+        if planned.name in found:
+            raise ValueError(f"there is a camera {planned.name} already")
+        found[planned.name] = planned
+    if len(found) > MOST_CAMERAS:
+        raise ValueError(f"{len(found)} cameras up to here, expected {MOST_CAMERAS} at most")
+
+
+def _planned(name: str, entry: CameraEntry) -> Iterator[Planned]:
+    many = name.endswith(_PATTERN)
+    if not many and "*" in name:
+        raise ValueError(f"{name!r:.120} means several: expected a name that ends in {_PATTERN}")
+    count = 1 if entry.emulated is None else entry.emulated.count
+    if not many:
+        check_name(name)
+        if count > 1:
+            raise ValueError(f"{count} cameras want a name such as {name}{_PATTERN}")
+        yield Planned(name, entry, 0)
+        return
     if entry.emulated is None:
-        raise ValueError(f"{name}: only emulated cameras have a pattern for a name")
-    stem, count = name.removesuffix("/**"), entry.emulated.count
-    check_name(f"{stem}/cam")
-    width = len(str(count))
-    return [Planned(f"{stem}/cam{n + 1:0{width}}", entry, n) for n in range(count)]
+        raise ValueError("only emulated cameras have a pattern for a name")
+    stem, width = name.removesuffix(_PATTERN), len(str(count))
+    for n in range(count):
+        yield Planned(check_name(f"{stem}/cam{n + 1:0{width}}"), entry, n)
+
+
+# ---------------------------------------------------------------------- reading one
 
 
 def load_fleet(path: str | Path) -> FleetFile:
@@ -213,7 +316,13 @@ def load_fleet(path: str | Path) -> FleetFile:
             line and field.
         MissingExtraError: PyYAML is not installed.
     """
-    return read_model(path, "fleet", FleetFile, "cameras", _mistake)
+    folder = Path(path).parent
+    file = read_model(
+        path, "fleet", FleetFile, "cameras", lambda found: next(_mistakes(found, folder), None)
+    )
+    if file.certificates is None:
+        return file
+    return file.model_copy(update={"certificates": str(folder / file.certificates)})
 
 
 def fleet_schema() -> dict[str, Any]:
@@ -225,16 +334,75 @@ def fleet_schema() -> dict[str, Any]:
     }
 
 
-def _mistake(file: FleetFile) -> tuple[tuple[str, ...], str] | None:
-    """Return what cannot work of a file, and where."""
+Mistake = tuple["Sequence[int | str]", str]
+
+
+def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
+    """Give what cannot work of a file, and where."""
+    yield from _of_certificates(file, folder)
+    found: dict[str, Planned] = {}
+    taken: dict[tuple[str, int], str] = {}
     for name, entry in file.cameras.items():
+        place = ("cameras", name)
         try:
-            for planned in _planned(name, entry):
-                entry.settings(planned.name, entry.url or "bvs://127.0.0.1")
-        except (ConfigurationError, ValueError) as exc:
-            return ("cameras", name), str(exc)
+            _add(found, name, entry)
+        except ValueError as exc:
+            yield place, str(exc)
+        for where, text in _of_entry(name, entry, taken, folder):
+            yield (*place, *where), text
+
+
+def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
+    listen, connect = file.endpoints
+    tls = [one for one in (*listen, *connect) if one.startswith("tls/")]
+    if file.certificates is None:
+        if tls:
+            yield ("listen" if tls[0] in listen else "connect",), f"{tls[0]} wants certificates"
+        return
+    missing = [one for one in CERTIFICATE_FILES if not (folder / file.certificates / one).is_file()]
+    if missing:
+        where = folder / file.certificates
+        yield ("certificates",), f"{where} has no {', no '.join(missing)}"
+
+
+def _of_entry(
+    name: str, entry: CameraEntry, taken: dict[tuple[str, int], str], folder: Path
+) -> Iterator[Mistake]:
+    """Give what cannot work of a camera; ``taken``: whose each address is."""
+    if entry.url is not None:
+        try:
+            address = parse_address(entry.url, model=entry.model)
+        except SmartCamError as exc:
+            yield ("url",), str(exc)
+            return
+        other = taken.setdefault((address.host, address.port), name)
+        if other != name:
+            yield ("url",), f"this is the camera {other}, and a camera takes one client"
+    elif entry.model is not None:
+        yield ("model",), "is for a url"
+    elif entry.emulated is not None and entry.emulated.scenario is not None:
+        yield from _of_scenario(folder / entry.emulated.scenario)
+    if entry.reconnect is not None:
+        try:
+            entry.reconnect.backoff()
+        except ConfigurationError as exc:
+            yield ("reconnect",), str(exc)
+            return
+    specs = entry.interpret_as
+    each = specs.items() if isinstance(specs, dict) else [(None, specs)]
+    for application, spec in each:
+        if spec is not None:
+            try:
+                Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
+            except SmartCamError as exc:
+                numbered = () if application is None else (application,)
+                yield ("interpret_as", *numbered), str(exc)
+
+
+def _of_scenario(path: Path) -> Iterator[Mistake]:
+    from smartcam.emulator import load_scenario
+
     try:
-        file.plan()
-    except ValueError as exc:
-        return ("cameras",), str(exc)
-    return None
+        load_scenario(path)
+    except ConfigurationError as exc:
+        yield ("emulated", "scenario"), str(exc)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
+import functools
+import weakref
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Generic
@@ -12,6 +15,7 @@ from smartcam._suggestions import did_you_mean
 from smartcam.camera import DEFAULT_MAX_QUEUE, DEFAULT_MAX_QUEUE_BYTES, DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     ConfigurationError,
+    ConnectionClosedError,
     LocalProtocolError,
     SmartCamError,
 )
@@ -82,6 +86,17 @@ class CameraLeft(FleetEvent):
     camera: str
 
 
+class _Bell(asyncio.Event):
+    """Calls somebody where a queue has something, or ends."""
+
+    def __init__(self, ring: Callable[[], None]) -> None:
+        super().__init__()
+        self._ring = ring
+
+    def set(self) -> None:
+        self._ring()
+
+
 class FleetResults(Generic[ValueT]):
     """Results of several cameras as they come: ``async for result in results``.
 
@@ -96,32 +111,37 @@ class FleetResults(Generic[ValueT]):
     ) -> None:
         self._subscribe = subscribe
         self._streams: dict[str, Subscription[Result[ValueT]]] = {}
-        self._order: list[str] = []
+        self._line: collections.deque[str] = collections.deque()  # those that have something
+        self._in_line: set[str] = set()
         self._ready = asyncio.Event()
         self._ended = False
-
-    @property
-    def closed(self) -> bool:
-        """Whether it is."""
-        return self._ended
 
     def add(self, camera: FleetCamera[Any]) -> None:
         """Have a camera's results in it."""
         if camera.name not in self._streams and not self._ended:
             stream = self._streams[camera.name] = self._subscribe(camera)
-            self._order.append(camera.name)
-            stream.share(self._ready)
+            stream.share(_Bell(functools.partial(self._queue, camera.name)))
+
+    def _queue(self, name: str) -> None:
+        if name not in self._in_line:
+            self._in_line.add(name)
+            self._line.append(name)
+        self._ready.set()
 
     def statistics(self) -> dict[str, SubscriberStatistics]:
         """Return the account of each camera's queue."""
         return {name: stream.statistics() for name, stream in self._streams.items()}
 
+    def end(self) -> None:
+        """Nothing more will come; what is queued may be read yet. Idempotent."""
+        self._ended = True
+        self._ready.set()
+
     def close(self) -> None:
         """Unsubscribe; what is queued counts as dropped. Idempotent."""
-        self._ended = True
         for stream in self._streams.values():
             stream.close()
-        self._ready.set()
+        self.end()
 
     def __aiter__(self) -> AsyncIterator[Result[ValueT]]:
         return self
@@ -131,15 +151,28 @@ class FleetResults(Generic[ValueT]):
 
         Raises:
             InterpretationError: what came cannot be read; the stream stays usable.
+            SubscriberOverflowError: more came of a camera than its queue holds, and that is an
+                error; it has no results here any more, the others go on.
+            LinkError: the same, for a camera that is lost for good.
             StopAsyncIteration: closed, or the fleet is.
         """
         while True:
-            for place, name in enumerate(self._order):
+            while self._line:
+                name = self._line.popleft()
+                self._in_line.discard(name)
                 stream = self._streams[name]
-                if stream.waiting:
-                    # whoever was read now comes last
-                    self._order.append(self._order.pop(place))
-                    return await anext(stream)
+                if not stream.waiting:
+                    if not stream.ended:
+                        continue
+                    try:
+                        return await anext(stream)  # which says how it ended, once
+                    except StopAsyncIteration:
+                        continue
+                try:
+                    return await anext(stream)  # something is there: it does not wait
+                finally:
+                    if stream.waiting or stream.ended:
+                        self._queue(name)  # behind the others
             if self._ended:
                 raise StopAsyncIteration
             self._ready.clear()
@@ -183,15 +216,16 @@ class Fleet:
         self._around, self._timeout = around, timeout
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}
+        self._present: set[str] = set()  # agents
         self._agents: dict[str, set[str]] = {}  # of a camera, those that share it
         self._handles: list[Handle] = []
         self._opening: dict[str, asyncio.Task[None]] = {}
         self._turns = asyncio.Semaphore(MOST_AT_ONCE)
         self._events: Subscribers[FleetEvent] = Subscribers()
-        self._results: list[tuple[str, FleetResults[Any]]] = []
+        self._results: list[tuple[str, weakref.ref[FleetResults[Any]]]] = []
         self._stack = contextlib.AsyncExitStack()
         self._state: Literal["new", "open", "closed"] = "new"
-        self._settings(self._address_of("camera"), {})  # wrong options are told at once
+        self._make("camera")  # wrong options are told at once
 
     # ------------------------------------------------------------------ life
 
@@ -238,10 +272,10 @@ class Fleet:
         for task in self._opening.values():
             task.cancel()
         await asyncio.gather(*self._opening.values(), return_exceptions=True)
-        for _, results in self._results:
-            results.close()
         for camera in self._cameras.values():
             await camera.close()
+        for results in self._subscribed("**"):
+            results.end()
         for stream in self._events:
             stream.end(None)
         await self._program.close()
@@ -275,9 +309,15 @@ class Fleet:
         there = sorted(name for name, agents in self._agents.items() if agents)
         return [self._cameras[name] for name in there if meets(pattern, name)]
 
-    def agents(self) -> list[str]:
-        """Return the agents that are there, by name."""
-        return sorted({agent for agents in self._agents.values() for agent in agents})
+    def agents(self, pattern: str = "**") -> list[str]:
+        """Return the agents that share a camera of a pattern, by name.
+
+        Raises:
+            ConfigurationError: the pattern cannot be one.
+        """
+        check_pattern(pattern)
+        sharing = (agents for name, agents in self._agents.items() if meets(pattern, name))
+        return sorted({agent for agents in sharing for agent in agents})
 
     def __getitem__(self, name: str) -> FleetCamera[Any]:
         """Return a camera, which an agent shares or has shared.
@@ -313,6 +353,7 @@ class Fleet:
         stream = Subscription[FleetEvent]("events", max_queue=max_queue, overflow=overflow)
         if self._state == "closed":
             stream.end(None)
+            return stream
         at = datetime.now(UTC)
         for agent in self.agents():
             stream.offer(AgentJoined(self._name, at, agent), 0.0)
@@ -322,46 +363,61 @@ class Fleet:
         self._events.add(stream)
         return stream
 
+    def _tell(self, kind: type[FleetEvent], *names: str) -> None:
+        for stream in self._events:
+            stream.offer(kind(self._name, datetime.now(UTC), *names), 0.0)
+
     @property
     def _name(self) -> str:
         return self._program.keys.fleet
 
-    def _tell(self, event: FleetEvent) -> None:
-        for stream in self._events:
-            stream.offer(event, 0.0)
-
     def _on_agent(self, key: str, present: bool) -> None:
         (agent,) = self._program.keys.tail(key, "presence/agent")
-        kind = AgentJoined if present else AgentLeft
-        self._tell(kind(self._name, datetime.now(UTC), agent))
+        if present == (agent in self._present):
+            return
+        if present:
+            self._present.add(agent)
+            self._tell(AgentJoined, agent)
+            return
+        for name in sorted(name for name, agents in self._agents.items() if agent in agents):
+            self._leave(agent, name)
+        self._present.discard(agent)
+        self._tell(AgentLeft, agent)
 
     def _on_camera(self, key: str, present: bool) -> None:
-        agent, *chunks = self._program.keys.tail(key, "presence/camera")
+        keys = self._program.keys
+        agent, *chunks = keys.tail(key, "presence/camera")
         name = "/".join(chunks)
         sharing = self._agents.setdefault(name, set())
         if present == (agent in sharing):
             return
-        kind = CameraJoined if present else CameraLeft
-        (sharing.add if present else sharing.discard)(agent)
+        if not present:
+            self._leave(agent, name)
+            return
+        self._on_agent(keys.agent(agent), True)  # it comes before its cameras
+        sharing.add(agent)
         if name not in self._cameras:
             self._meet(name)
-        self._tell(kind(self._name, datetime.now(UTC), agent, name))
+        self._tell(CameraJoined, agent, name)
+
+    def _leave(self, agent: str, name: str) -> None:
+        self._agents[name].discard(agent)
+        self._tell(CameraLeft, agent, name)
 
     # ------------------------------------------------------------------ cameras
 
     def _address_of(self, name: str) -> Any:
         return (self._address or FleetAddress("fleet", "", 0)).of(name)
 
-    def _settings(self, address: Any, options: Mapping[str, Any]) -> CameraSettings:
-        return CameraSettings.of(address, {**self._options, **options})
+    def _make(self, name: str) -> FleetCamera[Any]:
+        own = {"name": name, "connect_timeout": self._timeout}
+        settings = CameraSettings.of(self._address_of(name), {**self._options, **own})
+        return FleetCamera[Any](settings, name, self._program, shared=True)
 
     def _meet(self, name: str) -> None:
-        settings = self._settings(self._address_of(name), {"name": name})
-        camera = FleetCamera[Any](settings, name, self._program, shared=True)
-        self._cameras[name] = camera
-        for pattern, results in self._results:
-            if meets(pattern, name):
-                results.add(camera)
+        camera = self._cameras[name] = self._make(name)
+        for results in self._subscribed(name):
+            results.add(camera)
         task = asyncio.get_running_loop().create_task(
             self._open_camera(camera), name=f"smartcam.fleet.{name}.open"
         )
@@ -385,10 +441,12 @@ class Fleet:
             **options: as :meth:`smartcam.Camera.trigger` takes them.
 
         Returns:
-            The result, or the error, by the camera's name.
+            The result (with ``results_per_trigger`` the list of them), or the error, by the
+            camera's name.
 
         Raises:
-            ConfigurationError: no camera is meant, or an argument cannot work.
+            ConfigurationError: no camera is meant, or an argument cannot work for any of them.
+            ConnectionClosedError: the fleet is not open.
 
         Cancellation: cancels each; which ones were triggered then is unknown.
         """
@@ -398,21 +456,25 @@ class Fleet:
         self, pattern: str, do: Callable[[FleetCamera[Any]], Awaitable[Any]]
     ) -> dict[str, Any]:
         cameras = self.cameras(pattern)
+        if self._state != "open":
+            raise ConnectionClosedError(f"{self.url}: not open: the fleet is new, or was closed")
         if not cameras:
             there = ", ".join(one.name for one in self.cameras()[:20]) or "none"
             raise ConfigurationError(f"no camera of the fleet is {pattern!r}; there are {there}")
 
-        async def outcome(camera: FleetCamera[Any]) -> Any:
+        async def outcome(doing: Awaitable[Any]) -> Any:
             try:
-                return await do(camera)
-            except ConfigurationError:
-                raise
+                return await doing
             except SmartCamError as error:
                 return error
 
+        doing = {one.name: do(one) for one in cameras}
         async with asyncio.TaskGroup() as group:
-            tasks = {one.name: group.create_task(outcome(one)) for one in cameras}
-        return {name: task.result() for name, task in tasks.items()}
+            tasks = {name: group.create_task(outcome(one)) for name, one in doing.items()}
+        outcomes = {name: task.result() for name, task in tasks.items()}
+        if all(isinstance(one, ConfigurationError) for one in outcomes.values()):
+            raise next(iter(outcomes.values()))
+        return outcomes
 
     def results(
         self,
@@ -433,22 +495,28 @@ class Fleet:
             overflow: the same.
 
         Raises:
-            ConfigurationError: the pattern cannot be one.
+            ConfigurationError: the pattern, or an argument, cannot work.
         """
         check_pattern(pattern)
+        bounds: dict[str, Any] = {"min_interval": min_interval, "max_queue": max_queue}
+        bounds |= {"max_queue_bytes": max_queue_bytes, "overflow": overflow}
+        Subscription[Any]("results", **bounds)  # what cannot work is told at once
 
         def subscribe(camera: FleetCamera[Any]) -> Subscription[Result[Any]]:
-            return camera.results(
-                min_interval=min_interval,
-                max_queue=max_queue,
-                max_queue_bytes=max_queue_bytes,
-                overflow=overflow,
-            )
+            stream: Subscription[Result[Any]] = camera.results(**bounds)
+            return stream
 
         results = FleetResults[Any](subscribe)
-        self._results = [one for one in self._results if not one[1].closed]
-        self._results.append((pattern, results))
+        self._results = [one for one in self._results if one[1]() is not None]
+        self._results.append((pattern, weakref.ref(results)))
         for name, camera in self._cameras.items():
             if meets(pattern, name):
                 results.add(camera)
+        if self._state == "closed":
+            results.end()
         return results
+
+    def _subscribed(self, name: str) -> list[FleetResults[Any]]:
+        """Return whose pattern means a name, or has a name in common with a pattern."""
+        found = [results() for pattern, results in self._results if meets(pattern, name)]
+        return [one for one in found if one is not None]

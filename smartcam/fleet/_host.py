@@ -8,31 +8,29 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.interpretation import Interpretation
-from smartcam.exceptions import (
-    ConnectionClosedError,
-    ConnectionLostError,
-    SmartCamError,
-)
+from smartcam.exceptions import ConnectionLostError, SmartCamError
+from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._gate import Gate
 from smartcam.fleet._log import Log
 from smartcam.fleet._shared import SharedCamera, Tap
+from smartcam.fleet._topics import CameraTopics
 from smartcam.fleet._wire import (
     CURRENT,
-    OWNED,
-    WITH_CELLS,
+    LATE,
     Run,
     encode,
     encode_runs,
     timestamp,
 )
-from smartcam.models import StatusChanged, jsonable
+from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import AsyncGenerator, Sequence
 
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._keys import Keys
     from smartcam.fleet._shared import Carried, Owner
+    from smartcam.fleet._topics import Topics
     from smartcam.models import CameraEvent, Result, Status
     from smartcam.settings import CameraSettings
 
@@ -53,12 +51,14 @@ class Host:
         keys: of the fleet.
         epoch: of the agent.
         history: results that are kept, and their bytes.
+        topics: where it is said in JSON.
 
     Attributes:
         gate: whose commands may pass.
         results: the last results.
         states: the last things that happened.
         outcomes: the runs of triggers under way, by whose they are; for who has put a list there.
+        topics: says in JSON what comes, for other programs.
         failure: why there is no session yet, None where there is or was one.
     """
 
@@ -70,6 +70,7 @@ class Host:
         keys: Keys,
         epoch: int,
         history: tuple[int, int],
+        topics: Topics,
     ) -> None:
         self.name = name
         self.settings = settings
@@ -80,12 +81,14 @@ class Host:
         self.failure: SmartCamError | None = None
         self._epoch = epoch
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
+        self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make()
         self._fresh: list[bytes] = []  # runs that are not said yet
         self._fresh_states: list[bytes] = []
         self._flushing = False
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
+        self._over = False  # there will be no session any more
         self._states_out: Publisher = bus.publisher(keys.states(name))
         self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
 
@@ -99,8 +102,20 @@ class Host:
         """Whether there is a session."""
         return self._camera.connected
 
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers that what is said next has."""
+        topics = self.topics
+        return self.results.following, self.states.following, topics.statuses, topics.events
+
+    @numbers.setter
+    def numbers(self, numbers: tuple[int, ...]) -> None:
+        topics = self.topics
+        self.results.following, self.states.following, topics.statuses, topics.events = numbers
+
     def _make(self) -> SharedCamera:
-        return SharedCamera(self.settings, Tap(self._on_results, self._on_status, self._on_event))
+        tap = Tap(self._on_results, self._on_status, self._on_event, self._on_end)
+        return SharedCamera(self.settings, tap)
 
     # ------------------------------------------------------------------ life
 
@@ -116,6 +131,7 @@ class Host:
                     self._fail(error)
                     delay = next(delays, None)
                     if delay is None or backoff is None or not backoff.transient(error):
+                        self._over = True
                         return
                     await asyncio.sleep(delay)
                     self._camera = self._make()
@@ -134,18 +150,20 @@ class Host:
 
     async def close(self) -> None:
         """End the session with Disconnect; bounded."""
+        self._opened.clear()  # what is said from now on is no news
         await self._camera.close()
         if self._reminder is not None:
             self._reminder.cancel()
         self._states_out.close()
         self._results_out.close()
+        self.topics.close()
 
     def _fail(self, error: BaseException) -> None:
         if not isinstance(error, SmartCamError):
             error = ConnectionLostError(f"{self.name}: {error}")
         self.failure = error
         self._opened.set()
-        self._say({"kind": "Absent", "reason": str(error)})
+        self._say({"kind": "Absent"})
 
     def require(self) -> SharedCamera:
         """Return the camera.
@@ -160,6 +178,28 @@ class Host:
             ) from self.failure
         return self._camera
 
+    @contextlib.asynccontextmanager
+    async def turn(self, program: str, said: str, timeout: float) -> AsyncGenerator[None]:
+        """A command of ``program`` has its turn as long as the body runs.
+
+        Raises:
+            ResponseTimeoutError, TriggerTimeoutError: another program has reserved the camera for
+                ``timeout`` seconds more.
+        """
+        async with contextlib.AsyncExitStack() as stack:
+            try:
+                await stack.enter_async_context(self.gate.command(program, timeout))
+            except TimeoutError as exc:
+                raise self.not_granted(said, timeout) from exc
+            yield
+
+    def not_granted(self, said: str, timeout: float) -> SmartCamError:
+        """Return the error of who waited in vain for others to let go of the camera."""
+        holder = self.gate.holder
+        who = "commands of others" if holder is None else f"reserved by {holder}, which"
+        text = f"{self.name}: {who} did not let go within {timeout:.3g} s; {said} was not done"
+        return late(said, text)
+
     # ------------------------------------------------------------------ what the camera is
 
     def state(self) -> dict[str, Any]:
@@ -167,24 +207,34 @@ class Host:
         camera = self._camera
         try:
             status: int | None = int(camera.status)
-        except (ConnectionClosedError, SmartCamError):
+        except SmartCamError:
             status = None
-        return {
+        fields: dict[str, Any] = {
             "connected": camera.connected,
-            "trying": not self._opened.is_set(),
             "status": status,
             "endian": camera.endian,
             "application": camera.active_application,
         }
+        if not self._opened.is_set():
+            fields["trying"] = True
+        elif not camera.connected:
+            trouble = self.failure or camera.trouble
+            if trouble is not None:
+                fields["error"] = to_fields(trouble)
+            fields["over"] = self._over
+        return fields
 
     def about(self) -> dict[str, Any]:
-        """Return what else there is to know of it."""
-        camera = self._camera
-        fields: dict[str, Any] = {"camera": self.name, "url": camera.url, "camera_name": ""}
-        fields["protocol_version"] = camera.protocol_version
-        fields["failure"] = None if self.failure is None else str(self.failure)
-        fields["interpret_as"] = jsonable(self.settings.interpret_as)
-        fields["y_down"], fields["lenient"] = self.settings.y_down, self.settings.lenient
+        """Return what else there is to know of it, the same for a whole session."""
+        camera, settings = self._camera, self.settings
+        fields: dict[str, Any] = {
+            "camera": self.name,
+            "url": camera.url,
+            "protocol_version": camera.protocol_version,
+            "interpret_as": jsonable(settings.interpret_as),
+            "y_down": settings.y_down,
+            "lenient": settings.lenient,
+        }
         with contextlib.suppress(SmartCamError):
             fields["capabilities"] = jsonable(camera.capabilities)
         return fields
@@ -192,14 +242,24 @@ class Host:
     # ------------------------------------------------------------------ what comes
 
     def _on_status(self, status: Status) -> None:
+        self.topics.on_status(status)
         self._say({"kind": "Status"})
 
     def _on_event(self, event: CameraEvent) -> None:
         if isinstance(event, StatusChanged):
             return  # a status tells that
+        self.topics.on_event(event)
         fields: dict[str, Any] = jsonable(event)
         del fields["camera"]
-        self._say({"kind": type(event).__name__, "event": fields})
+        said: dict[str, Any] = {"kind": type(event).__name__, "event": fields}
+        if isinstance(event, (Connected, Reconnected)):
+            said["about"] = self.about()
+        self._say(said)
+
+    def _on_end(self) -> None:
+        if self._opened.is_set() and self.failure is None:
+            self._over = True
+            self._say({"kind": "Over"})
 
     def _say(self, fields: dict[str, Any]) -> None:
         """Say what happened, and what the camera is now."""
@@ -209,19 +269,20 @@ class Host:
         self.states.add(1, clock, data)
         self._fresh_states.append(data)
         self._flush_soon()
+        self.topics.on_state()
 
-    def _on_results(self, results: Sequence[Result[Carried]], current: bool) -> None:
+    def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
         """Keep results that came together, and say them at the end of this turn of the loop."""
         first = results[0]
         owner = first.value.owner
-        flags = (CURRENT if current else 0) | (OWNED if first.triggered_at is not None else 0)
+        flags = (CURRENT if current else 0) | (LATE if late else 0)
         cells = first.value.cells
         clock = asyncio.get_running_loop().time()
         run = Run(
             self.results.following,
             first.application,
             self._camera.endian,
-            flags | (WITH_CELLS if cells else 0),
+            flags,
             owner.program,
             owner.call,
             clock,
@@ -238,6 +299,7 @@ class Host:
         if self._results_out.heard:
             self._fresh.append(data)
             self._flush_soon()
+        self.topics.on_run(run)
 
     def _flush_soon(self) -> None:
         if not self._flushing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 
 ROOT = "smartcam"
@@ -42,7 +43,14 @@ def _meet(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
     if not one or not other:
         return one == other
     first, second = one[0], other[0]
-    return (first == second or "*" in {first, second}) and _meet(one[1:], other[1:])
+    same = first == second or "*" in {first, second} or _fits(first, second) or _fits(second, first)
+    return same and _meet(one[1:], other[1:])
+
+
+def _fits(pattern: str, chunk: str) -> bool:
+    """Whether a chunk is one of a pattern such as ``cam$*``, which the engine knows, too."""
+    parts = pattern.split("$*")
+    return len(parts) > 1 and re.fullmatch(".*".join(map(re.escape, parts)), chunk) is not None
 
 
 class Keys:
@@ -86,6 +94,26 @@ class Keys:
     def results(self, camera: str) -> str:
         """Results of a camera."""
         return f"{self.root}/results/{camera}"
+
+    def listing(self, camera: str) -> str:
+        """What there is to know of a camera, for who asks; in JSON."""
+        return f"{self.root}/cameras/{camera}"
+
+    def topic(self, kind: str, camera: str) -> str:
+        """What is said of a camera in JSON: ``results``, ``status`` or ``events``."""
+        return f"{self.root}/topic/{kind}/{camera}"
+
+    def service(self, camera: str, name: str) -> str:
+        """A service for programs without smartcam."""
+        return f"{self.root}/service/{camera}/{name}"
+
+    def thesis(self, name: str) -> str:
+        """A service of the thesis' interface."""
+        return f"{self.root}/thesis/{name}"
+
+    def thesis_topic(self, name: str) -> str:
+        """A topic of somebody's choice."""
+        return f"{self.root}/thesis/topic/{name}"
 
     def tail(self, key: str, kind: str) -> list[str]:
         """Return the chunks of ``key`` behind ``kind``, such as ``presence/camera``."""

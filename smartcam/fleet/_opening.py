@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypedDict
 
+from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._address import FleetAddress
 from smartcam.fleet._bus import MemoryBus
@@ -75,15 +76,21 @@ def open(
         ConfigurationError: the URL, the file or an option cannot work.
         MissingExtraError: a URL, and the extra ``fleet`` is not installed.
     """
-    if isinstance(place, str) and place.strip().startswith("fleet"):
-        address = FleetAddress.parse(place) if "://" in place else None
-        if address is not None:
-            if address.camera:
-                raise ConfigurationError(
-                    f"fleet address {place!r} is a camera's; smartcam.connect() takes it"
-                )
-            end = ZenohEnd(address.link)
-            return Fleet(end, address, address.fleet, None, connect_timeout, options)
+    for name in options:
+        if name not in FleetOptions.__annotations__:
+            known = [*FleetOptions.__annotations__]
+            raise ConfigurationError(
+                f"open: a fleet has no option {name!r}; it has {', '.join(known)}"
+                f"{did_you_mean(name, known)}"
+            )
+    if isinstance(place, str) and "://" in place:
+        address = FleetAddress.parse(place)
+        if address.camera:
+            raise ConfigurationError(
+                f"fleet address {place!r} is a camera's; smartcam.connect() takes it"
+            )
+        end = ZenohEnd(address.link)
+        return Fleet(end, address, address.fleet, None, connect_timeout, options)
     bus = MemoryBus()
     server = FleetServer(place, bus=bus.end())
     return Fleet(bus.end(), None, server.file.fleet, server, connect_timeout, options)

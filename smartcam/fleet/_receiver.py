@@ -8,7 +8,6 @@ import json
 import logging
 import math
 import weakref
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.listeners import Listeners
@@ -19,9 +18,9 @@ from smartcam.exceptions import (
     WrongApplicationError,
 )
 from smartcam.fleet._log import Feed
-from smartcam.fleet._wire import CURRENT, Batch, Message, Run, decode, decode_runs
+from smartcam.fleet._reading import as_result, interpreted, singles
+from smartcam.fleet._wire import CURRENT, LATE, Batch, Message, Run, decode, decode_runs
 from smartcam.models import Result
-from smartcam.protocols.messages import ResultContainer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -330,7 +329,7 @@ class Receiver:
         self._wake()
 
     def _see(self, epoch: int) -> None:
-        """Look whether the agent was started anew, which presence does not tell where it is soon."""
+        """Look whether the agent was started anew: presence does not tell where it is back soon."""
         met = self._caller.met
         if met is not None and epoch > met.epoch:
             self._caller.lose(f"the agent {met.agent} was restarted")
@@ -352,6 +351,8 @@ class Receiver:
             InterpretationError: of the first that cannot be read.
         """
         found = [self._outcome(own, run) for run in batch.runs]
+        if batch.runs and not math.isnan(batch.runs[-1].latency):
+            self._counters.processing.add(batch.runs[-1].latency)
         for one in found:
             if isinstance(one, InterpretationError):
                 raise one
@@ -373,8 +374,6 @@ class Receiver:
                 counters.count("uninterpretable")
                 raise
             counters.count("triggered")
-            if not math.isnan(run.latency):
-                counters.processing.add(run.latency)
         except InterpretationError as error:
             outcome = error
         own.outcomes[run.number] = outcome
@@ -396,11 +395,8 @@ class Receiver:
                 return
             if listeners.streams_results and self._take_burst(run, now):
                 return
-            for place in range(len(run.payloads)):
-                one = replace(
-                    run, number=run.number + place, payloads=run.payloads[place : place + 1]
-                )
-                fate = "streamed" if run.flags & CURRENT else "late"
+            for one in singles(run):
+                fate = "late" if run.flags & LATE else "streamed"
                 try:
                     outcome: Result | InterpretationError = self._interpret(
                         one, self._interpretation()
@@ -420,7 +416,7 @@ class Receiver:
             size = len(run.payloads[0])
             listeners.offer_error(outcome, now, size, current=current, owned=owned)
         else:
-            listeners.offer_result(outcome, now, current=current)
+            listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 
     def _take_burst(self, run: Run, now: float) -> bool:
         """Hand on containers that are only streamed, all at once; False where that cannot be."""
@@ -451,32 +447,10 @@ class Receiver:
         return True
 
     def _interpret(self, run: Run, interpretation: Interpretation) -> Result:
-        cells = fault = None
-        if run.cells:
-            said: dict[str, Any] = json.loads(run.cells)
-            fault, given = said.get("fault"), said.get("cells")
-            cells = None if given is None else tuple(given)
-        (data,) = run.payloads
-        container = ResultContainer(
-            application=run.application, data=data, cells=cells, fault=fault
-        )
-        at = run.received_at
-        value, sequence, empty_slots = interpretation(
-            container, run.endian, camera=self._name, number=run.number, at=at
-        )
+        value, sequence, empty_slots = interpreted(run, interpretation, self._name)
         if empty_slots:
             self._counters.skip(empty_slots)
-        return Result(
-            self._name,
-            run.application,
-            sequence,
-            run.number,
-            run.trigger_time,
-            at,
-            None if math.isnan(run.latency) else run.latency,
-            data,
-            value,
-        )
+        return as_result(run, self._name, value, sequence)
 
     def _wrong_application(self, run: Run, expected: int) -> WrongApplicationError:
         return WrongApplicationError(

@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._client.camera_state import CameraState
 from smartcam._client.interpretation import Interpretation, Interpreted
 from smartcam._client.listeners import Listeners
 from smartcam.client import SmartCamera
-from smartcam.exceptions import ResponseTimeoutError, TriggerTimeoutError, WrongApplicationError
+from smartcam.exceptions import SmartCamError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -47,11 +48,19 @@ class Carrier(Interpretation):
     Args:
         owner: whose trigger's results it is for.
         layouts: a layout with ``@sequence``, or one for each application that has; None for none.
+        by_application: the program reads each application's results its own way.
     """
 
-    def __init__(self, owner: Owner = NOBODY, layouts: Any = None) -> None:
+    def __init__(
+        self, owner: Owner = NOBODY, layouts: Any = None, *, by_application: bool = False
+    ) -> None:
         super().__init__(layouts, lenient=True, y_down=False)
         self._carried = Carried(owner, b"")
+        self._each = by_application
+
+    @property
+    def by_application(self) -> bool:
+        return self._each
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
@@ -77,9 +86,10 @@ class Carrier(Interpretation):
 class Tap(NamedTuple):
     """What an agent is told of one of its cameras; each a function."""
 
-    results: Callable[[Sequence[Result[Carried]], bool], None]
+    results: Callable[[Sequence[Result[Carried]], bool, bool], None]
     status: Callable[[Status], None]
     event: Callable[[CameraEvent], None]
+    end: Callable[[], None]
 
 
 class TappedListeners(Listeners):
@@ -108,6 +118,11 @@ class TappedListeners(Listeners):
         if self.tap is not None:
             self.tap.event(event)
 
+    def end(self, error: SmartCamError | None) -> None:
+        super().end(error)
+        if self.tap is not None:
+            self.tap.end()
+
     def offer_status(self, status: Status, now: float) -> None:
         super().offer_status(status, now)
         if self.tap is not None:
@@ -116,12 +131,12 @@ class TappedListeners(Listeners):
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
         super().offer_burst(results, now, size)
         if self.tap is not None:
-            self.tap.results(results, True)
+            self.tap.results(results, True, False)
 
-    def offer_result(self, result: Result, now: float, *, current: bool) -> None:
-        super().offer_result(result, now, current=current)
+    def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
+        super().offer_result(result, now, current=current, late=late)
         if self.tap is not None:
-            self.tap.results((result,), current)
+            self.tap.results((result,), current, late)
 
 
 class SharedCamera(SmartCamera[Carried]):
@@ -141,49 +156,38 @@ class SharedCamera(SmartCamera[Carried]):
     def _make_listeners(self) -> Listeners:
         return TappedListeners(self.settings.name, self._observers)
 
+    def _make_state(self) -> CameraState:
+        settings = self.settings
+        return CameraState(settings.name, settings.application, self._listeners, shared=True)
+
     def _interpretation(self, spec: object) -> Interpretation:
         return Carrier()
+
+    @property
+    def trouble(self) -> SmartCamError | None:
+        """Why there is no session, None where there is one."""
+        try:
+            self._require_session()
+        except SmartCamError as error:
+            return error
+        return None
 
     @property
     def endian(self) -> int:
         """The byte order that its last status told."""
         return self._state.endian
 
-    @property
-    def expected_application(self) -> int | None:
-        """The application that was asked for last, None where none was."""
-        return self._state.wanted.application
-
     async def trigger_for(
-        self,
-        request: TriggerRequest,
-        application: int | None,
-        expected: int | None,
-        timeout: float,
+        self, request: TriggerRequest, application: int | None, timeout: float
     ) -> list[Result[Carried]]:
-        """Trigger for a program: :meth:`trigger`.
+        """Trigger for a program, as :meth:`trigger` does.
 
         Args:
             request: what it is to do.
             application: have this one running for it.
-            expected: the application that its program counts on, None for any.
             timeout: seconds.
         """
-        if application is not None or expected is None:
-            return await self._trigger(application, request, timeout)
-        try:
-            async with self._lock.hold(timeout) as deadline:
-                active = self.active_application
-                if active != expected:
-                    raise WrongApplicationError(
-                        f"{self.name}: application {active} is active, application {expected} was "
-                        "expected: another program has switched; no trigger was sent",
-                        expected=expected,
-                        got=active,
-                    )
-                return await self._triggers.trigger(request, deadline)
-        except ResponseTimeoutError as exc:
-            raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
+        return await self._trigger(application, request, timeout)
 
     async def ensure(self, application: int, timeout: float) -> None:
         """Have an application running and ready, as ``application=`` does at the start."""

@@ -20,6 +20,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 
+def grace(timeout: float) -> float:
+    """Return the seconds for which a reply is awaited beyond a call's own.
+
+    So the agent gives up first. Half of it may go by until the call is there; then the call has
+    all its time.
+    """
+    return min(0.25, 0.02 + 0.1 * timeout)
+
+
 class Message(NamedTuple):
     """A JSON object, and the byte strings that came behind it."""
 
@@ -68,8 +77,8 @@ def decode(payload: bytes, what: str) -> Message:
 
 # ---------------------------------------------------------------------- results
 
-CURRENT, OWNED, WITH_CELLS = 1, 2, 4
-"""Flags of a run: not known to be an older trigger's; outcome of a trigger; texts behind it."""
+CURRENT, LATE = 1, 2
+"""Flags of a run: not known to be an older trigger's; known to be one's that was given up."""
 
 _RUN = struct.Struct("<QIIBBxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")

@@ -42,6 +42,12 @@ LEASE = 5.0
 LONG = 1 << 16
 """Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
 
+REPLIERS = 4
+"""Threads that answer queries: who asks and does not read holds up one of them."""
+
+MOST_REPLYING = 4096
+"""Queries whose answers wait for these threads; one beyond gets none."""
+
 MOST_WAITING = 1 << 26
 """Bytes that wait for the event loop, or for the thread that says what is long; what comes beyond
 is dropped, and results are asked for again later."""
@@ -171,6 +177,8 @@ class ZenohEnd(Bus):
         self._sending = 0
         self._behind: collections.Counter[str] = collections.Counter()
         self._calm_since, self._said = -CALM, 0
+        self._repliers: ThreadPoolExecutor | None = None
+        self._replying = 0
 
     # ------------------------------------------------------------------ life
 
@@ -210,10 +218,9 @@ class ZenohEnd(Bus):
             return
         for one in tuple(self._declared):
             one.close()
-        sender, self._sender = self._sender, None
-        if sender is not None:
-            sender.shutdown(wait=False)
-        closing = self._loop.run_in_executor(None, session.close)
+        threads = [one for one in (self._sender, self._repliers) if one is not None]
+        self._sender = self._repliers = None
+        closing = self._loop.run_in_executor(None, _end, session, threads)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.shield(closing)
@@ -289,7 +296,7 @@ class ZenohEnd(Bus):
     def _hand_over(
         self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]
     ) -> None:
-        """Have a thread say it, which waits until there is room; what goes the same way then, too."""
+        """Have a thread say it, which waits until there is room; what goes the same way, too."""
         if self._sender is None:
             self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
         size = len(payload)
@@ -310,6 +317,25 @@ class ZenohEnd(Bus):
             self._behind[way] += 1
         self._sender.submit(say)
 
+    def reply(self, query: Any, replies: list[tuple[str, bytes]]) -> None:
+        """Answer a query, and end it; never waits.
+
+        The engine may wait for who has asked, as that one has said in the query; so threads do it.
+        """
+        if self._session is None or not replies or self._replying >= MOST_REPLYING:
+            _quietly(query.drop)
+            return
+        if self._repliers is None:
+            self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
+        with self._lock:
+            self._replying += 1
+        encoding = self._zenoh.Encoding.APPLICATION_JSON
+        self._repliers.submit(_reply, query, replies, encoding).add_done_callback(self._replied)
+
+    def _replied(self, _: object) -> None:
+        with self._lock:
+            self._replying -= 1
+
     def publisher(self, key: str, on_heard: Callable[[bool], None] | None = None) -> Publisher:
         return _Publisher(self, key, on_heard)
 
@@ -326,7 +352,7 @@ class ZenohEnd(Bus):
 
     def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
         def on_query(query: Any) -> None:
-            self._in_loop(declared.call, 0, answer, _Question(self._zenoh, query))
+            self._in_loop(declared.call, 0, answer, _Question(self, query))
 
         declared = _Declared(self)
         return declared.of(
@@ -406,8 +432,9 @@ class ZenohEnd(Bus):
         """Declare something at the engine; it is closed with this end."""
         if self._session is None:
             raise ConfigurationError("the fleet's bus is not open")
+        made = how(self._session)
         self._declared.add(one)
-        return how(self._session)
+        return made
 
     def forget(self, one: _Declared) -> None:
         """It is closed."""
@@ -495,20 +522,32 @@ class _Publisher(Publisher):
 
 
 class _Question(Question):
-    def __init__(self, zenoh: Any, query: Any) -> None:
+    def __init__(self, end: ZenohEnd, query: Any) -> None:
         self.key = str(query.key_expr)
         self.payload = b"" if query.payload is None else query.payload.to_bytes()
-        self._query = query
-        self._encoding = zenoh.Encoding.APPLICATION_JSON
+        self._end, self._query = end, query
+        self._replies: list[tuple[str, bytes]] = []
 
     def reply(self, key: str, payload: bytes) -> None:
-        if self._query is not None:
-            _quietly(self._query.reply, key, payload, encoding=self._encoding)
+        self._replies.append((key, payload))
 
     def close(self) -> None:
         query, self._query = self._query, None
         if query is not None:
-            _quietly(query.drop)
+            self._end.reply(query, self._replies)
+
+
+def _reply(query: Any, replies: list[tuple[str, bytes]], encoding: Any) -> None:
+    for key, payload in replies:
+        _quietly(query.reply, key, payload, encoding=encoding, express=True)
+    _quietly(query.drop)
+
+
+def _end(session: Any, threads: list[ThreadPoolExecutor]) -> None:
+    """Say what is to be said yet, then end the session."""
+    for one in threads:
+        one.shutdown()
+    session.close()
 
 
 def _direct(call: Callable[[Any], None]) -> Any:

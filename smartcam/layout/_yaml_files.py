@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
+from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout._yamls import MAX_YAML_TEXT, BadYamlError, compose, construct
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from pydantic_core import ErrorDetails
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -60,13 +63,47 @@ def read_model(
         model = kind.model_validate(data)
     except ValidationError as exc:
         findings = [
-            (item["loc"], item["msg"].removeprefix("Value error, ")) for item in exc.errors()
+            (item["loc"], item["msg"].removeprefix("Value error, ") + _meant(kind, item))
+            for item in exc.errors()
         ]
         raise ConfigurationError(_texts(named, root, findings)) from exc
     found = mistake(model)
     if found is not None:
         raise ConfigurationError(_texts(named, root, [found]))
     return model
+
+
+def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
+    """Return which field may have been meant by one that there is not; empty for any other item."""
+    if item["type"] != "extra_forbidden":
+        return ""
+    *place, field = item["loc"]
+    schema = kind.model_json_schema()
+    found = [*_branches(schema, schema)]
+    for part in place:
+        children = [child for one in found for child in _children(schema, one, part)]
+        found = children or found  # pydantic's way has the kinds of a union in it, too
+    return did_you_mean(str(field), {name for one in found for name in one.get("properties", {})})
+
+
+def _children(schema: Any, one: Any, part: int | str) -> list[Any]:
+    kinds = [one["items"]] if isinstance(part, int) and "items" in one else []
+    if part in one.get("properties", {}):
+        kinds = [one["properties"][part]]
+    elif isinstance(one.get("additionalProperties"), dict):
+        kinds = [one["additionalProperties"]]
+    return [branch for kind in kinds for branch in _branches(schema, kind)]
+
+
+def _branches(schema: Any, node: Any) -> Iterator[Any]:
+    """Give what a part of a schema may be: what it refers to, and each kind of a union."""
+    if "$ref" in node:
+        yield from _branches(schema, schema["$defs"][node["$ref"].rpartition("/")[2]])
+    kinds = [*node.get("anyOf", ()), *node.get("oneOf", ()), *node.get("allOf", ())]
+    for kind in kinds:
+        yield from _branches(schema, kind)
+    if "properties" in node or "items" in node or "additionalProperties" in node:
+        yield node
 
 
 def _texts(named: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]) -> str:

@@ -21,6 +21,7 @@ from smartcam.emulator import (
 )
 from smartcam.exceptions import ConfigurationError
 from tests import ROOT
+from tests.schemas import plain
 
 CELL = """\
 seed: 10
@@ -200,18 +201,3 @@ def test_schema_finds_mistakes() -> None:
 def test_schema_in_the_documents_is_that_of_the_code() -> None:
     text = (ROOT / "docs" / "scenario.schema.json").read_text(encoding="utf-8")
     assert plain(json.loads(text)) == plain(scenario_schema())
-
-
-def plain(schema: Any) -> Any:
-    """Return a schema without what pydantic's versions spell in different ways."""
-    if isinstance(schema, list):
-        return [plain(one) for one in schema]
-    if not isinstance(schema, dict):
-        return schema
-    found = {key: plain(value) for key, value in schema.items()}
-    if "const" in found:
-        found.pop("enum", None)
-    if found.get("additionalProperties") is True:
-        del found["additionalProperties"]
-    (found_all,) = found.pop("allOf", [{}])
-    return {**found, **found_all}

@@ -71,6 +71,10 @@ def test_scenario_without_builtins(tmp_path: Path) -> None:
         ("running: 2020-13-45\n", "line.yaml: month must be"),
         ("colour: red\n", "line.yaml, line 1: colour: Extra inputs are not permitted"),
         (
+            "timeline:\n  - {at: 1, do: {kind: drop, nthh: 3}}\n",
+            "line.yaml, line 2: timeline.0.do.0.drop.nthh: Extra .*; did you mean 'nth'",
+        ),
+        (
             "applications:\n  - id: 5\n  - id: 6\n    rate: -1\n",
             "line.yaml, line 4: applications.1.rate: Input should be greater than or equal to "
             "0.0001",

@@ -1,0 +1,87 @@
+"""What an agent said of a result, read: its value, and all of it as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import InterpretationError
+from smartcam.fleet._errors import to_fields
+from smartcam.models import Result, jsonable
+from smartcam.protocols.messages import ResultContainer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam._client.interpretation import Interpretation, Interpreted
+    from smartcam.fleet._wire import Run
+
+
+def singles(run: Run) -> Iterator[Run]:
+    """Give each container of a run as a run of its own."""
+    for place in range(len(run.payloads)):
+        yield replace(run, number=run.number + place, payloads=run.payloads[place : place + 1])
+
+
+def interpreted(run: Run, interpretation: Interpretation, camera: str) -> Interpreted:
+    """Return what the one container of ``run`` holds.
+
+    Raises:
+        InterpretationError: it does not fit.
+    """
+    cells = fault = None
+    if run.cells:
+        said: dict[str, Any] = json.loads(run.cells)
+        fault, given = said.get("fault"), said.get("cells")
+        cells = None if given is None else tuple(given)
+    (data,) = run.payloads
+    container = ResultContainer(application=run.application, data=data, cells=cells, fault=fault)
+    return interpretation(
+        container, run.endian, camera=camera, number=run.number, at=run.received_at
+    )
+
+
+def as_result(run: Run, camera: str, value: Any, sequence: int | None) -> Result[Any]:
+    """Return the one container of ``run`` as a result with this value."""
+    latency = None if math.isnan(run.latency) else run.latency
+    return Result(
+        camera,
+        run.application,
+        sequence,
+        run.number,
+        run.trigger_time,
+        run.received_at,
+        latency,
+        run.payloads[0],
+        value,
+    )
+
+
+def result_fields(run: Run, interpretation: Interpretation | None, camera: str) -> dict[str, Any]:
+    """Return the one container of ``run`` as JSON, with ``error`` where it cannot be read.
+
+    The value is None then, and without an interpretation.
+    """
+    value = sequence = None
+    said: dict[str, Any] = {"error": ""}
+    if interpretation is not None:
+        try:
+            value, sequence, _ = interpreted(run, interpretation, camera)
+            value = jsonable(value)
+        except InterpretationError as error:
+            value, said = None, failure(error)
+        except Exception as exc:  # noqa: BLE001 - a plug-in's value that is no JSON
+            value, said = None, failure(InterpretationError(f"the value is no JSON: {exc!r:.200}"))
+    fields: dict[str, Any] = jsonable(as_result(run, camera, None, sequence))
+    return {**fields, "value": value, **said}
+
+
+def failure(error: BaseException) -> dict[str, Any]:
+    """Return an error as answers and results in JSON have it: ``error`` is never empty."""
+    said = to_fields(error, 0)
+    fields: dict[str, Any] = {"error": said["text"] or said["kind"], "kind": said["kind"]}
+    if "attributes" in said:
+        fields["attributes"] = said["attributes"]
+    return fields

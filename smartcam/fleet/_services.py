@@ -1,0 +1,243 @@
+"""Services for programs without smartcam: JSON in, JSON out. ``docs/bus.md`` describes them."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+from datetime import datetime
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from smartcam._client.triggering import TriggerRequest
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import UnsupportedError
+from smartcam.fleet._calls import ACTIONS, MOST_FILLED, Call, outcomes
+from smartcam.fleet._keys import COMMANDS
+from smartcam.fleet._reading import result_fields, singles
+from smartcam.fleet._shared import Carrier
+from smartcam.fleet._wire import decode_runs, encode_runs
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from smartcam._client.interpretation import Interpretation
+    from smartcam.fleet._host import Host
+    from smartcam.fleet._shared import Owner
+    from smartcam.fleet._topics import CameraTopics
+    from smartcam.fleet._wire import Run
+
+DEFAULT_TIMEOUT = 10.0
+MOST_TIMEOUT = 600.0
+MOST_RESULTS = 1000
+"""Results that one answer brings."""
+
+MOST_INPUT = 1 << 16
+
+
+def _hex(text: str) -> str:
+    try:
+        bytes.fromhex(text)
+    except ValueError as exc:
+        raise ValueError("expected bytes as hex, such as 0aff") from exc
+    return text
+
+
+def _time(text: str) -> str:
+    try:
+        datetime.fromisoformat(text)
+    except ValueError as exc:
+        raise ValueError("expected a time such as 2030-01-31T12:00:00") from exc
+    return text
+
+
+Hex = Annotated[str, Field(max_length=2 * MOST_INPUT), AfterValidator(_hex)]
+Number = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+Text = Annotated[str, Field(max_length=200)]
+Interpret = Annotated[str, Field(max_length=10_000)]
+
+
+class PlainRequest(BaseModel):
+    """What every request may say."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    timeout: Annotated[float, Field(gt=0, le=MOST_TIMEOUT, allow_inf_nan=False)] | None = None
+    id: Text | int | None = None
+    program: Text = ""
+    epoch: Text | None = None
+
+
+class _PlainTrigger(PlainRequest):
+    application: Number | None = None
+    input: Hex | None = None
+    results_per_trigger: Annotated[int, Field(ge=1, le=MOST_RESULTS)] | None = None
+    when_busy: Literal["wait", "refuse"] = "wait"
+    interpret_as: Interpret | None = None
+
+
+class _PlainSwitch(PlainRequest):
+    application: Number | Text
+
+
+class _PlainInput(PlainRequest):
+    input: Hex
+
+
+class _PlainNumber(PlainRequest):
+    number: Number
+
+
+class _PlainClock(PlainRequest):
+    when: Annotated[Text, AfterValidator(_time)]
+
+
+class _PlainResults(PlainRequest):
+    first: Annotated[int, Field(ge=1)] | None = None
+    most: Annotated[int, Field(ge=1, le=MOST_RESULTS)] = 100
+
+
+class Work(NamedTuple):
+    """A service under way.
+
+    Attributes:
+        host: the camera.
+        topics: what is said of it in JSON.
+        request: what is asked for; of the service's own kind.
+        timeout: seconds that it may take.
+        owner: whose results are those of its trigger.
+    """
+
+    host: Host
+    topics: CameraTopics
+    request: Any
+    timeout: float
+    owner: Owner
+
+
+class Service(NamedTuple):
+    """A service.
+
+    Attributes:
+        request: what it takes.
+        do: does it, and returns what its answer has beside ``error``.
+        command: it waits while another program has the camera reserved.
+        timeout: seconds, where the request says none.
+        nothing: what its answer has beside an error.
+    """
+
+    request: type[PlainRequest]
+    do: Callable[[Work], Awaitable[dict[str, Any]]]
+    command: bool = True
+    timeout: float = DEFAULT_TIMEOUT
+    nothing: Mapping[str, Any] = MappingProxyType({})
+
+
+async def triggered(
+    work: Work,
+    interpretation: Interpretation | None,
+    application: int | None,
+    *,
+    data: bytes | None = None,
+    wanted: int = 1,
+    wait: bool = True,
+) -> list[Run]:
+    """Trigger; return its containers, each a run of its own.
+
+    Raises:
+        SmartCamError: as :meth:`smartcam.Camera.trigger`.
+    """
+    layouts = interpretation.numbered_layouts() if interpretation is not None else None
+    request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
+    runs = await outcomes(work.host, work.owner, request, application, work.timeout)
+    batch = decode_runs(encode_runs(0, 0, runs), "results")
+    return [one for run in batch.runs for one in singles(run)]
+
+
+async def _trigger(work: Work) -> dict[str, Any]:
+    request, topics = work.request, work.topics
+    interpretation = topics.interpretation
+    if request.interpret_as is not None:
+        interpretation = topics.reading(request.interpret_as)
+    runs = await triggered(
+        work,
+        interpretation,
+        request.application,
+        data=None if request.input is None else bytes.fromhex(request.input),
+        wanted=request.results_per_trigger or 1,
+        wait=request.when_busy == "wait",
+    )
+    results = [result_fields(run, interpretation, work.host.name) for run in runs]
+    answer: dict[str, Any] = {"result": results[0]}
+    if request.results_per_trigger is not None:
+        answer = {"results": results}
+    for one in results:
+        if one["error"]:
+            return {**answer, "error": one["error"], "kind": one["kind"]}
+    return answer
+
+
+async def _status(work: Work) -> dict[str, Any]:
+    return work.topics.state()
+
+
+def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
+    """Return what does the same as a call of smartcam's own programs."""
+
+    async def service(work: Work) -> dict[str, Any]:
+        arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
+        blobs = [bytes.fromhex(arguments.pop(one)) for one in ("input",) if one in arguments]
+        call = Call(work.host, "", work.owner, arguments, blobs, work.timeout, {})
+        fields, found = await ACTIONS[do](call)
+        if "status" in fields:
+            fields["status_names"] = Status(fields["status"]).names
+        return {**fields, "image": base64.b64encode(found[0]).decode()} if found else fields
+
+    return service
+
+
+async def _results(work: Work) -> dict[str, Any]:
+    kept, most = work.host.results, work.request.most
+    first = max(1, kept.following - most) if work.request.first is None else work.request.first
+    part = kept.part(first, MOST_FILLED)
+    batch = decode_runs(encode_runs(0, 0, part.data), "results that are kept")
+    found = (one for run in batch.runs for one in singles(run) if one.number >= part.first)
+    results = [work.topics.result(one) for one in itertools.islice(found, most)]
+    return {"first": part.first, "next_result": part.following, "results": results}
+
+
+async def _unknown(work: Work) -> dict[str, Any]:
+    raise UnsupportedError(f"{work.host.name}: there is no such service")
+
+
+UNKNOWN = Service(PlainRequest, _unknown)
+"""In place of a service that is not there."""
+
+_OF_ALL = {*PlainRequest.model_fields}
+
+_REQUESTS: dict[str, type[PlainRequest]] = {
+    "switch_application": _PlainSwitch,
+    "start": PlainRequest,
+    "stop": PlainRequest,
+    "reset_errors": PlainRequest,
+    "set_input": _PlainInput,
+    "set_sequence_number": _PlainNumber,
+    "set_clock": _PlainClock,
+    "reboot": PlainRequest,
+    "query_status": PlainRequest,
+    "query_application": PlainRequest,
+    "wait_ready": PlainRequest,
+    "get_clock": PlainRequest,
+    "read_image": PlainRequest,
+}
+"""What the services take that do the same as a call of smartcam's own programs."""
+
+SERVICES: dict[str, Service] = {
+    "trigger": Service(_PlainTrigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
+    "status": Service(PlainRequest, _status, command=False),
+    "results": Service(_PlainResults, _results, command=False),
+    **{do: Service(kind, _same(do), do in COMMANDS) for do, kind in _REQUESTS.items()},
+}
+"""The plain services by name."""

@@ -1,0 +1,78 @@
+"""Kinds of cameras: at the wire, and of a fleet over either bus; made as ``connect()`` does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from smartcam import Camera, SmartCamera
+from smartcam.fleet._agent import Agent
+from smartcam.fleet._bus import Bus, MemoryBus
+from smartcam.fleet._camera import FleetCamera
+from smartcam.fleet._keys import Keys
+from smartcam.fleet._program import Program
+from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+from smartcam.observers import Observer
+from smartcam.settings import Address, CameraSettings
+
+FLEET = "plant"
+
+AGENTS = {
+    "connect_timeout",
+    "connect_attempts",
+    "switch_timeout",
+    "request_timeout",
+    "close_timeout",
+    "liveness_timeout",
+    "reconnect",
+    "restore",
+    "max_length",
+}
+"""Options that are the agent's, since it has the session."""
+
+
+class OwnAgentCamera(FleetCamera[Any]):
+    """A camera of a fleet whose agent begins and ends with it."""
+
+    def __init__(
+        self,
+        url: str,
+        ends: tuple[Bus, Bus],
+        options: dict[str, Any],
+        observers: Iterable[Observer],
+    ) -> None:
+        name = "line1/cam1"
+        theirs = {key: value for key, value in options.items() if key in AGENTS}
+        session = CameraSettings.make(url, options.pop("model", None), {**theirs, "name": name})
+        self.agent = Agent("agent", Keys(FLEET), ends[0], {name: session})
+        address = Address("fleet", "fleet", "localhost", 7447, path=name)
+        own = {key: value for key, value in options.items() if key not in {"max_length", "restore"}}
+        super().__init__(
+            CameraSettings.of(address, own),
+            name,
+            Program(ends[1], FLEET, name),
+            observers=observers,
+        )
+
+    async def attend(self, timeout: float) -> None:
+        await self.agent.open(timeout)
+        await super().attend(timeout)
+
+    async def close(self) -> None:
+        await super().close()
+        await self.agent.close()
+
+
+def connect(
+    kind: str, url: str, *, observers: Iterable[Observer] = (), **options: Any
+) -> Camera[Any]:
+    """Return an unopened camera of a kind, for one that is at ``url``."""
+    if kind == "wire":
+        model = options.pop("model", None)
+        return SmartCamera(CameraSettings.make(url, model, options), observers=observers)
+    if kind == "memory":
+        bus = MemoryBus()
+        return OwnAgentCamera(url, (bus.end(), bus.end()), options, observers)
+    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    ends = ZenohEnd(Link(listen=(place,))), ZenohEnd(Link(connect=(place,)))
+    return OwnAgentCamera(url, ends, options, observers)
