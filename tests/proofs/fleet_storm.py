@@ -118,6 +118,9 @@ async def live(
             elif outcome == "InputContainerError":
                 with contextlib.suppress(SmartCamError):
                     await camera.switch_application(WITH_INPUT)
+            elif outcome == "NotRunningError":  # who was to switch was killed meanwhile
+                with contextlib.suppress(SmartCamError):
+                    await camera.start()
         ends.put_nowait(None)
 
     async with asyncio.TaskGroup() as group:
