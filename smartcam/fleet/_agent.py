@@ -41,7 +41,7 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 MOST_PROGRAMS = 4096
 MOST_CALLS = 256
-"""Calls of one program that may be under way at a time."""
+"""Calls of one program that may be under way at a time, for each camera of the agent."""
 
 KNOWN_CALLS = 4096
 """Numbers of calls that are remembered for each program; older ones are not done any more."""
@@ -60,25 +60,31 @@ class Guest:
     Attributes:
         number: by which results say whose they are.
         tasks: its calls under way.
+        floor: calls up to this one are not done, or not again.
         entered: what its temporary switches go back to.
         told: the number up to which it has heard of states with its replies, by camera.
     """
 
     number: int
+    floor: int = 0
     tasks: dict[int, asyncio.Task[None]] = field(default_factory=dict[int, "asyncio.Task[None]"])
     entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
     told: dict[str, int] = field(default_factory=dict[str, int])
     _known: set[int] = field(default_factory=set[int])
-    _floor: int = 0
+
+    @property
+    def last(self) -> int:
+        """The highest number of a call that was seen."""
+        return max(self._known, default=self.floor)
 
     def is_new(self, call: int) -> bool:
         """Whether a call has not been seen; it is known from now on."""
-        if call <= self._floor or call in self._known:
+        if call <= self.floor or call in self._known:
             return False
         self._known.add(call)
         if len(self._known) > KNOWN_CALLS:
             kept = sorted(self._known)[KNOWN_CALLS // 2 :]
-            self._floor = kept[0] - 1
+            self.floor = kept[0] - 1
             self._known = set(kept)
         return True
 
@@ -111,6 +117,7 @@ class Agent:
         self._cameras, self._history, self._on_event = cameras, history, on_event
         self.hosts: dict[str, Host] = {}
         self._programs: dict[str, Guest] = {}
+        self._gone: dict[str, int] = {}  # programs that left, oldest first: their last call
         self._numbers = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._declared: list[Handle] = []
@@ -214,6 +221,9 @@ class Agent:
         guest = self._programs.pop(program, None)
         if guest is None:
             return
+        self._gone[program] = guest.last
+        if len(self._gone) > MOST_PROGRAMS:
+            del self._gone[next(iter(self._gone))]
         for task in guest.tasks.values():
             self._end(task)
         for host in self.hosts.values():
@@ -222,12 +232,13 @@ class Agent:
             for camera, before in guest.entered.values():
                 camera.leave(before)
 
-    def _guest(self, program: str) -> Guest:
-        known = self._programs.get(program)
-        if known is None:
+    def _guest(self, program: str, call: int) -> Guest | None:
+        """Return who says hello; None where that was said before it left, and comes only now."""
+        known, left = self._programs.get(program), self._gone.get(program, 0)
+        if known is None and call > left:
             if len(self._programs) >= MOST_PROGRAMS:
                 raise LocalProtocolError(f"{self.name}: {MOST_PROGRAMS} programs are here already")
-            known = self._programs[program] = Guest(self.next_program())
+            known = self._programs[program] = Guest(self.next_program(), left)
         return known
 
     def next_program(self) -> int:
@@ -256,9 +267,10 @@ class Agent:
         program, number = str(fields["program"]), int(fields["call"])
         if "cancel" in fields:
             self._cancel(host, program, int(fields["cancel"]))
+            self._reply(program, number, {"answer": {}})
             return
         said = str(fields["do"])
-        guest = self._guest(program) if said == "hello" else self._programs.get(program)
+        guest = self._guest(program, number) if said == "hello" else self._programs.get(program)
         if guest is None or fields.get("epoch", self.epoch) != self.epoch:
             stranger = ConnectionLostError(
                 f"{host.name}: the agent {self.name} was restarted, or took this program for "
@@ -276,9 +288,9 @@ class Agent:
             error = UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
         elif left < 0:
             error = late(said, f"{host.name}: {said} came after its deadline; it was not done")
-        elif len(guest.tasks) >= MOST_CALLS:
+        elif len(guest.tasks) >= MOST_CALLS * len(self.hosts):
             error = LocalProtocolError(
-                f"{host.name}: {MOST_CALLS} calls of this program are under way"
+                f"{host.name}: {len(guest.tasks)} calls of this program are under way"
             )
         if error is not None:
             self._reply(program, number, {"error": to_fields(error)})

@@ -34,6 +34,10 @@ HELLO_TIMEOUT = 2.0
 """Seconds for the answer to a hello; then it is said again, as long as the agent is there."""
 
 
+INSIST_AFTER = 1.0
+"""Seconds until something is said again that the agent has to know: it may have been lost."""
+
+
 class Met:
     """An agent that has answered.
 
@@ -88,6 +92,7 @@ class Caller:
         self._ahead = 0.0  # the agent's clock is at least so far ahead of the loop's
         self._measured = 0.0
         self._waiting: list[asyncio.Future[None]] = []
+        self._insisting: set[asyncio.Task[None]] = set()
 
     # ------------------------------------------------------------------ life
 
@@ -109,6 +114,7 @@ class Caller:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
+        await asyncio.gather(*self._insisting)  # what they wait for has failed
 
     def finish(self, error: LinkError) -> None:
         """There will be no agent any more."""
@@ -235,7 +241,7 @@ class Caller:
         self._ahead, self._measured = max(least, clock - now), now
 
     def clock(self, at: float) -> float:
-        """Return what the agent's clock says at a time of the loop's: that, or a little more."""
+        """Return what the agent's clock says at a time of the loop's: that, or a little less."""
         return at + self._ahead - DRIFT * max(0.0, at - self._measured)
 
     # ------------------------------------------------------------------ calls
@@ -315,14 +321,46 @@ class Caller:
 
     def tell(self, do: str, arguments: dict[str, Any]) -> None:
         """Have something done without waiting for it, if there is an agent."""
-        if self.met is None:
-            return
-        number = self.program.next_call()
-        fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments}
-        self.program.send(self._key(self.met.agent, do), {**fields, "epoch": self.met.epoch})
+        if self.met is not None:
+            fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
+            self._insist(self._key(self.met.agent, do), fields)
 
     def _cancel(self, key: str, number: int) -> None:
-        self.program.send(key, {"call": self.program.next_call(), "cancel": number})
+        self._insist(key, {"cancel": number})
+
+    def _insist(self, key: str, fields: dict[str, Any]) -> None:
+        """Say what does no harm when it comes twice, now, and until the agent says it has it.
+
+        An agent that is gone, or has been, knows nothing any more that would have to end.
+        """
+        program, met = self.program, self.met
+
+        def say() -> tuple[int, asyncio.Future[Message]]:
+            number = program.next_call()
+            program.send(key, {"call": number, **fields})
+            return number, program.expect(number, self)
+
+        async def repeat(number: int, answer: asyncio.Future[Message]) -> None:
+            while True:
+                try:
+                    async with asyncio.timeout(INSIST_AFTER):
+                        await answer
+                except TimeoutError:
+                    if self.met is not met or met is None:
+                        return
+                except SmartCamError:
+                    return
+                else:
+                    return
+                finally:
+                    program.forget(number)
+                number, answer = say()
+
+        task = asyncio.get_running_loop().create_task(
+            repeat(*say()), name=f"smartcam.fleet.{self.camera}.insist"
+        )
+        self._insisting.add(task)
+        task.add_done_callback(self._insisting.discard)
 
     def _key(self, agent: str, do: str) -> str:
         return self.program.keys.call(agent, self.camera, command=do in COMMANDS)

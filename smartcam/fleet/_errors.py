@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
 from typing import Any, cast
 
 import smartcam.exceptions
@@ -27,7 +28,9 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
             "text": f"{type(error).__name__}: {error}",
         }
     else:
-        fields = {"kind": known, "text": str(error)}
+        # the text of a KeyError is its argument in quotes
+        text = error.args[0] if isinstance(error, KeyError) and error.args else error
+        fields = {"kind": known, "text": str(text)}
     own = vars(error) if isinstance(error, SmartCamError) else {}
     attributes = {name: _said(value) for name, value in own.items() if name[0] != "_"}
     if attributes:
@@ -40,7 +43,9 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
 def from_fields(fields: Any) -> SmartCamError:
     """Return the error that is said by ``fields``."""
     error = _from_fields(fields)
-    return error if isinstance(error, SmartCamError) else SmartCamError(str(error))
+    if isinstance(error, SmartCamError):
+        return error
+    return SmartCamError(f"{type(error).__name__}: {error}")
 
 
 def _from_fields(fields: Any) -> BaseException:
@@ -59,8 +64,10 @@ def _from_fields(fields: Any) -> BaseException:
 
 
 def _said(value: object) -> Any:
-    """Return an attribute's value as JSON, which has no tuples."""
-    return {"tuple": jsonable(value)} if isinstance(value, tuple) else jsonable(value)
+    """Return an attribute's value as JSON, which has no tuples and no bytes."""
+    if isinstance(value, (tuple, bytes)):
+        return {type(value).__name__: jsonable(value)}
+    return jsonable(value)
 
 
 def _meant(value: Any) -> Any:
@@ -68,6 +75,9 @@ def _meant(value: Any) -> Any:
         said = cast("dict[str, Any]", value)
         if said.keys() == {"tuple"} and isinstance(said["tuple"], list):
             return tuple(said["tuple"])
+        if said.keys() == {"bytes"} and isinstance(said["bytes"], str):
+            with contextlib.suppress(ValueError):
+                return bytes.fromhex(said["bytes"])
     return cast("object", value)
 
 

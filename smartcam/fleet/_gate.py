@@ -43,7 +43,7 @@ class Gate:
             await self._pass(program, None, timeout)
 
     def leave(self, program: str) -> None:
-        """A command of ``program`` has ended."""
+        """A command of ``program`` has ended; programs without any are not kept."""
         left = self._active[program] - 1
         if left:
             self._active[program] = left

@@ -205,7 +205,7 @@ class Host:
         try:
             await self.gate.enter(program, timeout)
         except TimeoutError as exc:
-            raise self._reserved(said, timeout) from exc
+            raise self._not_granted(said, timeout) from exc
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
@@ -216,14 +216,14 @@ class Host:
         try:
             await self.gate.reserve(program, reservation, timeout)
         except TimeoutError as exc:
-            raise self._reserved("reserve", timeout) from exc
+            raise self._not_granted("reserve", timeout) from exc
 
-    def _reserved(self, said: str, timeout: float) -> SmartCamError:
-        return late(
-            said,
-            f"{self.name}: reserved by {self.gate.holder}, which did not let go within "
-            f"{timeout:.3g} s; {said} was not done",
-        )
+    def _not_granted(self, said: str, timeout: float) -> SmartCamError:
+        """Return the error of who waited in vain for others to let go of the camera."""
+        holder = self.gate.holder
+        who = "commands of others" if holder is None else f"reserved by {holder}, which"
+        text = f"{self.name}: {who} did not let go within {timeout:.3g} s; {said} was not done"
+        return late(said, text)
 
     # ------------------------------------------------------------------ what the camera is
 

@@ -127,7 +127,8 @@ class Feed(Generic[NumberedT]):
 
     Args:
         take: gets each thing once, in order of the numbers.
-        miss: is told how many could not be had any more.
+        miss: is told how many could not be had any more, and what came next; None where nothing
+            did.
         lacks: is called where something is missing; then who made the feed is to ask the agent for
             what follows ``expected``, and to :meth:`fill` it in.
         most_held: bytes that wait for what is missing before them; what comes beyond is dropped,
@@ -142,7 +143,7 @@ class Feed(Generic[NumberedT]):
     def __init__(
         self,
         take: Callable[[NumberedT], None],
-        miss: Callable[[int], None],
+        miss: Callable[[int, NumberedT | None], None],
         lacks: Callable[[], None],
         *,
         most_held: int = 1 << 23,
@@ -182,13 +183,14 @@ class Feed(Generic[NumberedT]):
 
     def fill(self, epoch: int, first: int, following: int, things: list[NumberedT]) -> None:
         """Take what the agent said when asked: all that it has from ``first`` on, or a part."""
-        if epoch != self.epoch:
-            return  # a newer one begins with begin()
-        before, stuck = self.expected, self._held[0].number if self._held else following
+        if epoch != self.epoch or not self.expected:
+            return  # a newer one begins with begin(); or nobody wants it any more
+        held = self._now_held()
+        before, stuck = self.expected, held[0].number if held else following
         if first <= before and not things:
             first = max(following, stuck)  # it says that there is more, and has nothing to show
         if first > before:
-            self._miss(first - before)
+            self._miss(first - before, things[0] if things else None)
             self.expected = first
         for thing in things:
             if thing.next > self.expected:
@@ -213,14 +215,19 @@ class Feed(Generic[NumberedT]):
     def _go_on(self, following: int) -> None:
         """Take what was held as far as it fits; ask for what is missing before the rest."""
         self.lacking = False
-        while self._held and self._held[0].number <= self.expected:
-            thing = self._held.popleft()
+        held = self._now_held()
+        while held and held[0].number <= self.expected:
+            thing = held.popleft()
             self._held_bytes -= thing.size
             if thing.next > self.expected:
                 self._have(thing)
-        if self._held or following > self.expected:
+        if held or following > self.expected:
             self.lacking = True
             self._lacks()
+
+    def _now_held(self) -> collections.deque[NumberedT]:
+        """Return what waits in this epoch; what is held of the next one waits for its begin()."""
+        return self._held if self._held_epoch == self.epoch else collections.deque()
 
     def _hold(self, epoch: int, thing: NumberedT) -> None:
         if epoch != self._held_epoch:

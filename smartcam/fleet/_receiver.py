@@ -95,10 +95,15 @@ class FleetListeners(Listeners):
             taken = [one for one in taken if one not in late]
         return taken
 
-    def miss(self, count: int) -> None:
-        """Tell the streams of results that some cannot come any more."""
+    def miss(self, count: int, then: Run | None) -> None:
+        """Tell the streams of results that some cannot come any more, which came before ``then``.
+
+        One that subscribed in between cannot know how many it has missed: it counts all.
+        """
+        self.results.horizon = math.inf if then is None else then.clock
         for stream in self.results:
             stream.miss(count)
+        self.results.horizon = math.inf
 
 
 class Own:
@@ -276,6 +281,9 @@ class Receiver:
             epoch = feed.epoch
             try:
                 reply = await self._caller.call(kind, self._soon(), {"first": feed.expected})
+            except SmartCamError:
+                continue
+            try:
                 answer = reply.fields["answer"]
                 first, following = int(answer["first"]), int(answer["following"])
                 things = _things(kind, reply)
@@ -283,8 +291,6 @@ class Receiver:
                 logger.warning("%s ! what was missing cannot be read: %s", self._name, exc)
                 first = following = feed.expected + 1  # or it would be asked for for ever
                 things = []
-            except SmartCamError:
-                continue
             feed.fill(epoch, first, following, things)
             self._wake()
 
@@ -306,6 +312,7 @@ class Receiver:
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
             logger.warning("%s ! %s: %s", self._name, what, exc)
             return
+        self._see(epoch)
         self._states.receive(epoch, following, states)
         self._wake()
 
@@ -331,8 +338,15 @@ class Receiver:
         if not (listeners.hears_results or listeners.observed):
             self._leave_results()
             return
+        self._see(batch.epoch)
         self._results.receive(batch.epoch, batch.following, batch.runs)
         self._wake()
+
+    def _see(self, epoch: int) -> None:
+        """Look whether the agent was started anew: presence does not tell where it is back soon."""
+        met = self._caller.met
+        if met is not None and epoch > met.epoch:
+            self._caller.lose(f"the agent {met.agent} was restarted")
 
     def _count(self, payload: bytes) -> None:
         counters = self._caller.counters
@@ -467,5 +481,5 @@ def _things(kind: str, reply: Message) -> list[Any]:
     return decode_runs(reply.blobs[0], "results that were asked for").runs
 
 
-def _ignore(_: int) -> None:
+def _ignore(_count: int, _then: State | None) -> None:
     """States that are missed for ever: what the camera is now, the next one says."""

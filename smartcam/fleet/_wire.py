@@ -19,10 +19,6 @@ from smartcam.exceptions import RemoteProtocolError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-VERSION = 1
-MAX_MESSAGE = 1 << 26
-"""Bytes that a message may have. A container has 64 kB at most, a picture a few megabytes."""
-
 
 def grace(timeout: float) -> float:
     """Return the seconds for which a reply is awaited beyond a call's own.
@@ -94,6 +90,7 @@ _RUN = struct.Struct("<QIIBBxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
 _MAGIC = b"scr1"
 _NO_NUMBER = math.nan
+_NEVER = 253_402_300_800.0  # the year 10,000, which no datetime has
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +215,8 @@ def _decode_run(payload: bytes, place: int) -> tuple[Run, int]:
         _RUN.unpack_from(payload, place)
     )
     place += _RUN.size
-    if not 1 <= count <= (len(payload) - place) // 4 or not math.isfinite(at):
+    known = 0 <= at < _NEVER and (0 <= trigger < _NEVER or math.isnan(trigger))
+    if not 1 <= count <= (len(payload) - place) // 4 or not known:
         raise ValueError(f"a run of {count} containers at {at} does not fit")
     lengths = struct.unpack_from(f"<{count}I", payload, place)
     place += 4 * count

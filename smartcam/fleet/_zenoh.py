@@ -2,7 +2,7 @@
 
 What comes is put into one queue, and a burst wakes the event loop once. Nothing is said in a way
 that could make the loop wait: what does not fit into the engine's buffers is dropped there, and who
-hears it finds the gap by the numbers. Only what is long goes out in a thread, which may wait.
+hears it finds the gap by the numbers. What is long, or much, goes out in a thread, which may wait.
 """
 
 from __future__ import annotations
@@ -50,7 +50,16 @@ MOST_REPLYING = 4096
 """Queries whose answers wait for these threads; one beyond gets none."""
 
 MOST_WAITING = 1 << 26
-"""Bytes that wait for the event loop; results beyond are dropped, and asked for again later."""
+"""Bytes that wait for the event loop, or for the thread that says what is long; what comes beyond
+is dropped, and results are asked for again later."""
+
+CALM = 0.01
+"""Seconds in which a few things are said at once, and many together."""
+
+MOST_EXPRESS, MOST_SAID = 8, 64
+"""Messages in that time that each go out at once, and those that the loop says itself. The engine
+has room for 16 packets of a kind on their way: the next go in packets of many, up to a millisecond
+later, and what comes then is said by the thread, for the engine would drop it."""
 
 TURN = 64
 """Callbacks in one turn of the event loop."""
@@ -85,6 +94,7 @@ class Link:
             "listen/endpoints": list(self.listen),
             "connect/endpoints": list(self.connect),
             "connect/timeout_ms": 0,  # one try; later ones are made without end
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
             "connect/exit_on_failure": not self.listen,
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
@@ -165,12 +175,20 @@ class ZenohEnd(Bus):
         self._lock = threading.Lock()
         self._told_dropped = False
         self._sender: ThreadPoolExecutor | None = None
+        self._sending = 0
+        self._behind: collections.Counter[str] = collections.Counter()
+        self._calm_since, self._said = -CALM, 0
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
         zenoh = self._zenoh
-        how = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
-        self._dropping = {**how, "congestion_control": zenoh.CongestionControl.DROP}
-        self._blocking = {**how, "congestion_control": zenoh.CongestionControl.BLOCK}
+        control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
+        self._dropping, self._waiting_for_room = (
+            {
+                express: {"priority": priority, "express": express, "congestion_control": one}
+                for express in (False, True)
+            }
+            for one in (control.DROP, control.BLOCK)
+        )
 
     # ------------------------------------------------------------------ life
 
@@ -270,12 +288,41 @@ class ZenohEnd(Bus):
         session = self._session
         if session is None:
             return
-        if len(payload) <= LONG:
-            _put(session, key, payload, self._dropping)
+        now = self._loop.time()
+        if now - self._calm_since > CALM:
+            self._calm_since, self._said = now, 0
+        self._said += 1
+        # what is said by itself goes out at once, a burst together: there is not room for many
+        express = self._said <= MOST_EXPRESS
+        way = key if self._link.listen else ""  # a router has one to each who listens
+        if len(payload) > LONG or self._said > MOST_SAID or way in self._behind:
+            self._hand_over(way, session, key, payload, self._waiting_for_room[express])
             return
+        _put(session, key, payload, self._dropping[express])
+
+    def _hand_over(
+        self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]
+    ) -> None:
+        """Have a thread say it, which waits until there is room; what goes the same way, too."""
         if self._sender is None:
             self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
-        self._sender.submit(_put, session, key, payload, self._blocking)
+        size = len(payload)
+        if self._sending + size > MOST_WAITING:
+            logger.warning("%s ! %d bytes wait to be said; more is dropped", key, self._sending)
+            return
+
+        def say() -> None:
+            _put(session, key, payload, how)
+            with self._lock:
+                self._sending -= size
+                self._behind[way] -= 1
+                if not self._behind[way]:
+                    del self._behind[way]
+
+        with self._lock:
+            self._sending += size
+            self._behind[way] += 1
+        self._sender.submit(say)
 
     def reply(self, query: Any, replies: list[tuple[str, bytes]]) -> None:
         """Answer a query, and end it; never waits.

@@ -1,0 +1,89 @@
+"""A bus inside the process that misbehaves: what one says is lost, doubled, late, or overtaken.
+
+Who is there is told as it is: presence comes from the engine, which does not lose it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from random import Random
+
+from smartcam.fleet._bus import MemoryBus, MemoryEnd
+
+Fate = Callable[[str, bytes], Sequence[float]]
+"""Tells after how many seconds each copy of something said arrives; none: it is lost."""
+
+
+def as_said(key: str, payload: bytes) -> Sequence[float]:
+    """Have everything arrive, once and at once."""
+    return (0.0,)
+
+
+class LossyBus(MemoryBus):
+    """A bus whose ends misbehave as ``fate`` says; it may be changed at any time."""
+
+    def __init__(self, fate: Fate = as_said) -> None:
+        super().__init__()
+        self.fate = fate
+        self.said = 0  # copies that arrived
+        self.lost = 0
+        self.doubled = 0
+        self.late = 0
+
+    def end(self) -> MemoryEnd:
+        return _LossyEnd(self)
+
+
+class _LossyEnd(MemoryEnd):
+    def __init__(self, bus: LossyBus) -> None:
+        super().__init__(bus)
+        self._lossy = bus
+
+    def put(self, key: str, payload: bytes) -> None:
+        bus = self._lossy
+        delays = bus.fate(key, payload)
+        bus.lost += not delays
+        bus.doubled += len(delays) > 1
+        for delay in delays:
+            bus.said += 1
+            if delay:
+                bus.late += 1
+                self._loop.call_later(delay, super().put, key, payload)
+            else:
+                super().put(key, payload)
+
+
+def chance_of(
+    chance: Random, *, lost: float = 0.0, doubled: float = 0.0, late: float = 0.0, by: float = 0.05
+) -> Fate:
+    """Return a fate that is left to chance.
+
+    Args:
+        chance: seeded.
+        lost: share of what is said that does not arrive.
+        doubled: share that arrives twice, the second time late.
+        late: share that arrives late, so that what was said later overtakes it.
+        by: seconds that something late is late at most.
+    """
+
+    def fate(key: str, payload: bytes) -> Sequence[float]:
+        place = chance.random()
+        if place < lost:
+            return ()
+        if place < lost + doubled:
+            return (0.0, chance.uniform(0, by))
+        if place < lost + doubled + late:
+            return (chance.uniform(0, by),)
+        return (0.0,)
+
+    return fate
+
+
+def only(kind: str, fate: Fate) -> Fate:
+    """Return a fate of one kind of what is said: ``command``, ``ask``, ``reply``, ``results``,
+    ``states``; everything else arrives."""
+
+    def chosen(key: str, payload: bytes) -> Sequence[float]:
+        return fate(key, payload) if key.split("/")[2] == kind else (0.0,)
+
+    return chosen

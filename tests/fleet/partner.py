@@ -1,0 +1,80 @@
+"""An agent, or a program with a reservation, in a process of its own, to be stopped and killed.
+
+``python -m tests.fleet.partner agent PLACE CAMERA_URL``, or ``... holder FLEET_URL``. It says when
+it is ready, and goes on until its end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+
+import smartcam
+from smartcam.fleet._agent import Agent
+from smartcam.fleet._camera import FleetCamera
+from smartcam.fleet._keys import Keys
+from smartcam.fleet._zenoh import Link, ZenohEnd
+from smartcam.settings import CameraSettings
+from tests.fleet.fleetkit import FAST, FLEET, NAME, PATIENCE
+
+
+class Partner:
+    """A process."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self._process = process
+
+    def signal(self, number: int) -> None:
+        """Send it a signal, unless it has ended."""
+        if self._process.returncode is None:
+            self._process.send_signal(number)
+
+    async def kill(self) -> None:
+        """End it without a word."""
+        self.signal(signal.SIGKILL)
+        await self._process.wait()
+
+
+@contextlib.asynccontextmanager
+async def partner(*arguments: str) -> AsyncIterator[Partner]:
+    """Give one that is ready."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "tests.fleet.partner", *arguments, stdout=subprocess.PIPE
+    )
+    try:
+        assert process.stdout is not None
+        async with asyncio.timeout(PATIENCE):
+            assert await process.stdout.readline() == b"ready\n"
+        yield Partner(process)
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.communicate()
+
+
+async def _agent(place: str, url: str) -> None:
+    settings = CameraSettings.make(url, None, {"reconnect": FAST, "name": NAME})
+    agent = Agent("agent", Keys(FLEET), ZenohEnd(Link(listen=(place,))), {NAME: settings})
+    await agent.open(PATIENCE)
+    await agent.wait_tried()
+    await _ready()
+
+
+async def _holder(url: str) -> None:
+    async with smartcam.connect(url) as camera:
+        assert isinstance(camera, FleetCamera)
+        async with camera.reserve(timeout=PATIENCE):
+            await _ready()
+
+
+async def _ready() -> None:
+    print("ready", flush=True)  # noqa: T201
+    await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(_agent(*sys.argv[2:]) if sys.argv[1] == "agent" else _holder(sys.argv[2]))

@@ -1,0 +1,400 @@
+"""The end of a bus that Zenoh makes: what it opens, what it does where the other side is not."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import smartcam
+from smartcam.exceptions import ConnectFailedError, ConnectionLostError
+from smartcam.fleet import FleetCamera, _zenoh
+from smartcam.fleet._zenoh import LONG, Link, ZenohEnd, with_ports
+from smartcam.models import Connected, Disconnected, Reconnected
+from tests.client.clientkit import gone
+from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant
+from tests.fleet.partner import partner
+from tests.processes import printed_by
+
+pytestmark = pytest.mark.real_time
+
+LONG_LEASE = {"transport/link/tx/lease": 3_600_000}
+"""Of an end that takes nobody for gone because of silence."""
+
+
+def free_place() -> str:
+    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    return place
+
+
+def port_of(place: str) -> int:
+    return int(place.rpartition(":")[2])
+
+
+@contextlib.asynccontextmanager
+async def two_ends(**more: Any) -> AsyncIterator[tuple[ZenohEnd, ZenohEnd]]:
+    """Give an end that listens, and one that has connected to it."""
+    place = free_place()
+    listens, connects = ZenohEnd(Link(listen=(place,)), more), ZenohEnd(Link(connect=(place,)))
+    await listens.open(PATIENCE)
+    try:
+        await connects.open(PATIENCE)
+        yield listens, connects
+    finally:
+        await connects.close()
+        await listens.close()
+
+
+class Heard:
+    """What came under a pattern."""
+
+    def __init__(self) -> None:
+        self.payloads: list[bytes] = []
+
+    def __call__(self, key: str, payload: bytes) -> None:
+        self.payloads.append(payload)
+
+    async def come(self, count: int) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while len(self.payloads) < count:  # noqa: ASYNC110 - what another thread brings
+                await asyncio.sleep(0.005)
+
+
+async def heard_by(listens: ZenohEnd, connects: ZenohEnd) -> Heard:
+    """Have one end hear what the other says, once they know of each other."""
+    heard = Heard()
+    connects.subscribe("test/**", heard)
+    publisher = listens.publisher("test/first")
+    async with asyncio.timeout(PATIENCE):
+        while not publisher.heard:  # noqa: ASYNC110 - the engine tells
+            await asyncio.sleep(0.005)
+    return heard
+
+
+# ---------------------------------------------------------------------- what is open
+
+
+def own_sockets(kind: str) -> Iterator[tuple[str, str, str]]:
+    """Give local and remote address, and state, of this process' sockets of a kind."""
+    inodes = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            inodes.add(os.readlink(entry))  # noqa: PTH115 - what it says is no path
+    for family in ("", "6"):
+        for line in Path(f"/proc/self/net/{kind}{family}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if f"socket:[{fields[9]}]" in inodes:
+                yield fields[1], fields[2], fields[3]
+
+
+LISTENS, ESTABLISHED = "0A", "01"
+LOOPBACK = "0100007F"
+
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+
+@on_linux
+async def test_nothing_listens_that_was_not_asked_for() -> None:
+    before = {*own_sockets("tcp"), *own_sockets("udp")}
+    async with two_ends() as (listens, _):
+        after = {*own_sockets("tcp"), *own_sockets("udp")} - before
+        listening = [local for local, _, state in after if state == LISTENS]
+        assert listening == [f"{LOOPBACK}:{port_of(listens._link.listen[0]):04X}"]
+        assert {*own_sockets("udp")} <= before  # no scouting
+    await closed_sockets(before)
+
+
+async def closed_sockets(before: set[tuple[str, str, str]]) -> None:
+    """Wait until no connection is left that was not there before."""
+    async with asyncio.timeout(PATIENCE):
+        while {  # noqa: ASYNC110 - the system closes them
+            one for one in own_sockets("tcp") if one[2] in {LISTENS, ESTABLISHED}
+        } - before:
+            await asyncio.sleep(0.01)
+
+
+def test_engine_is_not_imported_without_a_fleet_over_it() -> None:
+    said = printed_by(
+        "import sys, asyncio, smartcam\n"
+        "print('zenoh' in sys.modules)\n"
+        "import smartcam.fleet\n"
+        "print('zenoh' in sys.modules)\n"
+        "from smartcam.fleet import FleetFile\n"
+        "file = FleetFile.model_validate({'cameras': {'line1/cam1': {'emulated': {}}}})\n"
+        "async def main():\n"
+        "    async with smartcam.fleet.open(file) as fleet:\n"
+        "        await fleet['line1/cam1'].query_application()\n"
+        "asyncio.run(main())\n"
+        "print('zenoh' in sys.modules)\n"
+    )
+    assert said.split() == ["False"] * 3
+
+
+# ---------------------------------------------------------------------- nobody there
+
+
+async def test_nothing_there_is_told_at_once_with_its_place() -> None:
+    place = free_place()
+    camera = smartcam.connect(f"fleet://127.0.0.1:{port_of(place)}/{NAME}", connect_timeout=3600.0)
+    async with asyncio.timeout(PATIENCE):
+        error = await gone(camera.open())
+    assert isinstance(error, ConnectFailedError)
+    assert f"127.0.0.1:{port_of(place)}" in str(error)
+    assert error.port == port_of(place)
+    assert " at /" not in str(error)  # no place in the engine's source
+
+
+@pytest.mark.parametrize("accepts", [True, False])
+async def test_silent_host_is_given_up_by_the_timeout(accepts: bool) -> None:
+    """One that takes connections and says nothing, and one that does not even take them."""
+    with contextlib.ExitStack() as stack:
+        silent = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+        port = silent.getsockname()[1]
+        for _ in range(0 if accepts else 4):
+            filler = stack.enter_context(socket.socket())
+            filler.setblocking(False)
+            filler.connect_ex(("127.0.0.1", port))
+        camera = smartcam.connect(f"fleet://127.0.0.1:{port}/{NAME}", connect_timeout=0.5)
+        async with asyncio.timeout(PATIENCE):
+            error = await gone(camera.open())
+            assert isinstance(error, ConnectFailedError)
+            assert f"127.0.0.1:{port}" in str(error)
+            await asyncio.get_running_loop().shutdown_default_executor()
+
+
+async def test_port_in_use_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        place = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        error = await gone(ZenohEnd(Link(listen=(place,))).open(PATIENCE))
+        assert isinstance(error, ConnectFailedError)
+        assert f"cannot listen on {place}" in str(error)
+
+
+@on_linux
+async def test_open_that_is_cancelled_leaves_no_session() -> None:
+    async with Plant(zenoh=True) as plant:
+        before = {*own_sockets("tcp")}
+        for delay in (0.0, 0.0, 0.001, 0.003, 0.01, 0.03):
+            camera = plant.camera()
+            task = asyncio.create_task(camera.open())
+            await asyncio.sleep(delay)
+            task.cancel()
+            await asyncio.wait({task})
+            if not task.cancelled():  # it was open by then
+                await camera.close()
+            await closed_sockets(before)
+        async with plant.camera() as camera:
+            assert (await camera.trigger(timeout=PATIENCE)).value.run == 1
+
+
+# ---------------------------------------------------------------------- the other side goes
+
+
+async def test_killed_agent_is_seen_at_once_and_everything_goes_on_when_it_is_back() -> None:
+    """The same camera, and its subscriptions: nothing is to be made anew."""
+    place = free_place()
+    url = f"fleet://127.0.0.1:{port_of(place)}/{NAME}"
+    async with NumberedCamera(time=0.01) as box, contextlib.AsyncExitStack() as stack:
+        agent = await stack.enter_async_context(partner("agent", place, box.url))
+        camera = await stack.enter_async_context(
+            smartcam.connect(url, interpret_as=LAYOUT, reconnect=FAST)
+        )
+        events, results = camera.events(), camera.results()
+        first = await camera.trigger(timeout=PATIENCE)
+        assert await anext(results) == first
+        other = await stack.enter_async_context(smartcam.connect(url, reconnect=FAST))
+        assert isinstance(other, FleetCamera)
+        reservation = other.reserve(timeout=PATIENCE)
+        await stack.enter_async_context(reservation)
+        waiting = [
+            asyncio.create_task(camera.trigger(timeout=3600.0)),  # at the agent
+            asyncio.create_task(camera.wait_status(_never, 3600.0)),  # here
+        ]
+        await camera.query_application()
+        await agent.kill()
+        async with asyncio.timeout(PATIENCE):
+            for error in await asyncio.gather(*waiting, return_exceptions=True):
+                assert isinstance(error, ConnectionLostError)
+                assert "agent" in str(error)
+            await until_not_connected(camera)
+        assert isinstance(await gone(camera.trigger()), ConnectionLostError)
+        await stack.enter_async_context(partner("agent", place, box.url))
+        await camera.wait_connected(PATIENCE)
+        second = await camera.trigger(timeout=PATIENCE)
+        assert second.value.run == box.runs == 2
+        async with asyncio.timeout(PATIENCE):
+            assert await anext(results) == second
+            kinds = [type(await anext(events)) for _ in range(events.statistics().queued)]
+        wanted = {Connected, Disconnected, Reconnected}
+        assert [kind for kind in kinds if kind in wanted] == [Disconnected, Reconnected]
+
+
+def _never(_: object) -> bool:
+    return False
+
+
+async def until_not_connected(camera: smartcam.Camera[Any]) -> None:
+    while camera.connected:  # noqa: ASYNC110 - another process
+        await asyncio.sleep(0.005)
+
+
+async def test_reservation_of_a_killed_program_ends_without_any_lease() -> None:
+    async with Plant(zenoh=True, engine=LONG_LEASE) as plant, plant.camera() as camera:
+        async with partner("holder", plant.address.url) as holder:
+            waiting = asyncio.create_task(camera.trigger(timeout=PATIENCE))
+            await until_waits(plant)
+            await holder.kill()
+            assert (await waiting).value.run == 1
+        assert plant.agent.hosts[NAME].gate.holder is None
+
+
+@pytest.mark.long
+async def test_reservation_of_a_silent_program_ends_with_the_lease() -> None:
+    async with (
+        Plant(zenoh=True) as plant,
+        plant.camera() as camera,
+        partner("holder", plant.address.url) as holder,
+    ):
+        waiting = asyncio.create_task(camera.trigger(timeout=PATIENCE))
+        await until_waits(plant)
+        holder.signal(signal.SIGSTOP)
+        assert (await waiting).value.run == 1
+        assert plant.agent.hosts[NAME].gate.holder is None
+        holder.signal(signal.SIGCONT)
+        assert (await camera.trigger(timeout=PATIENCE)).value.run == 2
+
+
+async def until_waits(plant: Plant) -> None:
+    gate = plant.agent.hosts[NAME].gate
+    async with asyncio.timeout(PATIENCE):
+        while not gate._line:  # noqa: ASYNC110 - another process
+            await asyncio.sleep(0.005)
+
+
+# ---------------------------------------------------------------------- what is said
+
+
+@pytest.mark.parametrize("size", [0, 1, LONG, LONG + 1, 3 << 20])
+async def test_what_is_said_arrives_however_long_it_is(size: int) -> None:
+    payload = os.urandom(size)
+    async with two_ends() as ends:
+        for says, hears in (ends, ends[::-1]):
+            heard = await heard_by(says, hears)
+            says.put("test/it", payload)
+            await heard.come(1)
+            assert heard.payloads == [payload]
+
+
+@pytest.mark.parametrize("count", [20, 100, 2000])
+async def test_burst_is_not_dropped(count: int) -> None:
+    """A program triggers many cameras in one turn of its loop, and all of them answer."""
+    async with two_ends() as ends:
+        for says, hears in (ends, ends[::-1]):
+            heard = await heard_by(says, hears)
+            payloads = [b"%d" % number + bytes(200) for number in range(count)]
+            for payload in payloads:
+                says.put("test/it", payload)
+            await heard.come(count)
+            assert sorted(heard.payloads) == sorted(payloads)
+
+
+async def test_long_questions_and_answers_arrive() -> None:
+    async with two_ends() as (one, other):
+        question, answers = os.urandom(1 << 20), [os.urandom(1 << 20) for _ in range(3)]
+
+        def answer(asked: Any) -> None:
+            assert asked.payload == question
+            for number, payload in enumerate(answers):
+                asked.reply(f"test/{number}", payload)
+            asked.close()
+
+        one.answer("test/*", answer)
+        got: list[tuple[str, bytes]] = []
+        async with asyncio.timeout(PATIENCE):
+            while len(got) < 3:
+                got = await other.ask("test/**", question, PATIENCE)
+        assert got == [(f"test/{number}", payload) for number, payload in enumerate(answers)]
+
+
+async def test_callback_that_raises_harms_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    async with two_ends() as (says, hears):
+
+        def fail(*_: object) -> None:
+            raise ZeroDivisionError
+
+        hears.subscribe("test/**", fail)
+        heard = await heard_by(says, hears)
+        hears.watch("presence/**", fail)
+        with caplog.at_level(logging.ERROR, "smartcam.fleet"):
+            for number in range(100):
+                says.put("test/it", b"%d" % number)
+            says.be_present("presence/one")
+            await heard.come(100)
+        assert heard.payloads == [b"%d" % number for number in range(100)]
+        assert any("was not taken" in record.message for record in caplog.records)
+        caplog.clear()
+
+
+async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bound, size, count = 100_000, 1000, 1000
+    monkeypatch.setattr(_zenoh, "MOST_WAITING", bound)
+    async with two_ends() as (says, hears):
+        heard = await heard_by(says, hears)
+        session, done = says._session, threading.Event()
+
+        def say() -> None:
+            for _ in range(count):
+                session.put(
+                    "test/it",
+                    bytes(size),
+                    congestion_control=importlib.import_module("zenoh").CongestionControl.BLOCK,
+                )
+            done.set()
+
+        with caplog.at_level(logging.WARNING, "smartcam.fleet"):
+            thread = threading.Thread(target=say)
+            thread.start()
+            assert done.wait(PATIENCE)  # the loop does nothing else meanwhile
+            thread.join()
+            deadline = time.monotonic() + PATIENCE
+            while hears._bytes <= bound - size and time.monotonic() < deadline:
+                time.sleep(0.01)  # noqa: ASYNC251 - that it does not run is the point
+        assert bound - size < hears._bytes <= bound
+        await heard.come(bound // size)
+        assert any("does not read" in record.message for record in caplog.records)
+        caplog.clear()
+        async with asyncio.timeout(PATIENCE):
+            while heard.payloads[-1] != b"last":  # as soon as it reads again, all is well
+                says.put("test/last", b"last")
+                await asyncio.sleep(0.05)
+        assert heard.payloads.count(bytes(size)) < count
+        assert hears._bytes == 0
+
+
+async def test_end_that_is_closed_says_and_hears_nothing_and_can_be_closed_again() -> None:
+    async with two_ends() as (says, hears):
+        heard = await heard_by(says, hears)
+        publisher = hears.publisher("test/it")
+        await hears.close()
+        await hears.close()
+        says.put("test/it", b"1")
+        hears.put("test/it", b"2")
+        publisher.put(b"3")
+        publisher.close()
+        assert await hears.ask("test/**", b"", 1.0) == []
+        await asyncio.sleep(0.1)
+        assert heard.payloads == []
