@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import (
@@ -112,8 +111,7 @@ class Caller:
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+            await asyncio.wait({task})
         await asyncio.gather(*self._insisting)  # what they wait for has failed
 
     def finish(self, error: LinkError) -> None:
@@ -121,7 +119,7 @@ class Caller:
         if self.end is None:
             self.end = error
         self.met = None
-        self.program.fail(self, lambda: self._again(error))
+        self.program.fail(self, lambda: error)
         self._wake()
 
     async def wait_met(self, deadline: float) -> Met:
@@ -135,7 +133,7 @@ class Caller:
         async with asyncio.timeout_at(deadline):
             while self.met is None:
                 if self.end is not None:
-                    raise self._again(self.end)
+                    raise self.end.with_traceback(None)
                 waiting: asyncio.Future[None] = loop.create_future()
                 self._waiting.append(waiting)
                 await waiting
@@ -159,19 +157,12 @@ class Caller:
         if self.met is not None:
             return self.met
         if self.end is not None:
-            raise self._again(self.end)
+            raise self.end.with_traceback(None)
         if self.trouble is not None:
-            raise self._again(self.trouble)
+            raise self.trouble.with_traceback(None)
         if self._task is not None:
             raise ConnectionLostError(f"{self.name}: no agent has answered yet")
         raise ConnectionClosedError(f"{self.name}: not connected: open it first")
-
-    @staticmethod
-    def _again(error: LinkError) -> LinkError:
-        """Return an error of its own for whom it is raised, with the first one behind it."""
-        again = type(error)(str(error), host=error.host, port=error.port)
-        again.__cause__ = error
-        return again
 
     def _on_presence(self, key: str, present: bool) -> None:
         agent = self.program.keys.tail(key, "presence/camera")[0]
@@ -189,7 +180,7 @@ class Caller:
             return
         self.met = None
         error = self.trouble = ConnectionLostError(f"{self.name}: {why}")
-        self.program.fail(self, lambda: self._again(_unknown(error)))
+        self.program.fail(self, lambda: _unknown(error))
         self._stirred.set()
         self._on_lost(error)
 

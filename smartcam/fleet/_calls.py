@@ -203,8 +203,7 @@ async def _request(call: Call) -> Answer:
 
 
 async def _refresh(call: Call) -> Answer:
-    await call.host.require().refresh(call.timeout)
-    return NOTHING
+    return {"asked": await call.host.require().refresh(call.timeout)}, []
 
 
 async def _wait_connected(call: Call) -> Answer:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam._client.interpretation import Interpretation
 from smartcam.camera import DEFAULT_RECONNECT_TIMEOUT, Camera
 from smartcam.exceptions import (
+    CommandRejectedError,
     ConfigurationError,
     ConnectFailedError,
     ConnectionClosedError,
@@ -24,7 +25,7 @@ from smartcam.exceptions import (
 from smartcam.fleet._caller import Caller, Met
 from smartcam.fleet._errors import from_fields
 from smartcam.fleet._receiver import FleetListeners, Own, Receiver
-from smartcam.fleet._wire import decode_runs
+from smartcam.fleet._wire import decode_runs, grace
 from smartcam.models import (
     ApplicationChanged,
     Capabilities,
@@ -91,6 +92,7 @@ class FleetCamera(Camera[ValueT]):
             settings.name, camera, program, self._wire, self._on_met, self._on_lost
         )
         self._expected = settings.application
+        self._switch_in_doubt = False  # one was cut off: the camera may be in either application
         self._receiver = Receiver(
             settings.name,
             camera,
@@ -99,14 +101,13 @@ class FleetCamera(Camera[ValueT]):
             self._counters,
             lambda: self._default,
             self._on_state,
-            lambda: self._expected,
+            lambda: None if self._switch_in_doubt else self._expected,
         )
         self._opened = False
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
         self._trying = True  # the agent has not done with the first try
         self._status: Status | None = None
-        self._heard_status = False  # in this session
         self._active: int | None = None
         self._about: dict[str, Any] = {}  # what the agent said of the camera
         self._trouble: LinkError | None = None
@@ -200,6 +201,8 @@ class FleetCamera(Camera[ValueT]):
 
     def _check_session(self) -> None:
         """Raise what says why there is no session, or nothing that can be used."""
+        if self._closed is not None:
+            raise self._closed.with_traceback(None)
         if self._unreadable is not None:
             raise self._unreadable
         if not self.connected:
@@ -243,10 +246,10 @@ class FleetCamera(Camera[ValueT]):
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
         try:
-            async with asyncio.timeout_at(deadline):
+            async with asyncio.timeout_at(deadline + grace(timeout)):
                 while True:
                     if self._closed is not None:
-                        raise self._again(self._closed)
+                        raise self._closed.with_traceback(None)
                     if self.connected:
                         with contextlib.suppress(ConnectionLostError):
                             # what the agent restores, or goes back to, is done then
@@ -267,19 +270,14 @@ class FleetCamera(Camera[ValueT]):
 
     def _require_session(self) -> Met:
         if self._closed is not None:
-            raise self._again(self._closed)
+            raise self._closed.with_traceback(None)
         if self._unreadable is not None:
             raise self._unreadable
         met = self._caller.require()
         if not self._linked:
-            raise self._again(self._trouble or ConnectionLostError(f"{self.name}: not connected"))
+            trouble = self._trouble or ConnectionLostError(f"{self.name}: not connected")
+            raise trouble.with_traceback(None)
         return met
-
-    @staticmethod
-    def _again(error: LinkError) -> LinkError:
-        again = type(error)(str(error), host=error.host, port=error.port)
-        again.__cause__ = error
-        return again
 
     def _deadline(self, timeout: float) -> float:
         if not 0 <= timeout < math.inf:
@@ -346,7 +344,7 @@ class FleetCamera(Camera[ValueT]):
         if not self._linked:
             self._stir(error)
             return
-        self._linked = self._heard_status = False
+        self._linked = False
         if not expected:
             self._counters.note_loss(error)
             self._observers.error(self.name, error)
@@ -362,7 +360,7 @@ class FleetCamera(Camera[ValueT]):
 
     def _fail(self, error: LinkError) -> None:
         """Tell who waits that there is no session."""
-        self._listeners.fail(self._again(error))
+        self._listeners.fail(error)
         self._stir(error)
 
     def _stir(self, what: Status | LinkError) -> None:
@@ -423,13 +421,12 @@ class FleetCamera(Camera[ValueT]):
         self._stir(self._status or Status(0))
 
     def _take_status(self, status: Status, at: datetime, kind: str) -> None:
-        previous = self._status if self._heard_status else None
+        previous = self._status
         self._status = status
         if kind == "Status":
             self._listeners.offer_status(status, asyncio.get_running_loop().time())
         elif status == previous:
             return
-        self._heard_status = True
         if status != previous and self._listeners.sees_events:
             self._listeners.publish(
                 StatusChanged(camera=self.name, at=at, status=status, previous=previous)
@@ -456,9 +453,8 @@ class FleetCamera(Camera[ValueT]):
     @property
     def status(self) -> Status:
         if self._status is None:
-            raise self._again(
-                self._closed or ConnectionClosedError(f"{self.name}: not connected: open it first")
-            )
+            unopened = ConnectionClosedError(f"{self.name}: not connected: open it first")
+            raise (self._closed or unopened).with_traceback(None)
         return self._status
 
     @property
@@ -512,6 +508,8 @@ class FleetCamera(Camera[ValueT]):
     async def _trigger(
         self, application: int | None, request: TriggerRequest, timeout: float
     ) -> list[Result]:
+        if self._switch_in_doubt:
+            await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
         interpretation = request.interpretation
         number = self._program.next_call()
@@ -539,8 +537,19 @@ class FleetCamera(Camera[ValueT]):
         self, application: int | str, *, timeout: float | None = None
     ) -> None:
         limit = self.settings.switch_timeout if timeout is None else timeout
-        reply = await self._do("switch_application", limit, application=application)
-        self._expected = reply.fields["answer"]["application"]
+        self._require_session()
+        self._switch_in_doubt = self._expected is not None
+        try:
+            reply = await self._do("switch_application", limit, application=application)
+        except CommandRejectedError:
+            self._switch_in_doubt = False
+            raise
+        self._expected, self._switch_in_doubt = reply.fields["answer"]["application"], False
+
+    async def _settle_switch(self, timeout: float) -> None:
+        """Ask which application is active now, from which results are expected then."""
+        self._expected = await self.query_application(timeout=timeout)
+        self._switch_in_doubt = False
 
     @contextlib.asynccontextmanager
     async def application(self, application: int) -> AsyncGenerator[Self]:
@@ -613,23 +622,28 @@ class FleetCamera(Camera[ValueT]):
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
         try:
-            await self._do("refresh", timeout)
             present = self.status
-            if queue.empty():
-                queue.put_nowait(present)
+            reply = await self._do("refresh", timeout)
+            if reply.fields["answer"]["asked"]:  # what was told before is not of now
+                present = self.status
+                while not queue.empty():
+                    status = queue.get_nowait()
+                    if isinstance(status, LinkError):
+                        raise status.with_traceback(None)
+            if predicate(present):
+                return present
             async with asyncio.timeout_at(deadline):
                 while True:
                     status = await queue.get()
                     if isinstance(status, LinkError):
-                        raise self._again(status)
+                        raise status.with_traceback(None)
                     if predicate(status):
                         return status
         except TimeoutError as exc:
             if isinstance(exc, SmartCamError):
                 raise
             raise ResponseTimeoutError(
-                f"{self.name}: the status wanted did not come within {timeout:g} s; "
-                f"status: {self.status}",
+                f"{self.name}: waited {timeout:g} s for the status wanted; status: {self.status}",
                 waited=timeout,
             ) from exc
         finally:

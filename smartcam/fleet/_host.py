@@ -234,19 +234,18 @@ class Host:
             status: int | None = int(camera.status)
         except SmartCamError:
             status = None
+        # a link that has just ended is no loss yet: what came before is not all told
+        trouble = self.failure or camera.trouble
         fields: dict[str, Any] = {
-            "connected": camera.connected,
+            "connected": trouble is None,
             "status": status,
             "endian": camera.endian,
             "application": camera.active_application,
         }
         if not self._opened.is_set():
             fields["trying"] = True
-        elif not camera.connected:
-            trouble = self.failure or camera.trouble
-            if trouble is not None:
-                fields["error"] = to_fields(trouble)
-            fields["over"] = self._over
+        elif trouble is not None:
+            fields |= {"error": to_fields(trouble), "over": self._over}
         return fields
 
     def about(self) -> dict[str, Any]:

@@ -213,8 +213,9 @@ class SharedCamera(SmartCamera[Carried]):
         """Go back, and wait for it."""
         await self._lock.leave_and_wait(before)
 
-    async def refresh(self, timeout: float) -> None:
-        """Have the last status be of now."""
+    async def refresh(self, timeout: float) -> bool:
+        """Have the last status be of now; return whether it had to be asked for."""
         deadline = self._deadline(timeout)
         self._require_session()
         await self._status.refresh(deadline)
+        return self._connection.features.polled

@@ -86,7 +86,7 @@ def decode(payload: bytes, what: str) -> Message:
 CURRENT, LATE = 1, 2
 """Flags of a run: not known to be an older trigger's; known to be one's that was given up."""
 
-_RUN = struct.Struct("<QIIBBxxIIddddI")
+_RUN = struct.Struct("<QIqBBxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
 _MAGIC = b"scr1"
 _NO_NUMBER = math.nan
@@ -99,7 +99,7 @@ class Run:
 
     Attributes:
         number: the agent's number of the first; the others follow.
-        application: whose they are.
+        application: whose they are; below 0 where the camera does not say.
         endian: the byte order that the camera's last status told.
         flags: what is known of all of them.
         owner: the program whose trigger they are the outcome of, as the agent numbers it; else 0.

@@ -1,8 +1,77 @@
 """Fixtures that several modules of the client's tests share."""
 
+from __future__ import annotations
+
+import asyncio
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
+
+import smartcam
+from tests.client.kinds import AT_THE_WIRE, IN_TIME_OF_THEIR_OWN, MODULES
+from tests.fleet.kinds import connect
+from tests.timed_loop import TimedLoop
+
+LOOPS: Mapping[str, Callable[[], asyncio.AbstractEventLoop]] = {
+    "wire": functools.partial(TimedLoop),
+    "memory": functools.partial(TimedLoop),
+    "zenoh": functools.partial(asyncio.SelectorEventLoop),  # its threads want real time
+}
+"""Kinds of cameras, and the event loops that they are tried on."""
+
+_LEFT_OUT = {
+    "wire": frozenset[str](),
+    "memory": frozenset(name for names in AT_THE_WIRE.values() for name in names),
+}
+_LEFT_OUT["zenoh"] = _LEFT_OUT["memory"] | IN_TIME_OF_THEIR_OWN
+
+
+def pytest_asyncio_loop_factories(
+    item: pytest.Item,
+) -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]] | None:
+    """Have a test of the behaviour of cameras run with every kind of them."""
+    if item.get_closest_marker("real_time"):
+        return None
+    module = item.parent.name if item.parent is not None else ""
+    return LOOPS if module.removesuffix(".py").rpartition("/")[2] in MODULES else None
+
+
+def _kind(item: pytest.Item) -> str | None:
+    """Return the kind of camera that a test is run with; None where there are no kinds."""
+    parameters = getattr(getattr(item, "callspec", None), "params", {})
+    loop = parameters.get("_asyncio_loop_factory")
+    return next((kind for kind, one in LOOPS.items() if one is loop), None)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what does not hold for a kind; those over Zenoh are long."""
+    kept: list[pytest.Item] = []
+    left_out: list[pytest.Item] = []
+    for item in items:
+        kind = _kind(item)
+        if kind is not None:
+            name, _, parameters = item.name.partition("[")
+            others = "-".join(one for one in parameters.rstrip("]").split("-") if one != kind)
+            if _LEFT_OUT[kind] & {name, f"{name}[{others}]"}:
+                left_out.append(item)
+                continue
+            if kind == "zenoh":
+                item.add_marker(pytest.mark.long)
+        kept.append(item)
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = kept
+
+
+@pytest.fixture(autouse=True)
+def _kind_of_camera(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have ``smartcam.connect`` give cameras of the kind."""
+    kind = _kind(request.node)
+    if kind not in {None, "wire"}:
+        monkeypatch.setitem(vars(smartcam), "connect", functools.partial(connect, kind))
 
 
 @pytest.fixture(params=["tcp", "udp"])

@@ -59,8 +59,10 @@ class OwnAgentCamera(FleetCamera[Any]):
         await super().attend(timeout)
 
     async def close(self) -> None:
-        await super().close()
-        await self.agent.close()
+        try:
+            await super().close()
+        finally:
+            await self.agent.close()
 
 
 def connect(
