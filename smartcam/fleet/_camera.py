@@ -187,7 +187,9 @@ class FleetCamera(Camera[ValueT]):
         """Wait until the agent has a session with the camera, or has tried in vain; bounded."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(deadline):
-                await self._stirred_until(lambda: self._caller.met is not None and not self._trying)
+                await self._stirred_until(
+                    lambda: self.ended or (self._caller.met is not None and not self._trying)
+                )
 
     async def _stirred_until(self, condition: Callable[[], bool]) -> None:
         """Wait until something is true of what the agent says."""
@@ -306,13 +308,15 @@ class FleetCamera(Camera[ValueT]):
 
     def _on_met(self, met: Met) -> None:
         """An agent has answered: this is what the camera is now."""
+        if self._closed is not None:
+            return
         hello = met.hello
-        new = met.epoch != self._receiver.epoch
         self._about = hello
         self._read_as(hello)
-        self._receiver.meet(met)
-        if new or not self._linked:
+        # what came since is newer; what was missed says it all, in order
+        if not self._receiver.misses_states(met):
             self._on_state({"kind": "Hello", **hello})
+        self._receiver.meet(met)
         if self._listeners.hears_results:
             self._listens(self._listeners.results)
 
@@ -370,6 +374,8 @@ class FleetCamera(Camera[ValueT]):
 
     def _on_state(self, said: dict[str, Any]) -> None:
         """Something happened to the camera; this is what it is now."""
+        if self._closed is not None:
+            return
         at = _time(said)
         linked = bool(said.get("connected"))
         if self._trying and not said.get("trying"):
@@ -438,6 +444,11 @@ class FleetCamera(Camera[ValueT]):
     @property
     def url(self) -> str:
         return self.settings.address.url
+
+    @property
+    def ended(self) -> bool:
+        """Whether there will be no session any more: closed, taken, or given up."""
+        return self._closed is not None
 
     @property
     def connected(self) -> bool:

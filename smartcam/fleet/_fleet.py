@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import dataclasses
 import functools
 import weakref
 from dataclasses import dataclass
@@ -107,27 +108,36 @@ class FleetResults(Generic[ValueT]):
         self, subscribe: Callable[[FleetCamera[Any]], Subscription[Result[ValueT]]]
     ) -> None:
         self._subscribe = subscribe
-        self._streams: dict[str, Subscription[Result[ValueT]]] = {}
-        self._line: collections.deque[str] = collections.deque()  # those that have something
-        self._in_line: set[str] = set()
+        # of each camera one; those before it have ended, with a camera that was given up
+        self._streams: dict[str, list[Subscription[Result[ValueT]]]] = {}
+        # those that have something
+        self._line: collections.deque[Subscription[Result[ValueT]]] = collections.deque()
+        self._in_line: set[Subscription[Result[ValueT]]] = set()
         self._ready = asyncio.Event()
         self._ended = False
 
     def add(self, camera: FleetCamera[Any]) -> None:
         """Have a camera's results in it."""
-        if camera.name not in self._streams and not self._ended:
-            stream = self._streams[camera.name] = self._subscribe(camera)
-            stream.share(_Bell(functools.partial(self._queue, camera.name)))
+        known = self._streams.setdefault(camera.name, [])
+        if self._ended or (known and not known[-1].ended):
+            return
+        stream = self._subscribe(camera)
+        known.append(stream)
+        stream.share(_Bell(functools.partial(self._queue, stream)))
 
-    def _queue(self, name: str) -> None:
-        if name not in self._in_line:
-            self._in_line.add(name)
-            self._line.append(name)
+    def _queue(self, stream: Subscription[Result[ValueT]]) -> None:
+        if stream not in self._in_line:
+            self._in_line.add(stream)
+            self._line.append(stream)
         self._ready.set()
 
     def statistics(self) -> dict[str, SubscriberStatistics]:
         """Return the account of each camera's queue."""
-        return {name: stream.statistics() for name, stream in self._streams.items()}
+        return {
+            name: _sum([stream.statistics() for stream in streams])
+            for name, streams in self._streams.items()
+            if streams
+        }
 
     def end(self) -> None:
         """Nothing more will come; what is queued may be read yet. Idempotent."""
@@ -136,8 +146,9 @@ class FleetResults(Generic[ValueT]):
 
     def close(self) -> None:
         """Unsubscribe; what is queued counts as dropped. Idempotent."""
-        for stream in self._streams.values():
-            stream.close()
+        for streams in self._streams.values():
+            for stream in streams:
+                stream.close()
         self.end()
 
     def __aiter__(self) -> AsyncIterator[Result[ValueT]]:
@@ -155,9 +166,8 @@ class FleetResults(Generic[ValueT]):
         """
         while True:
             while self._line:
-                name = self._line.popleft()
-                self._in_line.discard(name)
-                stream = self._streams[name]
+                stream = self._line.popleft()
+                self._in_line.discard(stream)
                 if not stream.waiting:
                     if not stream.ended:
                         continue
@@ -169,7 +179,7 @@ class FleetResults(Generic[ValueT]):
                     return await anext(stream)  # something is there: it does not wait
                 finally:
                     if stream.waiting or stream.ended:
-                        self._queue(name)  # behind the others
+                        self._queue(stream)  # behind the others
             if self._ended:
                 raise StopAsyncIteration
             self._ready.clear()
@@ -182,6 +192,15 @@ class FleetResults(Generic[ValueT]):
         self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _sum(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
+    """Return the account of queues that were one after the other."""
+    *_, last = accounts
+    counts = ("offered", "taken", "dropped", "queued", "queued_bytes", "missed")
+    return dataclasses.replace(
+        last, **{name: sum(getattr(one, name) for one in accounts) for name in counts}
+    )
 
 
 class Fleet:
@@ -318,6 +337,9 @@ class Fleet:
     def __getitem__(self, name: str) -> FleetCamera[Any]:
         """Return a camera, which an agent shares or has shared.
 
+        One that was given up (taken by another client, or lost with ``reconnect=None``) is another
+        object once an agent shares it again.
+
         Raises:
             ConfigurationError: none is called so.
         """
@@ -392,7 +414,8 @@ class Fleet:
             return
         self._on_agent(keys.agent(agent), True)  # it comes before its cameras
         sharing.add(agent)
-        if name not in self._cameras:
+        known = self._cameras.get(name)
+        if known is None or known.ended:
             self._meet(name)
         self._tell(CameraJoined, agent, name)
 
@@ -411,14 +434,25 @@ class Fleet:
         return FleetCamera[Any](settings, name, self._program, shared=True)
 
     def _meet(self, name: str) -> None:
+        before = self._cameras.get(name)
         camera = self._cameras[name] = self._make(name)
         for results in self._subscribed(name):
             results.add(camera)
         task = asyncio.get_running_loop().create_task(
-            camera.attend(self._timeout), name=f"smartcam.fleet.{name}.open"
+            self._attend(camera, before), name=f"smartcam.fleet.{name}.open"
         )
         self._opening[name] = task
-        task.add_done_callback(lambda _: self._opening.pop(name, None))
+
+        def forget(done: asyncio.Task[None]) -> None:
+            if self._opening.get(name) is done:
+                del self._opening[name]
+
+        task.add_done_callback(forget)
+
+    async def _attend(self, camera: FleetCamera[Any], before: FleetCamera[Any] | None) -> None:
+        if before is not None:
+            await before.close()
+        await camera.attend(self._timeout)
 
     # ------------------------------------------------------------------ over many
 

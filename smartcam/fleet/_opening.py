@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from smartcam._suggestions import did_you_mean
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, UnsupportedError
 from smartcam.fleet._address import FleetAddress
 from smartcam.fleet._bus import MemoryBus
 from smartcam.fleet._camera import FleetCamera
@@ -96,6 +96,12 @@ def open(
     return Fleet(bus.end(), None, server.file.fleet, server, connect_timeout, options)
 
 
+SESSIONS_OWN = frozenset(
+    {"connect_attempts", "close_timeout", "liveness_timeout", "restore", "max_length"}
+)
+"""Options of the session with the camera, which is the agent's."""
+
+
 def fleet_camera(
     url: str, options: dict[str, Any], observers: Iterable[Observer]
 ) -> FleetCamera[Any]:
@@ -103,6 +109,7 @@ def fleet_camera(
 
     Raises:
         ConfigurationError: the URL or an option cannot work.
+        UnsupportedError: an option is the session's, which is the agent's.
         MissingExtraError: the extra ``fleet`` is not installed.
     """
     address = FleetAddress.parse(url)
@@ -112,5 +119,11 @@ def fleet_camera(
             "smartcam.fleet.open() takes the fleet"
         )
     settings = CameraSettings.of(address.of(address.camera), options)
+    theirs = sorted(SESSIONS_OWN & options.keys())
+    if theirs:
+        raise UnsupportedError(
+            f"{url}: {', '.join(theirs)}: the session with the camera is its agent's: fleet.yaml "
+            "says how that is"
+        )
     program = Program(ZenohEnd(address.link), address.fleet, address.camera)
     return FleetCamera(settings, address.camera, program, observers=observers)

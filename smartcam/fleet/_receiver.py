@@ -177,6 +177,11 @@ class Receiver:
         await asyncio.gather(*tasks, return_exceptions=True)
         self._wake(everyone=True)
 
+    def misses_states(self, met: Met) -> bool:
+        """Whether an agent that is met has said more of the camera than was taken, since before."""
+        feed = self._states
+        return feed.epoch == met.epoch and 0 < feed.expected < int(met.hello["states"])
+
     def meet(self, met: Met) -> None:
         """The agent is there, and has said where its numbers stand."""
         hello = met.hello

@@ -403,6 +403,25 @@ async def test_camera_lost_for_good_is_told_once() -> None:
         assert (await anext(results)).camera == "a"
 
 
+async def test_camera_that_was_given_up_is_another_when_its_agent_is_back() -> None:
+    bus = MemoryBus()
+    async with fleet_on(bus, reconnect=None) as fleet:
+        results = fleet.results()
+        async with agent(bus, "one", "a"):
+            await until(lambda: "a" in fleet and fleet["a"].connected)
+            before = fleet["a"]
+        await until(lambda: before.ended)
+        async with agent(bus, "one", "a"):
+            await until(lambda: fleet["a"].connected)
+            assert fleet["a"] is not before
+            with pytest.raises(ConnectionLostError):
+                await before.trigger()
+            await fleet["a"].trigger()
+            with contextlib.suppress(ConnectionLostError):  # what ended the stream of before
+                await anext(results)
+            assert (await anext(results)).camera == "a"
+
+
 async def test_stream_that_nobody_refers_to_is_gone() -> None:
     async with smartcam.fleet.open(PLANT) as fleet:
         kept = fleet.results()
