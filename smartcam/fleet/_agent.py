@@ -49,6 +49,9 @@ KNOWN_CALLS = 4096
 KNOWN_CAMERAS = 1000
 """Cameras shared no more whose numbers go on where they ended, should they come back."""
 
+NO_TIME = 0.001
+"""Seconds in line that are not taken from a call's time."""
+
 FIRST_TRY = 30.0
 """Seconds that the first try to reach a camera is waited for at the start."""
 
@@ -327,7 +330,9 @@ class Agent:
             if said in PASSES_GATE:
                 await host.enter(call.program, said, call.timeout)
                 inside = True
-                call = call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
+                waited = now() - begun
+                if waited > NO_TIME:
+                    call = call._replace(timeout=max(0.0, call.timeout - waited))
             fields, blobs = await ACTIONS[said](call)
         except Exception as exc:
             if not isinstance(exc, SmartCamError):

@@ -131,5 +131,26 @@ AT_THE_WIRE: dict[str, tuple[str, ...]] = {
 }
 """By reason, those that do not: names of tests, or with a parameter in brackets one of theirs."""
 
-IN_TIME_OF_THEIR_OWN: frozenset[str] = frozenset()
-"""Those that would take too long in real time, or move the time themselves: not over Zenoh."""
+IN_TIME_OF_THEIR_OWN = frozenset(
+    {
+        "test_events_tell_of_changes_that_are_asked_for",
+        "test_connection_lost_again_soon_is_no_other_clients_doing",
+        "test_camera_that_takes_no_bytes_is_a_timeout",
+        "test_reconnect_keeps_the_password",
+        "test_cancelled_after_any_step_the_camera_goes_on",
+        "test_wait_connected_waits_for_what_is_restored",
+        "test_body_of_5_mb_in_segments_is_copied_once",
+        "test_image_sized_answer_pays_no_idle_wait",
+        "test_application_closed_inside_goes_nowhere",
+        "test_results_that_nobody_takes_hold_no_more_bytes_than_the_default",
+        "test_call_cancelled_at_any_step_and_repeated_is_done",
+        "test_call_cancelled_at_any_step_leaves_a_camera_that_works",
+        "test_call_cancelled_at_any_step_leaves_a_camera_whose_state_is_known",
+        "test_close_at_any_step_of_a_trigger_in_another_application_ends_it",
+        "test_close_cancelled_at_any_step_leaves_nothing",
+        "test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
+        "test_open_cancelled_at_any_step_leaves_a_camera_for_the_next",
+        "test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
+    }
+)
+"""Those that count the loop's steps, measure, or take long in real time: not over Zenoh."""
