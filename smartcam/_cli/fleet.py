@@ -12,7 +12,7 @@ from smartcam._cli.running import JsonErrors, error_json, exit_code, first
 from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import result_text, table_text
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
-from smartcam.exceptions import SmartCamError
+from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.fleet._keys import meets
 from smartcam.models import jsonable
 
@@ -53,6 +53,11 @@ def _opened(url: str, options: Options) -> Fleet:
     return open(url, connect_timeout=options.step(10.0), **options.reading(fleet=True))
 
 
+def _require_cameras(opened: Fleet) -> None:
+    if not len(opened):
+        raise ConnectFailedError(f"no agent of {opened.url} is there")
+
+
 # ---------------------------------------------------------------------- list
 
 
@@ -62,6 +67,7 @@ def _opened(url: str, options: Options) -> Fleet:
 @runs("--timeout", *OUTPUT)
 async def list_(url: str, pattern: str, options: Options) -> None:
     async with _opened(url, options) as opened:
+        _require_cameras(opened)
         found = [_camera(opened, one) for one in opened.cameras(pattern)]
     if options.as_json:
         for value in found:
@@ -151,6 +157,7 @@ async def trigger(url: str, pattern: str, input_hex: str | None, options: Option
     data = None if input_hex is None else from_hex(input_hex, "--input")
     timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
     async with _opened(url, options) as opened:
+        _require_cameras(opened)
         outcomes = await opened.trigger(pattern, timeout=timeout, input=data)
     codes: list[int] = []
     for name, outcome in sorted(outcomes.items()):

@@ -182,8 +182,11 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, LayoutError):
         del lines[1:]  # the text with a mark below it; the first line tells the position
     text = " ".join(line.strip() for line in lines)
-    hung_up = isinstance(error, ConnectionLostError) and isinstance(
-        error.__cause__, ConnectionError
+    cause = error.__cause__
+    hung_up = (
+        isinstance(error, ConnectionLostError)
+        and isinstance(cause, ConnectionError)
+        and not isinstance(cause, LinkError)  # such as an agent that is gone
     )
     return f"{text}. {TAKEN}" if hung_up else text
 

@@ -13,11 +13,14 @@ from smartcam.fleet._zenoh import Link
 from smartcam.settings import FLEET_SCHEMES, Address, masked
 
 if TYPE_CHECKING:
+    from pathlib import Path
     from typing import Self
 
 DEFAULT_PORT = 7447
 CERTIFICATES = "SMARTCAM_FLEET_CERTIFICATES"
 """Variable of the environment with the folder of certificates, where the URL names none."""
+
+CERTIFICATE_FILES = ("ca.pem", "cert.pem", "key.pem")
 
 CHUNK = r"[a-z0-9_-]+"
 MOST_CHUNKS = 4
@@ -67,6 +70,12 @@ def check_pattern(pattern: str) -> str:
             "for any number of parts, such as line1/* or **"
         )
     return pattern
+
+
+def missing_certificates(folder: Path) -> str:
+    """Say which files a folder with certificates lacks; empty where it has all."""
+    missing = [name for name in CERTIFICATE_FILES if not (folder / name).is_file()]
+    return f"{folder} has no {', no '.join(missing)}" if missing else ""
 
 
 class FleetAddress(NamedTuple):

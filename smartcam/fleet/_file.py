@@ -22,7 +22,14 @@ from pydantic import (
 from smartcam._client.interpretation import Interpretation
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, SmartCamError
-from smartcam.fleet._address import CHUNK, MOST_CHUNKS, MOST_NAME, check_name, check_word
+from smartcam.fleet._address import (
+    CHUNK,
+    MOST_CHUNKS,
+    MOST_NAME,
+    check_name,
+    check_word,
+    missing_certificates,
+)
 from smartcam.layout._yaml_files import read_model
 from smartcam.settings import CameraSettings, Seconds, masked, parse_address
 
@@ -33,8 +40,6 @@ DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 MOST_CAMERAS = 10_000
 """Cameras of one agent; each emulated one has a port of its own."""
-
-CERTIFICATE_FILES = ("ca.pem", "cert.pem", "key.pem")
 
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
 _PATTERN = "/**"
@@ -359,10 +364,8 @@ def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
         if tls:
             yield ("listen" if tls[0] in listen else "connect",), f"{tls[0]} wants certificates"
         return
-    missing = [one for one in CERTIFICATE_FILES if not (folder / file.certificates / one).is_file()]
-    if missing:
-        where = folder / file.certificates
-        yield ("certificates",), f"{where} has no {', no '.join(missing)}"
+    if missing := missing_certificates(folder / file.certificates):
+        yield ("certificates",), missing
 
 
 def _of_entry(

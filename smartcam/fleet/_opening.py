@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, UnsupportedError
-from smartcam.fleet._address import FleetAddress
+from smartcam.fleet._address import FleetAddress, missing_certificates
 from smartcam.fleet._bus import MemoryBus
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._fleet import Fleet
@@ -17,7 +18,6 @@ from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from pathlib import Path
     from typing import Unpack
 
     from smartcam.backoff import Backoff
@@ -89,8 +89,7 @@ def open(
             raise ConfigurationError(
                 f"fleet address {place!r} is a camera's; smartcam.connect() takes it"
             )
-        end = ZenohEnd(address.link)
-        return Fleet(end, address, address.fleet, None, connect_timeout, options)
+        return Fleet(_end(address), address, address.fleet, None, connect_timeout, options)
     bus = MemoryBus()
     server = FleetServer(place, bus=bus.end())
     return Fleet(bus.end(), None, server.file.fleet, server, connect_timeout, options)
@@ -125,5 +124,12 @@ def fleet_camera(
             f"{url}: {', '.join(theirs)}: the session with the camera is its agent's: fleet.yaml "
             "says how that is"
         )
-    program = Program(ZenohEnd(address.link), address.fleet, address.camera)
+    program = Program(_end(address), address.fleet, address.camera)
     return FleetCamera(settings, address.camera, program, observers=observers)
+
+
+def _end(address: FleetAddress) -> ZenohEnd:
+    folder = address.certificates
+    if folder is not None and (missing := missing_certificates(Path(folder))):
+        raise ConfigurationError(f"fleet address {address.url!r}: certificates: {missing}")
+    return ZenohEnd(address.link)

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -32,6 +33,9 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 LOOK_AGAIN = 0.1
 """Seconds between two looks whether an agent has come."""
+
+LAST_LOOK = 1.0
+"""Seconds that a look may take at what is there instead."""
 
 
 class Pending(NamedTuple):
@@ -94,8 +98,12 @@ class Program:
                     f"is meant: ?fleet={found[0]}"
                 )
             await asyncio.sleep(min(LOOK_AGAIN, left))
-        what = "camera" if "*" in self._camera else f"camera {self._camera}"
-        why = f"no agent there has a {what}: none came within {timeout:g} s"
+        what, meant = "camera", ""
+        if "*" not in self._camera:
+            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK)
+            meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
+            what = f"camera {self._camera}"
+        why = f"no agent there has a {what}: none came within {timeout:g} s{meant}"
         raise ConnectFailedError(why, attempts=(why,))
 
     async def close(self) -> None:

@@ -8,7 +8,7 @@ from datetime import datetime
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator
 
 from smartcam._client.triggering import TriggerRequest
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
@@ -35,6 +35,7 @@ MOST_RESULTS = 1000
 """Results that one answer brings."""
 
 MOST_INPUT = 1 << 16
+MOST_ID = 200
 
 
 def _hex(text: str) -> str:
@@ -43,6 +44,14 @@ def _hex(text: str) -> str:
     except ValueError as exc:
         raise ValueError("expected bytes as hex, such as 0aff") from exc
     return text
+
+
+def _id(value: object) -> str | int:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if isinstance(value, str) and 1 <= len(value.encode(errors="replace")) <= MOST_ID:
+        return value
+    raise ValueError(f"expected a text of 1 to {MOST_ID} bytes, or an integer")
 
 
 def _time(text: str) -> str:
@@ -56,6 +65,7 @@ def _time(text: str) -> str:
 Hex = Annotated[str, Field(max_length=2 * MOST_INPUT), AfterValidator(_hex)]
 Number = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 Text = Annotated[str, Field(max_length=200)]
+Id = Annotated[str | int, PlainValidator(_id)]
 Interpret = Annotated[str, Field(max_length=10_000)]
 
 
@@ -65,7 +75,7 @@ class PlainRequest(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     timeout: Annotated[float, Field(gt=0, le=MOST_TIMEOUT, allow_inf_nan=False)] | None = None
-    id: Text | int | None = None
+    id: Id | None = None
     program: Text = ""
     epoch: Text | None = None
 

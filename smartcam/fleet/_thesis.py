@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from smartcam._client.interpretation import Interpretation, without_poses
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
@@ -17,6 +17,7 @@ from smartcam.fleet._calls import ACTIONS, Call
 from smartcam.fleet._reading import interpreted
 from smartcam.fleet._services import (
     MOST_TIMEOUT,
+    Id,
     Interpret,
     Number,
     PlainRequest,
@@ -46,6 +47,10 @@ def _topic(text: str) -> str:
     return name
 
 
+def _said(value: object) -> object:
+    return value or None
+
+
 Topic = Annotated[Text, AfterValidator(_topic)]
 
 
@@ -54,6 +59,8 @@ class ThesisRequest(PlainRequest):
 
     camera_name: Annotated[str, Field(min_length=1, max_length=200)]
     timeout: Annotated[float, Field(ge=0, le=MOST_TIMEOUT, allow_inf_nan=False)] | None = None
+    id: Annotated[Id | None, BeforeValidator(_said)] = None
+    epoch: Annotated[Text | None, BeforeValidator(_said)] = None
 
 
 class ThesisSetup(ThesisRequest):
@@ -120,8 +127,15 @@ async def _setup(work: Work) -> dict[str, Any]:
     """Set up a camera that is there already."""
     request: ThesisSetup = work.request
     host, topics = work.host, work.topics
+    has = host.settings.address
+    model = request.camera_model_name
+    if model and (protocol := parse_address(has.host, model=model).protocol) != has.protocol:
+        raise ConfigurationError(
+            f"{host.name}: Setup says it is a {model}, which speaks {protocol}, but it speaks "
+            f"{has.protocol}; Stop it first, or choose another camera_name"
+        )
     if request.con_address:
-        wanted, has = request.address(), host.settings.address
+        wanted = request.address()
         if (wanted.host, wanted.port, wanted.protocol) != (has.host, has.port, has.protocol):
             raise ConfigurationError(
                 f"{host.name}: Setup says it is at {wanted.url}, but it is at {has.url}; Stop it "

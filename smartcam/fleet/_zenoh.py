@@ -16,6 +16,7 @@ import logging
 import os
 import re
 import socket
+import struct
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
 
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
+
+INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 LONG = 1 << 16
 """Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
@@ -136,6 +139,33 @@ def _free_port(endpoint: str) -> int:
         return int(found.getsockname()[1])
 
 
+def _end_lingering(ports: frozenset[int]) -> None:
+    """Have the engine close its connections without waiting.
+
+    It closes one that is cut off in the thread that serves all others, which would wait there 10 s
+    for an answer to what was sent last.
+    """
+    try:
+        numbers = [int(name) for name in os.listdir("/dev/fd")]  # noqa: PTH208 - names are enough
+    except OSError:
+        return  # Windows, where nothing waits
+    for number in numbers:
+        try:
+            found = socket.socket(fileno=number)
+        except OSError:
+            continue  # a file, or closed by now
+        try:
+            if found.family in INTERNET and ports & {
+                found.getsockname()[1],
+                found.getpeername()[1],
+            }:
+                found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+        except OSError:
+            pass  # it has no other end
+        finally:
+            found.detach()
+
+
 @functools.cache
 def _engine() -> Any:
     """Return Zenoh.
@@ -180,6 +210,7 @@ class ZenohEnd(Bus):
         self._calm_since, self._said = -CALM, 0
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
+        self._look: asyncio.TimerHandle | None = None  # for connections that linger
         zenoh = self._zenoh
         control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
         self._dropping, self._waiting_for_room = (
@@ -213,7 +244,15 @@ class ZenohEnd(Bus):
         except asyncio.CancelledError:
             opening.add_done_callback(_close_late)
             raise
+        self._end_lingering()
         return self
+
+    def _end_lingering(self) -> None:
+        """Look at the connections now, and again before a new one can be cut off for its lease."""
+        self._look = self._loop.call_later(LEASE / 2, self._end_lingering)
+        endpoints = (*self._link.listen, *self._link.connect)
+        ports = frozenset(int(one.rpartition(":")[2]) for one in endpoints)
+        self._loop.run_in_executor(None, _end_lingering, ports)
 
     def _failed(self, why: str) -> ConnectFailedError:
         doing = "listen on" if self._link.listen else "reach"
@@ -222,6 +261,8 @@ class ZenohEnd(Bus):
 
     async def close(self) -> None:
         session, self._session = self._session, None
+        if self._look is not None:
+            self._look.cancel()
         self._waiting.clear()
         self._bytes = 0
         if session is None:

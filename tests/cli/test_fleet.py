@@ -400,6 +400,17 @@ def test_fleet_trigger_gives_one_outcome_each(fleet: str) -> None:
     run("fleet", "trigger", f"{fleet}/line1/text").failed(2, "is a camera's")
 
 
+def test_what_is_not_there_is_told_with_what_is(fleet: str) -> None:
+    brief = ("--timeout", "0.5")
+    absent = run("trigger", f"{fleet}/line1/tekst", *brief)
+    absent.failed(3, "no agent there has a camera line1/tekst", "did you mean 'line1/text'?")
+    for command in (("fleet", "list"), ("fleet", "trigger")):
+        other = run(*command, f"{fleet}?fleet=hall", *brief)
+        other.failed(3, f"no agent of {fleet}?fleet=hall is there")
+    other = run("trigger", f"{fleet.replace('fleet:', 'fleet+tls:')}/a?certificates=/nope", *brief)
+    other.failed(2, "/nope has no ca.pem, no cert.pem, no key.pem")
+
+
 def test_fleet_watch_shows_results_and_who_comes_and_goes(fleet: str, tmp_path: Path) -> None:
     router = fleet.replace("fleet://", "tcp/")
     text = f"agent: west\nconnect: {router}\ncameras:\n  line5/**: {{emulated: {{count: 2}}}}\n"
@@ -431,6 +442,23 @@ def test_fleet_watch_ends_with_count_and_seconds(fleet: str) -> None:
     assert out[:2] == ["agent north: is there", "line4/free: shared by agent north"]
     assert [line.partition(": result")[0] for line in out[2::2]] == ["line4/free"] * 2
     assert run("fleet", "watch", fleet, "line9/*", "--seconds", "0.1").done().out == out[0] + "\n"
+
+
+def test_killed_agent_ends_a_command_that_uses_it(tmp_path: Path) -> None:
+    text = "listen: tcp/127.0.0.1:0\ncameras:\n  a: {emulated: {}, application: 7}\n"
+    with (
+        serving(tmp_path / "one.yaml", text, cameras=1) as (agent, line),
+        Process("smartcam", "trigger", line.strip(), "--count", "1000000") as triggering,
+    ):
+        triggering.read_until(b"result 2 ")
+        agent.send_signal(signal.SIGKILL)
+        ended = triggering.wait()
+    gone, end = "the agent ", " is gone, or the way to it"
+    ended.failed(3, gone, end)
+    assert ended.err.partition(end)[2] in {
+        "\n",
+        "; whether what was under way was done is unknown\n",
+    }
 
 
 # ---------------------------------------------------------------------- the demo

@@ -95,8 +95,10 @@ async def test_error_has_its_text_its_kind_and_what_is_known() -> None:
         ({"input": "0g"}, "expected bytes as hex"),
         ({"results_per_trigger": 10**9}, "results_per_trigger"),
         ({"when_busy": "hope"}, "when_busy"),
-        ({"id": []}, "id"),
+        ({"id": []}, "id: Value error, expected a text of 1 to 200 bytes, or an integer"),
         ({"id": "x" * 201}, "id"),
+        ({"id": ""}, "id"),
+        ({"id": True}, "id"),
     ],
 )
 async def test_bad_request_is_told_and_nothing_is_done(request_: object, said: str) -> None:
@@ -290,6 +292,8 @@ async def test_setup_of_a_camera_that_is_there(name: str) -> None:
         assert f"it is at bvs://127.0.0.1:{place.camera.port}" in answer["error"]
         wrongs: list[dict[str, Any]] = [
             {"interpret_as": "nonsense"},
+            {"camera_model_name": "IN-SIGHT"},
+            {"camera_model_name": "BVS003"},
             {"topic_status": "a b"},
             {"port": []},
         ]
@@ -405,6 +409,19 @@ async def test_one_trigger_for_each_type_of_result() -> None:
         answer = await thesis("Trigger50ByteString", "line1/cam9")
         assert answer["strings"] == []
         assert "has no camera" in answer["error"]
+
+
+async def test_thesis_fields_that_are_empty_or_0_count_as_not_said() -> None:
+    async with plant() as place:
+        for empty in ("", 0):
+            for _ in range(2):
+                answer = await place.client.thesis(
+                    "ChangeApplication", id=empty, epoch="", timeout=0, application_id=TEXTS
+                )
+                assert answer == {"error": ""}
+                answer = await place.client.thesis("Trigger50ByteString", id=empty, epoch="")
+                assert answer["error"] == ""
+        assert heard(place.camera, m.Trigger) == 4
 
 
 async def test_localizations_are_read_as_is_known() -> None:

@@ -286,6 +286,36 @@ async def until_waits(plant: Plant) -> None:
 # ---------------------------------------------------------------------- what is said
 
 
+def lingering(port: int) -> int:
+    """Count connections of this process that would be waited for when they are closed."""
+    count = 0
+    for place in Path("/dev/fd").iterdir():
+        with contextlib.suppress(OSError):
+            found = socket.socket(fileno=int(place.name))
+            try:
+                internet = found.family == socket.AF_INET
+                if internet and port in {found.getsockname()[1], found.getpeername()[1]}:
+                    count += found.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8)[0]
+            finally:
+                found.detach()
+    return count
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/dev/fd").is_dir(), reason="closing waits for nothing here")
+async def test_no_connection_lingers_for_as_long_as_a_lease(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(_zenoh, "_end_lingering", lambda _: None)
+    async with two_ends() as (listens, _):
+        port = port_of(listens._link.listen[0])
+        assert lingering(port)  # as the engine makes them
+        monkeypatch.undo()
+        async with asyncio.timeout(PATIENCE):
+            while lingering(port):  # noqa: ASYNC110 - what another thread does
+                await asyncio.sleep(0.05)
+
+
 @pytest.mark.parametrize("size", [0, 1, LONG, LONG + 1, 3 << 20])
 async def test_what_is_said_arrives_however_long_it_is(size: int) -> None:
     payload = os.urandom(size)
