@@ -21,6 +21,7 @@ from smartcam.fleet._wire import (
     encode,
     encode_runs,
     encode_state,
+    encode_status,
     timestamp,
 )
 from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
@@ -268,7 +269,12 @@ class Host:
 
     def _on_status(self, status: Status) -> None:
         self.topics.on_status(status)
-        self._say({"kind": "Status"}, hold=HOLD)
+        camera, number = self._camera, self.states.following
+        if not (camera.connected and self._opened.is_set()):
+            self._say({"kind": "Status"}, hold=HOLD)
+            return
+        data = encode_status(number, int(status), camera.endian, camera.active_application)
+        self._have_said(data, asyncio.get_running_loop().time(), HOLD)
 
     def _on_event(self, event: CameraEvent) -> None:
         self._tell(event)
@@ -291,7 +297,9 @@ class Host:
         """Say what happened, and what the camera is now; in ``hold`` seconds, or with the next."""
         clock = asyncio.get_running_loop().time()
         said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
-        data = encode_state(said)
+        self._have_said(encode_state(said), clock, hold)
+
+    def _have_said(self, data: bytes, clock: float, hold: float) -> None:
         self.states.add(1, clock, data)
         self._fresh_states.append(data)
         if hold and self._held is None:

@@ -18,7 +18,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet import FleetFile
 from smartcam.fleet._log import Log
-from smartcam.fleet._wire import decode
+from smartcam.fleet._wire import decode, decode_order
 from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
 from tests.client.clientkit import gone
@@ -53,7 +53,14 @@ class Recorded:
         return (0.0,)
 
     def calls(self, do: str) -> list[tuple[str, bytes]]:
-        return [one for one in self.said if decode(one[1], "it").fields.get("do") == do]
+        return [one for one in self.said if _what(one[1]) == do]
+
+
+def _what(payload: bytes) -> str | None:
+    """Return what a call wants done; None for a cancellation."""
+    if decode_order(payload, "it") is not None:
+        return "trigger"
+    return decode(payload, "it").fields.get("do")
 
 
 async def test_doubled_calls_and_replies_are_one() -> None:
