@@ -390,6 +390,8 @@ class Agent:
         told = host.untold(guest.told.get(host.name, 0))
         guest.told[host.name] = following
         host.flush(states=not told)
+        if told and len(self._programs) == 1:
+            host.forget_fresh()
         reply = encode_outcome(call.owner.call, self.epoch, now(), following, told, runs)
         self._bus.put(self._keys.reply(call.program), reply)
 
