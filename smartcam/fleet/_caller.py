@@ -306,13 +306,19 @@ class Caller:
         return reply
 
     async def trigger(
-        self, request: TriggerRequest, application: int | None, number: int, timeout: float
+        self,
+        request: TriggerRequest,
+        application: int | None,
+        expected: int | None,
+        number: int,
+        timeout: float,
     ) -> Outcome:
         """Have the agent trigger; return its reply.
 
         Args:
             request: what the trigger is to do.
             application: have this one running for it.
+            expected: the one that its results are to be of.
             number: of the call.
             timeout: seconds.
 
@@ -331,7 +337,7 @@ class Caller:
             self.clock(deadline),
             timeout,
             application,
-            request.expected,
+            expected,
             request.results,
             request.wait,
             interpretation.by_application,

@@ -516,9 +516,7 @@ class FleetCamera(Camera[ValueT]):
         receiver, number = self._receiver, self._program.next_call()
         own = receiver.own[number] = Own(request.interpretation, expected)
         try:
-            reply = await self._caller.trigger(
-                request._replace(expected=expected), application, number, timeout
-            )
+            reply = await self._caller.trigger(request, application, expected, number, timeout)
             receiver.take_told(reply)
             await self._reach(reply.states, reply.batch.following, deadline)
             return receiver.outcomes(own, reply.batch)

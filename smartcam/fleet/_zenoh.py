@@ -311,7 +311,10 @@ class ZenohEnd(Bus):
         if len(payload) > LONG or self._said > MOST_SAID or way in self._behind:
             self._hand_over(way, session, key, payload, self._waiting_for_room[express])
             return
-        _put(session, key, payload, self._dropping[express])
+        try:
+            session.put(key, payload, **self._dropping[express])
+        except self._zenoh.ZError as exc:  # it ends meanwhile
+            logger.debug("the fleet's bus: %s", exc)
 
     def _hand_over(
         self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]
