@@ -125,7 +125,7 @@ def decode(payload: bytes, what: str) -> Message:
 CURRENT, LATE = 1, 2
 """Flags of a run: not known to be an older trigger's; known to be one's that was given up."""
 
-_RUN = struct.Struct("<QIIBBxxIIddddI")
+_RUN = struct.Struct("<QIIIBxxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
 _MAGIC = b"scr1"
 _NO_NUMBER = math.nan

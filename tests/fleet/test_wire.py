@@ -50,7 +50,7 @@ def runs(draw: st.DrawFn) -> Run:
     return Run(
         number=draw(st.integers(0, 2**40)),
         application=draw(NUMBERS),
-        endian=draw(st.integers(0, 255)),
+        endian=draw(NUMBERS),
         flags=draw(st.integers(0, 255)),
         owner=draw(NUMBERS),
         call=draw(NUMBERS),
