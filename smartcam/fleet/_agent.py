@@ -26,7 +26,15 @@ from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._plain import Plain
 from smartcam.fleet._shared import Owner
-from smartcam.fleet._wire import Message, decode, encode, grace
+from smartcam.fleet._wire import (
+    Message,
+    Order,
+    decode,
+    decode_order,
+    encode,
+    encode_outcome,
+    grace,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,9 +56,6 @@ KNOWN_CALLS = 4096
 
 KNOWN_CAMERAS = 1000
 """Cameras shared no more whose numbers go on where they ended, should they come back."""
-
-NO_TIME = 0.001
-"""Seconds in line that are not taken from a call's time."""
 
 FIRST_TRY = 30.0
 """Seconds that the first try to reach a camera is waited for at the start."""
@@ -258,8 +263,11 @@ class Agent:
         def hear(key: str, payload: bytes) -> None:
             name = key.removeprefix(root)
             try:
-                message = decode(payload, f"a call to {name}")
-                self._on_call(self.hosts[name], message, command)
+                host, order = self.hosts[name], decode_order(payload, "a call")
+                if order is None:
+                    self._on_call(host, decode(payload, "a call"), command)
+                else:
+                    self._on_order(host, *order, command)
             except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! a call that cannot be read: %s", name, exc)
 
@@ -272,20 +280,47 @@ class Agent:
             self._cancel(host, program, int(fields["cancel"]))
             self._reply(program, number, {"answer": {}})
             return
-        said = str(fields["do"])
+        said, timeout = str(fields["do"]), float(fields.get("timeout", 1.0))
+        deadline = float(fields["deadline"]) if "deadline" in fields else None
+        epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
         guest = self._guest(program, number) if said == "hello" else self._programs.get(program)
-        if guest is None or fields.get("epoch", self.epoch) != self.epoch:
+        left = self._admit(host, guest, program, number, epoch, said, deadline, timeout, command)
+        if guest is not None and left is not None:
+            owner = Owner(guest.number, number)
+            call = Call(host, program, owner, arguments, message.blobs, left, guest.entered)
+            self._start(said, call, guest)
+
+    def _on_order(self, host: Host, program: str, order: Order, command: bool) -> None:
+        number, guest, said = order.call, self._programs.get(program), "trigger"
+        epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
+        left = self._admit(host, guest, program, number, epoch, said, deadline, timeout, command)
+        if guest is not None and left is not None:
+            owner = Owner(guest.number, number)
+            self._start(said, Call(host, program, owner, {}, [], left, guest.entered, order), guest)
+
+    def _admit(
+        self,
+        host: Host,
+        guest: Guest | None,
+        program: str,
+        number: int,
+        epoch: int,
+        said: str,
+        deadline: float | None,
+        timeout: float,
+        command: bool,
+    ) -> float | None:
+        """Return the seconds that a call may take; None where it is not done, or not again."""
+        if guest is None or epoch != self.epoch:
             stranger = ConnectionLostError(
                 f"{host.name}: the agent {self.name} was restarted, or took this program for "
                 f"gone; {said} was not done"
             )
             self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
-            return
+            return None
         if not guest.is_new(number):
-            return  # it is done, or under way: a double
-        timeout, left = float(fields.get("timeout", 1.0)), 1.0
-        if "deadline" in fields:
-            left = float(fields["deadline"]) + grace(timeout) / 2 - now()
+            return None  # it is done, or under way: a double
+        left = 1.0 if deadline is None else deadline + grace(timeout) / 2 - now()
         error: SmartCamError | None = None
         if said not in ACTIONS or (said in COMMANDS) != command:
             error = UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
@@ -297,13 +332,12 @@ class Agent:
             )
         if error is not None:
             self._reply(program, number, {"error": to_fields(error)})
-            return
-        timeout = min(timeout, left)
-        owner = Owner(guest.number, number)
-        arguments: Any = fields.get("arguments", {})
-        call = Call(host, program, owner, arguments, message.blobs, timeout, guest.entered)
-        guest.tasks[number] = asyncio.get_running_loop().create_task(
-            self._do(said, call, guest), name=f"smartcam.fleet.{host.name}.{said}"
+            return None
+        return min(timeout, left)
+
+    def _start(self, said: str, call: Call, guest: Guest) -> None:
+        guest.tasks[call.owner.call] = asyncio.get_running_loop().create_task(
+            self._do(said, call, guest), name=f"smartcam.fleet.{call.host.name}.{said}"
         )
 
     def _cancel(self, host: Host, program: str, number: int) -> None:
@@ -323,16 +357,14 @@ class Agent:
     async def _do(self, said: str, call: Call, guest: Guest) -> None:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
-        begun = now()
         inside = False
-        told: list[bytes] | None = None
         try:
             if said in PASSES_GATE:
-                await host.enter(call.program, said, call.timeout)
+                if not host.gate.goes_in(call.program):
+                    begun = now()
+                    await host.enter(call.program, said, call.timeout)
+                    call = call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
                 inside = True
-                waited = now() - begun
-                if waited > NO_TIME:
-                    call = call._replace(timeout=max(0.0, call.timeout - waited))
             fields, blobs = await ACTIONS[said](call)
         except Exception as exc:
             if not isinstance(exc, SmartCamError):
@@ -341,21 +373,27 @@ class Agent:
             blobs = []
         else:
             reply = {"answer": fields}
-            if said == "trigger":
-                told = host.untold(guest.told.get(host.name, 0))
         finally:
             if inside:
                 host.gate.leave(call.program)
             guest.tasks.pop(call.owner.call, None)
-        if told:  # others hear of it a little later
-            reply["told"] = len(told)
-            blobs = [*blobs, *told]
-            guest.told[host.name] = host.states.following
-            host.flush(states=False)
-        else:
-            host.flush()
+        if said == "trigger" and blobs:
+            self._reply_to_trigger(call, guest, blobs[0])
+            return
+        host.flush()
         reply |= {"states": host.states.following, "results": host.results.following}
         self._reply(call.program, call.owner.call, reply, blobs)
+
+    def _reply_to_trigger(self, call: Call, guest: Guest, runs: bytes) -> None:
+        """Reply, with the states that nobody was told of; others hear of them a little later."""
+        host, following = call.host, call.host.states.following
+        told = host.untold(guest.told.get(host.name, 0))
+        guest.told[host.name] = following
+        host.flush(states=not told)
+        if told and len(self._programs) == 1:
+            host.forget_fresh()
+        reply = encode_outcome(call.owner.call, self.epoch, now(), following, told, runs)
+        self._bus.put(self._keys.reply(call.program), reply)
 
     def _reply(
         self, program: str, number: int, fields: dict[str, Any], blobs: list[bytes] | None = None

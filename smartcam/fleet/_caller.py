@@ -16,14 +16,14 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._errors import from_fields
 from smartcam.fleet._keys import COMMANDS
-from smartcam.fleet._wire import grace
+from smartcam.fleet._wire import Message, Order, Outcome, encode, encode_order, grace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from smartcam._client.triggering import TriggerRequest
     from smartcam.fleet._bus import Handle
-    from smartcam.fleet._program import Program
-    from smartcam.fleet._wire import Message
+    from smartcam.fleet._program import Program, Reply
     from smartcam.protocols._framed.machine import Counters
 
 DRIFT = 1e-4
@@ -279,19 +279,87 @@ class Caller:
         number: int | None = None,
         timeout: float | None = None,
     ) -> Message:
-        program = self.program
         begun = asyncio.get_running_loop().time()
-        number = number or program.next_call()
-        key = self._key(agent, do)
-        fields: dict[str, Any] = {"call": number, "do": do, "arguments": arguments or {}}
+        number = number or self.program.next_call()
+        fields: dict[str, Any] = {
+            "program": self.program.name,
+            "call": number,
+            "do": do,
+            "arguments": arguments or {},
+        }
         if met is not None:
             timeout = deadline - begun if timeout is None else timeout
             fields |= {"epoch": met.epoch, "deadline": self.clock(deadline), "timeout": timeout}
             deadline += grace(timeout)
+        reply = await self._ask(do, number, encode(fields, blobs), begun, deadline, agent, met)
+        if not isinstance(reply, Message):
+            raise RemoteProtocolError(f"{self.name}: the agent {agent} answers {do} as a trigger")
+        return reply
+
+    async def trigger(
+        self,
+        request: TriggerRequest,
+        application: int | None,
+        expected: int | None,
+        number: int,
+        timeout: float,
+    ) -> Outcome:
+        """Have the agent trigger; return its reply.
+
+        Args:
+            request: what the trigger is to do.
+            application: have this one running for it.
+            expected: the one that its results are to be of.
+            number: of the call.
+            timeout: seconds.
+
+        Raises:
+            SmartCamError: as :meth:`call`.
+
+        Cancellation: the agent is told.
+        """
+        met = self.require()
+        begun = asyncio.get_running_loop().time()
+        deadline = begun + timeout
+        interpretation = request.interpretation
+        order = Order(
+            number,
+            met.epoch,
+            self.clock(deadline),
+            timeout,
+            application,
+            expected,
+            request.results,
+            request.wait,
+            interpretation.by_application,
+            request.input_data,
+            interpretation.numbered_layouts(),
+        )
+        payload = encode_order(self.program.name, order)
+        reply = await self._ask(
+            "trigger", number, payload, begun, deadline + grace(timeout), met.agent, met
+        )
+        if not isinstance(reply, Outcome):
+            raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
+        self.sample(reply.clock)
+        return reply
+
+    async def _ask(
+        self,
+        do: str,
+        number: int,
+        payload: bytes,
+        begun: float,
+        deadline: float,
+        agent: str,
+        met: Met | None,
+    ) -> Reply:
+        """Say a call, and return the reply to it; ``deadline`` is this side's."""
+        program, key = self.program, self._key(agent, do)
         waiting = program.expect(number, self)
         timer = asyncio.get_running_loop().call_at(deadline, _expire, waiting)
         try:
-            self.counters.bytes_sent += program.send(key, fields, blobs)
+            self.counters.bytes_sent += program.put(key, payload)
             self.counters.frames_sent += 1
             reply = await waiting
         except TimeoutError as exc:
@@ -304,6 +372,8 @@ class Caller:
             timer.cancel()
             program.forget(number)
         self.counters.frames_received += 1
+        if isinstance(reply, Outcome):
+            return reply
         if reply.fields.get("stranger") and self.met is met and met is not None:
             self.lose(f"the agent {met.agent} was restarted, or took this program for gone")
         if "error" in reply.fields:
@@ -326,12 +396,12 @@ class Caller:
         """
         program, met = self.program, self.met
 
-        def say() -> tuple[int, asyncio.Future[Message]]:
+        def say() -> tuple[int, asyncio.Future[Reply]]:
             number = program.next_call()
             program.send(key, {"call": number, **fields})
             return number, program.expect(number, self)
 
-        async def repeat(number: int, answer: asyncio.Future[Message]) -> None:
+        async def repeat(number: int, answer: asyncio.Future[Reply]) -> None:
             while True:
                 try:
                     async with asyncio.timeout(INSIST_AFTER):
@@ -371,7 +441,7 @@ class Caller:
         )
 
 
-def _expire(waiting: asyncio.Future[Message]) -> None:
+def _expire(waiting: asyncio.Future[Reply]) -> None:
     if not waiting.done():
         waiting.set_exception(TimeoutError())
 

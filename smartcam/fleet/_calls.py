@@ -10,7 +10,7 @@ from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Carrier, Owner
-from smartcam.fleet._wire import encode_runs
+from smartcam.fleet._wire import Order, encode_runs
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -34,6 +34,7 @@ class Call(NamedTuple):
         blobs: byte strings that came with it.
         timeout: seconds that it may take.
         entered: applications to go back to of this program's temporary switches, by their call.
+        order: a trigger that came in numbers; in place of arguments.
     """
 
     host: Host
@@ -43,6 +44,7 @@ class Call(NamedTuple):
     blobs: list[bytes]
     timeout: float
     entered: dict[tuple[str, int], Any]
+    order: Order | None = None
 
     def argument(self, name: str, *kinds: type) -> Any:
         """Return an argument; None where it is not said.
@@ -69,18 +71,24 @@ _PLAIN = Carrier()
 
 
 async def _trigger(call: Call) -> Answer:
-    layouts = call.argument("layouts", str, dict)
-    if isinstance(layouts, dict):
-        layouts = {int(key): text for key, text in layouts.items()}
-    data = call.blobs[0] if call.blobs else None
-    wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
-    expected, each = call.argument("expected", int), bool(call.argument("by_application", bool))
+    order = call.order
+    layouts = None
+    if order is not None:
+        data, wanted, wait, each = order.data, order.results, order.wait, order.by_application
+        application, expected = order.application, order.expected
+    else:
+        layouts = call.argument("layouts", str, dict)
+        if isinstance(layouts, dict):
+            layouts = {int(key): text for key, text in layouts.items()}
+        data = call.blobs[0] if call.blobs else None
+        wanted, wait = call.wanted("results", int), call.wanted("wait", bool)
+        each = bool(call.argument("by_application", bool))
+        application, expected = call.argument("application", int), call.argument("expected", int)
     if layouts is None and not each:
         carrier = _PLAIN.of(call.owner)
     else:
         carrier = Carrier(call.owner, layouts, by_application=each)
     request = TriggerRequest(carrier, data, wanted, wait, expected)
-    application = call.argument("application", int)
     runs = await outcomes(call.host, call.owner, request, application, call.timeout)
     return {}, [encode_runs(0, call.host.results.following, runs)]
 

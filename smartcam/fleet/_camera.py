@@ -18,14 +18,13 @@ from smartcam.exceptions import (
     ConnectionLostError,
     LinkError,
     LocalProtocolError,
-    RemoteProtocolError,
     ResponseTimeoutError,
     SmartCamError,
 )
 from smartcam.fleet._caller import Caller, Met
 from smartcam.fleet._errors import from_fields
 from smartcam.fleet._receiver import FleetListeners, Own, Receiver
-from smartcam.fleet._wire import decode_runs, grace
+from smartcam.fleet._wire import grace
 from smartcam.models import (
     ApplicationChanged,
     Capabilities,
@@ -504,17 +503,17 @@ class FleetCamera(Camera[ValueT]):
         deadline = self._deadline(limit)
         self._require_session()
         reply = await self._caller.call(do, deadline, arguments, blobs, call, limit)
-        if "told" in reply.fields:
-            self._receiver.take_told(reply)
-        await self._reach(reply, deadline)
+        states, results = reply.fields.get("states"), reply.fields.get("results")
+        if isinstance(states, int) and isinstance(results, int):
+            await self._reach(states, results, deadline)
         return reply
 
-    async def _reach(self, reply: Message, deadline: float) -> None:
-        soon = min(deadline, asyncio.get_running_loop().time() + REACH_TIMEOUT)
-        for kind in ("states", "results"):
-            number = reply.fields.get(kind)
-            if isinstance(number, int):
-                await self._receiver.reach(kind, number, soon)
+    async def _reach(self, states: int, results: int, deadline: float) -> None:
+        """Wait for what the agent has said before its reply."""
+        if not self._receiver.has(states, results):
+            soon = min(deadline, asyncio.get_running_loop().time() + REACH_TIMEOUT)
+            await self._receiver.reach("states", states, soon)
+            await self._receiver.reach("results", results, soon)
 
     async def _trigger(
         self, application: int | None, request: TriggerRequest, timeout: float
@@ -522,27 +521,17 @@ class FleetCamera(Camera[ValueT]):
         if self._switch_in_doubt:
             await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
-        interpretation = request.interpretation
-        number = self._program.next_call()
-        own = self._receiver.own[number] = Own(interpretation, expected)
+        deadline = self._deadline(timeout)
+        self._require_session()
+        receiver, number = self._receiver, self._program.next_call()
+        own = receiver.own[number] = Own(request.interpretation, expected)
         try:
-            reply = await self._do(
-                "trigger",
-                timeout,
-                [] if request.input_data is None else [request.input_data],
-                number,
-                application=application,
-                expected=expected,
-                layouts=interpretation.numbered_layouts(),
-                by_application=interpretation.by_application,
-                results=request.results,
-                wait=request.wait,
-            )
-            if not reply.blobs:
-                raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
-            return self._receiver.outcomes(own, decode_runs(reply.blobs[0], "a trigger's results"))
+            reply = await self._caller.trigger(request, application, expected, number, timeout)
+            receiver.take_told(reply)
+            await self._reach(reply.states, reply.batch.following, deadline)
+            return receiver.outcomes(own, reply.batch)
         finally:
-            del self._receiver.own[number]
+            del receiver.own[number]
 
     async def switch_application(
         self, application: int | str, *, timeout: float | None = None

@@ -37,10 +37,15 @@ class Gate:
         Raises:
             TimeoutError: not within ``timeout`` seconds.
         """
-        if not self._line and self.holder in {None, program}:
-            self._active[program] += 1
-        else:
+        if not self.goes_in(program):
             await self._pass(program, None, timeout)
+
+    def goes_in(self, program: str) -> bool:
+        """Let a command begin if it need not wait; whether it did."""
+        if self._line or (self.holder is not None and self.holder != program):
+            return False
+        self._active[program] += 1
+        return True
 
     def leave(self, program: str) -> None:
         """A command of ``program`` has ended; programs without any are not kept."""

@@ -7,6 +7,7 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Any
 
+from smartcam._client.deadline import DeadlineTimer
 from smartcam._client.interpretation import Interpretation
 from smartcam.exceptions import ConnectionLostError, SmartCamError
 from smartcam.fleet._errors import late, to_fields
@@ -21,6 +22,7 @@ from smartcam.fleet._wire import (
     encode,
     encode_runs,
     encode_state,
+    encode_status,
     timestamp,
 )
 from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
@@ -40,6 +42,10 @@ MOST_STATE_BYTES = 1 << 19
 HOLD = 0.005
 """Seconds that a status may wait for others, so that one message tells them. The program whose
 trigger it belongs to hears of it with the reply."""
+
+CATCH_UP = 0.2
+"""Seconds behind such a reply after which the number of the next state is told where no state was:
+the reply may have been lost, and nothing else would tell."""
 
 GATHER = 0.002
 """Seconds between two messages with results, at least: those that come faster go together."""
@@ -101,7 +107,8 @@ class Host:
         self._fresh_bytes = 0
         self._due: asyncio.Handle | None = None  # says the results
         self._said_at = -math.inf
-        self._held: asyncio.TimerHandle | None = None  # says the states
+        self._held = DeadlineTimer(self._flush_states)
+        self._catch_up = DeadlineTimer(self._put_states)
         self._reminder: asyncio.TimerHandle | None = None
         self._opened = asyncio.Event()
         self._over = False  # there will be no session any more
@@ -171,6 +178,8 @@ class Host:
         if self._reminder is not None:
             self._reminder.cancel()
         self.flush()
+        self._held.cancel()
+        self._catch_up.cancel()
         self._states_out.close()
         self._results_out.close()
         self.topics.close()
@@ -267,7 +276,12 @@ class Host:
 
     def _on_status(self, status: Status) -> None:
         self.topics.on_status(status)
-        self._say({"kind": "Status"}, hold=HOLD)
+        camera, number = self._camera, self.states.following
+        if not (camera.connected and self._opened.is_set()):
+            self._say({"kind": "Status"}, hold=HOLD)
+            return
+        data = encode_status(number, int(status), camera.endian, camera.active_application)
+        self._have_said(data, asyncio.get_running_loop().time(), HOLD)
 
     def _on_event(self, event: CameraEvent) -> None:
         self._tell(event)
@@ -290,13 +304,15 @@ class Host:
         """Say what happened, and what the camera is now; in ``hold`` seconds, or with the next."""
         clock = asyncio.get_running_loop().time()
         said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
-        data = encode_state(said)
+        self._have_said(encode_state(said), clock, hold)
+
+    def _have_said(self, data: bytes, clock: float, hold: float) -> None:
         self.states.add(1, clock, data)
         self._fresh_states.append(data)
-        if hold and self._held is None:
-            self._held = asyncio.get_running_loop().call_later(hold, self._flush_states)
-        elif not hold:
+        if not hold:
             self._flush_states()
+        elif len(self._fresh_states) == 1:
+            self._held.set(clock + hold)
         self.topics.on_state()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
@@ -341,6 +357,12 @@ class Host:
         fresh = self._fresh_states
         return fresh[max(0, since - self.states.following + len(fresh)) :]
 
+    def forget_fresh(self) -> None:
+        """The states that are not said yet need not be: whoever hears them was told."""
+        self._held.clear()
+        self._fresh_states.clear()
+        self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP)
+
     def flush(self, *, states: bool = True) -> None:
         """Say what is not said yet; without ``states`` only results."""
         if states:
@@ -348,13 +370,15 @@ class Host:
         self._flush_results()
 
     def _flush_states(self) -> None:
-        if self._held is not None:
-            self._held.cancel()
-            self._held = None
+        self._held.clear()
         if self._fresh_states:
-            fresh, self._fresh_states = self._fresh_states, []
-            following = self.states.following
-            self._states_out.put(encode({"epoch": self._epoch, "following": following}, fresh))
+            self._put_states()
+
+    def _put_states(self) -> None:
+        self._catch_up.clear()
+        fresh, self._fresh_states = self._fresh_states, []
+        following = self.states.following
+        self._states_out.put(encode({"epoch": self._epoch, "following": following}, fresh))
 
     def _flush_results(self) -> None:
         if self._due is not None:

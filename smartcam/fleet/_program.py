@@ -19,7 +19,7 @@ from smartcam.exceptions import (
     ProtocolError,
 )
 from smartcam.fleet._keys import Keys
-from smartcam.fleet._wire import Message, decode, encode
+from smartcam.fleet._wire import Message, Outcome, decode, decode_outcome, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -38,11 +38,14 @@ LAST_LOOK = 1.0
 """Seconds that a look may take at what is there instead."""
 
 
+Reply = Message | Outcome
+
+
 class Pending(NamedTuple):
     """A call whose reply has not come."""
 
     camera: object
-    reply: asyncio.Future[Message]
+    reply: asyncio.Future[Reply]
 
 
 class Program:
@@ -123,13 +126,16 @@ class Program:
 
     def send(self, key: str, fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> int:
         """Say something to an agent; return how many bytes."""
-        payload = encode({"program": self.name, **fields}, blobs)
+        return self.put(key, encode({"program": self.name, **fields}, blobs))
+
+    def put(self, key: str, payload: bytes) -> int:
+        """Say something that is bytes already, as :meth:`send` does."""
         self.bus.put(key, payload)
         return len(payload)
 
-    def expect(self, number: int, camera: object) -> asyncio.Future[Message]:
+    def expect(self, number: int, camera: object) -> asyncio.Future[Reply]:
         """Return what gets the reply to a call; :meth:`forget` it when it is done."""
-        reply: asyncio.Future[Message] = asyncio.get_running_loop().create_future()
+        reply: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
         self._pending[number] = Pending(camera, reply)
         return reply
 
@@ -145,8 +151,14 @@ class Program:
 
     def _on_reply(self, key: str, payload: bytes) -> None:
         try:
-            message = decode(payload, "a reply")
-            pending = self._pending.get(message.fields["call"])
+            outcome = decode_outcome(payload, "a reply")
+            if outcome is not None:
+                message: Reply = outcome
+                number = outcome.call
+            else:
+                message = said = decode(payload, "a reply")
+                number = said.fields["call"]
+            pending = self._pending.get(number)
         except (ProtocolError, KeyError, TypeError) as exc:
             logger.warning("%s ! a reply that cannot be read: %s", self.name, exc)
             return

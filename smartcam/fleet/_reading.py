@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import InterpretationError
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 def singles(run: Run) -> Iterator[Run]:
     """Give each container of a run as a run of its own."""
     for place in range(len(run.payloads)):
-        yield replace(run, number=run.number + place, payloads=run.payloads[place : place + 1])
+        yield run._replace(number=run.number + place, payloads=run.payloads[place : place + 1])
 
 
 def interpreted(run: Run, interpretation: Interpretation, camera: str) -> Interpreted:

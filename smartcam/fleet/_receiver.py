@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 import math
 import weakref
@@ -19,7 +18,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._log import Feed
 from smartcam.fleet._reading import as_result, interpreted, singles
-from smartcam.fleet._wire import CURRENT, LATE, Batch, Message, Run, decode, decode_runs
+from smartcam.fleet._wire import CURRENT, LATE, Run, decode, decode_runs, decode_state
 from smartcam.models import Result
 
 if TYPE_CHECKING:
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from smartcam._client.interpretation import Interpretation
     from smartcam.fleet._bus import Handle
     from smartcam.fleet._caller import Caller, Met
+    from smartcam.fleet._wire import Batch, Message, Outcome
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
@@ -63,9 +63,7 @@ def state(data: bytes) -> State:
     Raises:
         ValueError: it is nothing of the kind.
     """
-    said: Any = json.loads(str(data, "utf-8"))
-    if not isinstance(said, dict) or not isinstance(said.get("number"), int):
-        raise ValueError(f"no state: {data[:40]!r}")  # noqa: TRY004 - as json's own
+    said = decode_state(data)
     return State(said["number"], said)
 
 
@@ -249,7 +247,14 @@ class Receiver:
             async with asyncio.timeout_at(deadline):
                 await reached
 
+    def has(self, states: int, results: int) -> bool:
+        """Whether everything before these numbers was taken, as far as it is heard."""
+        heard = "results" not in self._handles or self._results.expected >= results
+        return heard and self._states.expected >= states
+
     def _wake(self, *, everyone: bool = False) -> None:
+        if not self._reaching:
+            return
         left: list[tuple[Feed[Any], int, asyncio.Future[None]]] = []
         for feed, number, reached in self._reaching:
             if everyone or feed.expected >= number:
@@ -321,15 +326,16 @@ class Receiver:
         self._states.receive(epoch, following, states)
         self._wake()
 
-    def take_told(self, reply: Message) -> None:
-        """Take the states at the end of a reply, which are not said to all yet."""
+    def take_told(self, reply: Outcome) -> None:
+        """Take the states in a reply, which are not said to all yet."""
+        if not reply.told:
+            return
         try:
-            told, following = int(reply.fields["told"]), int(reply.fields["states"])
-            states = [state(one) for one in reply.blobs[len(reply.blobs) - told :]]
-        except (KeyError, TypeError, ValueError) as exc:
+            states = [state(one) for one in reply.told]
+        except ValueError as exc:
             logger.warning("%s ! what the agent says with a reply: %s", self._camera, exc)
             return
-        self._states.receive(int(reply.fields.get("epoch", 0)), following, states)
+        self._states.receive(reply.epoch, reply.states, states)
         self._wake()
 
     def _hear_results(self, key: str, payload: bytes) -> None:

@@ -130,7 +130,8 @@ class TappedListeners(Listeners):
             self.tap.end()
 
     def offer_status(self, status: Status, now: float) -> None:
-        super().offer_status(status, now)
+        if self.statuses.references:
+            super().offer_status(status, now)
         if self.tap is not None:
             self.tap.status(status)
 

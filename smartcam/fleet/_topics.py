@@ -272,7 +272,10 @@ class CameraTopics:
     def on_state(self) -> None:
         """Something happened."""
         number, self.statuses = self.statuses, self.statuses + 1
-        outs = [self._topics.heard("status", self._host.name), self.status_out]
+        out = self._topics.heard("status", self._host.name)
+        if out is None and self.status_out is None:
+            return
+        outs = [out, self.status_out]
         hearing = [one for one in outs if one is not None and one.heard]
         if hearing:
             at = datetime.now(UTC).isoformat()
@@ -284,9 +287,11 @@ class CameraTopics:
         """The camera told its status; that it is another one is an event."""
         before, self._before = self._before, status
         if status != before:
-            at = datetime.now(UTC)
-            name = self._host.name
-            self.on_event(StatusChanged(camera=name, at=at, status=status, previous=before))
+            number, self.events = self.events, self.events + 1
+            if self._topics.heard("events", self._host.name) is not None:
+                at, name = datetime.now(UTC), self._host.name
+                changed = StatusChanged(camera=name, at=at, status=status, previous=before)
+                self._say_event(changed, number)
 
     def on_event(self, event: CameraEvent) -> None:
         """An event of the camera's."""
@@ -295,6 +300,9 @@ class CameraTopics:
             self.trouble = event.reason
         elif isinstance(event, (Connected, Reconnected)):
             self.trouble = ""
+        self._say_event(event, number)
+
+    def _say_event(self, event: CameraEvent, number: int) -> None:
         out = self._topics.heard("events", self._host.name)
         if out is not None:
             what = {"number": number, "event": type(event).__name__}

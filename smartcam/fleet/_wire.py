@@ -1,8 +1,10 @@
 """What smartcam's own ends of a fleet say to each other, as bytes.
 
 A message is a JSON object with byte strings behind it: calls, replies, what the camera is. Results
-go as runs: containers of one camera that came together, with consecutive numbers. Everything is
-little endian. ``docs/bus.md`` has the layouts.
+go as runs: containers of one camera that came together, with consecutive numbers. What each trigger
+needs goes as a few numbers instead of JSON, which costs most of all: its call (:class:`Order`), its
+reply (:class:`Outcome`), and the statuses meanwhile. Everything is little endian. ``docs/bus.md``
+has the layouts.
 """
 
 from __future__ import annotations
@@ -10,7 +12,6 @@ from __future__ import annotations
 import json
 import math
 import struct
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -43,6 +44,44 @@ _as_json = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 def encode_state(fields: dict[str, Any]) -> bytes:
     """Return what happened as bytes: one of a message's byte strings."""
     return _as_json(fields).encode()
+
+
+_STATUS = struct.Struct("<4sQIIq")
+_IS_STATUS = b"scs1"
+_NONE = -(1 << 63)  # in place of a number
+
+
+def encode_status(number: int, status: int, endian: int, application: int | None) -> bytes:
+    """Return a status of a session as bytes, as :func:`encode_state` does; ``number`` is its own.
+
+    Raises:
+        struct.error: it does not fit.
+    """
+    return _STATUS.pack(
+        _IS_STATUS, number, status, endian, _NONE if application is None else application
+    )
+
+
+def decode_state(data: bytes) -> dict[str, Any]:
+    """Return the fields of what happened.
+
+    Raises:
+        ValueError: it is nothing of the kind.
+    """
+    if data[:4] == _IS_STATUS and len(data) == _STATUS.size:
+        _, number, status, endian, application = _STATUS.unpack(data)
+        return {
+            "kind": "Status",
+            "connected": True,
+            "number": number,
+            "status": status,
+            "endian": endian,
+            "application": None if application == _NONE else application,
+        }
+    said: Any = json.loads(str(data, "utf-8"))
+    if not isinstance(said, dict) or not isinstance(cast("Any", said).get("number"), int):
+        raise ValueError(f"no state: {data[:40]!r}")  # noqa: TRY004 - as json's own
+    return cast("dict[str, Any]", said)
 
 
 def encode(fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> bytes:
@@ -86,15 +125,14 @@ def decode(payload: bytes, what: str) -> Message:
 CURRENT, LATE = 1, 2
 """Flags of a run: not known to be an older trigger's; known to be one's that was given up."""
 
-_RUN = struct.Struct("<QIqBBxxIIddddI")
+_RUN = struct.Struct("<QIqIBxxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
 _MAGIC = b"scr1"
 _NO_NUMBER = math.nan
 _NEVER = 253_402_300_800.0  # the year 10,000, which no datetime has
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
+class Run(NamedTuple):
     """Containers of one application that came together.
 
     Attributes:
@@ -151,7 +189,7 @@ class Run:
         """Return what of it has ``number`` or a later one."""
         if number <= self.number:
             return self
-        return replace(self, number=number, payloads=self.payloads[number - self.number :])
+        return self._replace(number=number, payloads=self.payloads[number - self.number :])
 
     def encode(self) -> bytes:
         """Return it as bytes."""
@@ -242,6 +280,175 @@ def _decode_run(payload: bytes, place: int) -> tuple[Run, int]:
         payload[place:end],
     )
     return run, end
+
+
+# ---------------------------------------------------------------------- triggers
+
+_ORDER = struct.Struct("<4sQQddqqIBB")
+_IS_ORDER = b"sct1"
+_WAIT, _BY_APPLICATION, _INPUT = 1, 2, 4
+_OUTCOME = struct.Struct("<4sQQdQI")
+_IS_OUTCOME = b"sco1"
+
+
+class Order(NamedTuple):
+    """A call for a trigger.
+
+    Attributes:
+        call: its number.
+        epoch: of the agent that it is for.
+        deadline: the agent's clock, seconds.
+        timeout: seconds that the user gave.
+        application: have this one running for it.
+        expected: the application that its results are to be of.
+        results: how many it is to have.
+        wait: until the camera takes it.
+        by_application: each application's results are read in a way of their own.
+        data: input, None for none.
+        layouts: those that have the number of a result in them; None for none.
+    """
+
+    call: int
+    epoch: int
+    deadline: float
+    timeout: float
+    application: int | None
+    expected: int | None
+    results: int
+    wait: bool
+    by_application: bool
+    data: bytes | None
+    layouts: Any = None
+
+
+def encode_order(program: str, order: Order) -> bytes:
+    """Return a call of ``program`` as bytes; as a message where it has more than numbers in it."""
+    number, epoch, deadline, timeout, application, expected, results, wait, each, data, layouts = (
+        order
+    )
+    flags = wait * _WAIT | each * _BY_APPLICATION | (data is not None) * _INPUT
+    name = program.encode()
+    if layouts is None:
+        try:
+            head = _ORDER.pack(
+                _IS_ORDER,
+                number,
+                epoch,
+                deadline,
+                timeout,
+                _NONE if application is None else application,
+                _NONE if expected is None else expected,
+                results,
+                flags,
+                len(name),
+            )
+        except struct.error:
+            pass  # the agent says what is wrong with such numbers
+        else:
+            return b"".join((head, name, data or b""))
+    fields: dict[str, Any] = {
+        "program": program,
+        "call": number,
+        "do": "trigger",
+        "epoch": epoch,
+        "deadline": deadline,
+        "timeout": timeout,
+        "arguments": {
+            "application": application,
+            "expected": expected,
+            "results": results,
+            "wait": wait,
+            "by_application": each,
+            "layouts": layouts,
+        },
+    }
+    return encode(fields, () if data is None else (data,))
+
+
+def decode_order(payload: bytes, what: str) -> tuple[str, Order] | None:
+    """Return the program and its call in ``payload``; None where that is a message.
+
+    Raises:
+        RemoteProtocolError: it is broken; ``what`` is.
+    """
+    if payload[:4] != _IS_ORDER:
+        return None
+    try:
+        (_, number, epoch, deadline, timeout, application, expected, results, flags, size) = (
+            _ORDER.unpack_from(payload)
+        )
+        end = _ORDER.size + size
+        if len(payload) < end or (len(payload) > end and not flags & _INPUT):
+            raise ValueError(f"{len(payload)} bytes came, {end} were expected")
+        program = str(payload[_ORDER.size : end], "utf-8")
+    except (ValueError, struct.error) as exc:
+        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+    return program, Order(
+        number,
+        epoch,
+        deadline,
+        timeout,
+        None if application == _NONE else application,
+        None if expected == _NONE else expected,
+        results,
+        bool(flags & _WAIT),
+        bool(flags & _BY_APPLICATION),
+        payload[end:] if flags & _INPUT else None,
+    )
+
+
+class Outcome(NamedTuple):
+    """The reply to a trigger that has succeeded.
+
+    Attributes:
+        call: the number of the call.
+        epoch: of the agent.
+        clock: the agent's, seconds.
+        states: the number that the agent gives what happens next.
+        told: what happened and was not said before.
+        batch: its results, and what number the agent gives the next one.
+    """
+
+    call: int
+    epoch: int
+    clock: float
+    states: int
+    told: list[bytes]
+    batch: Batch
+
+
+def encode_outcome(
+    call: int, epoch: int, clock: float, states: int, told: Sequence[bytes], runs: bytes
+) -> bytes:
+    """Return a reply as bytes; ``runs`` is what :func:`encode_runs` gives, the rest as it has."""
+    count = len(told)
+    head = _OUTCOME.pack(_IS_OUTCOME, call, epoch, clock, states, count)
+    lengths = struct.pack(f"<{count}I", *map(len, told))
+    return b"".join((head, lengths, *told, runs))
+
+
+def decode_outcome(payload: bytes, what: str) -> Outcome | None:
+    """Return the reply to a trigger in ``payload``; None where that is a message.
+
+    Raises:
+        RemoteProtocolError: it is broken; ``what`` is.
+    """
+    if payload[:4] != _IS_OUTCOME:
+        return None
+    try:
+        _, call, epoch, clock, states, count = _OUTCOME.unpack_from(payload)
+        place = _OUTCOME.size
+        lengths = struct.unpack_from(f"<{count}I", payload, place)
+        place += 4 * count
+        told: list[bytes] = []
+        for length in lengths:
+            told.append(payload[place : place + length])
+            place += length
+        if place > len(payload):
+            raise ValueError(f"{place} bytes were announced, {len(payload)} came")
+    except (ValueError, struct.error) as exc:
+        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+    return Outcome(call, epoch, clock, states, told, decode_runs(payload[place:], what))
 
 
 def timestamp(at: datetime | None) -> float:

@@ -11,12 +11,14 @@ import asyncio
 import collections
 import contextlib
 import functools
+import io
 import json
 import logging
 import os
 import re
 import socket
 import struct
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -68,6 +70,8 @@ TURN = 64
 """Callbacks in one turn of the event loop."""
 
 CLOSE_TIMEOUT = 5.0
+
+_ONE = (1).to_bytes(8, sys.byteorder)
 
 
 @dataclass(frozen=True)
@@ -202,6 +206,7 @@ class ZenohEnd(Bus):
         self._waiting = collections.deque()
         self._bytes = 0
         self._woken = False
+        self._bell: _Bell | None = None
         self._lock = threading.Lock()
         self._told_dropped = False
         self._sender: ThreadPoolExecutor | None = None
@@ -245,6 +250,7 @@ class ZenohEnd(Bus):
             opening.add_done_callback(_close_late)
             raise
         self._end_lingering()
+        self._bell = _Bell.on(loop, self._drain)
         return self
 
     def _end_lingering(self) -> None:
@@ -265,6 +271,9 @@ class ZenohEnd(Bus):
             self._look.cancel()
         self._waiting.clear()
         self._bytes = 0
+        bell, self._bell = self._bell, None
+        if bell is not None:
+            bell.close()
         if session is None:
             return
         for one in tuple(self._declared):
@@ -289,6 +298,10 @@ class ZenohEnd(Bus):
         self._wake()
 
     def _wake(self) -> None:
+        bell = self._bell
+        if bell is not None:
+            bell.ring()
+            return
         with contextlib.suppress(RuntimeError):  # the loop is closed, and nobody hears any more
             self._loop.call_soon_threadsafe(self._drain)
 
@@ -339,7 +352,10 @@ class ZenohEnd(Bus):
         if len(payload) > LONG or self._said > MOST_SAID or way in self._behind:
             self._hand_over(way, session, key, payload, self._waiting_for_room[express])
             return
-        _put(session, key, payload, self._dropping[express])
+        try:
+            session.put(key, payload, **self._dropping[express])
+        except self._zenoh.ZError as exc:  # it ends meanwhile
+            logger.debug("the fleet's bus: %s", exc)
 
     def _hand_over(
         self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]
@@ -505,6 +521,45 @@ class ZenohEnd(Bus):
     def later(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call something in the event loop; for any thread."""
         self._in_loop(call, 0, *arguments)
+
+
+class _Bell:
+    """Wakes an event loop from any thread; for less than its own ``call_soon_threadsafe``.
+
+    Args:
+        loop: the loop.
+        call: what it calls then.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
+        # a file, as its number may be another's when it is closed, and an object knows that
+        self._file = io.FileIO(os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC), "r+")
+        self._loop, self._call = loop, call
+        loop.add_reader(self._file.fileno(), self._hear)
+
+    @classmethod
+    def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _Bell | None:
+        """Return a bell; None where the system or the loop has nothing for it."""
+        if sys.platform != "linux":
+            return None
+        with contextlib.suppress(NotImplementedError, OSError):
+            return cls(loop, call)
+        return None
+
+    def ring(self) -> None:
+        """Have the loop call; once, however often it is rung before."""
+        with contextlib.suppress(ValueError):  # it is closed, and nobody hears any more
+            self._file.write(_ONE)
+
+    def _hear(self) -> None:
+        self._file.read(8)
+        self._call()
+
+    def close(self) -> None:
+        """Wake nobody any more. Idempotent."""
+        if not self._file.closed:
+            self._loop.remove_reader(self._file.fileno())
+            self._file.close()
 
 
 class _Declared(Handle):

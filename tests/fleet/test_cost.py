@@ -13,7 +13,7 @@ from smartcam.emulator import Application, EmulatedCamera
 from smartcam.fleet import FleetCamera, FleetFile, FleetServer
 from smartcam.fleet._address import FleetAddress
 from smartcam.fleet._bus import MemoryBus
-from smartcam.fleet._host import HOLD
+from smartcam.fleet._host import CATCH_UP, HOLD
 from smartcam.fleet._program import Program
 from smartcam.settings import CameraSettings
 
@@ -76,6 +76,7 @@ async def test_a_trigger_is_a_call_and_a_reply_and_statuses_of_several_go_in_one
     plant: Plant,
 ) -> None:
     camera = await plant.camera()
+    await plant.camera()  # who hears of it without a reply
     await camera.trigger()
     await asyncio.sleep(2 * HOLD)
     plant.said.clear()
@@ -86,6 +87,29 @@ async def test_a_trigger_is_a_call_and_a_reply_and_statuses_of_several_go_in_one
     assert plant.said["ask"] == 0  # nothing was missing
     # two statuses each; the clock stands still meanwhile
     assert 0 < plant.said["states"] <= 2
+
+
+async def test_statuses_that_the_only_program_has_with_a_reply_are_not_said_again(
+    plant: Plant,
+) -> None:
+    camera = await plant.camera()
+    await camera.trigger()
+    await asyncio.sleep(2 * CATCH_UP)
+    plant.said.clear()
+    statuses = camera.statuses()
+    for _ in range(TRIGGERS):
+        await camera.trigger()
+    await asyncio.sleep(2 * HOLD)
+    assert plant.said["states"] == 0
+    assert statuses.statistics().queued >= 2 * TRIGGERS
+    await asyncio.sleep(2 * CATCH_UP)
+    assert plant.said["states"] == 1  # that there are no more, should a reply have been lost
+    assert plant.said["ask"] == 0
+    other = await plant.camera()
+    await camera.trigger()
+    await asyncio.sleep(2 * HOLD)
+    assert other.status == camera.status
+    assert plant.said["states"] == 2
 
 
 async def test_the_status_after_a_call_is_that_of_its_end(plant: Plant) -> None:

@@ -18,7 +18,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet import FleetFile
 from smartcam.fleet._log import Log
-from smartcam.fleet._wire import decode
+from smartcam.fleet._wire import decode, decode_order, decode_outcome
 from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
 from tests.client.clientkit import gone
@@ -53,7 +53,14 @@ class Recorded:
         return (0.0,)
 
     def calls(self, do: str) -> list[tuple[str, bytes]]:
-        return [one for one in self.said if decode(one[1], "it").fields.get("do") == do]
+        return [one for one in self.said if _what(one[1]) == do]
+
+
+def _what(payload: bytes) -> str | None:
+    """Return what a call wants done; None for a cancellation."""
+    if decode_order(payload, "it") is not None:
+        return "trigger"
+    return decode(payload, "it").fields.get("do")
 
 
 async def test_doubled_calls_and_replies_are_one() -> None:
@@ -79,6 +86,21 @@ async def test_lost_reply_is_a_timeout_that_does_not_guess() -> None:
         assert "whether it was done is unknown" in str(error)
         bus.fate = as_said
         assert (await camera.trigger(timeout=1.0)).value.run == 2
+
+
+async def test_statuses_of_a_lost_reply_come_all_the_same() -> None:
+    def no_outcome(key: str, payload: bytes) -> Sequence[float]:
+        return (0.0,) if decode_outcome(payload, "it") is None else ()
+
+    bus = LossyBus()
+    async with Plant(bus=bus) as plant, plant.camera() as camera:
+        statuses = camera.statuses()
+        await camera.trigger(timeout=1.0)
+        before = statuses.statistics().queued
+        bus.fate = only("reply", no_outcome)
+        assert isinstance(await gone(camera.trigger(timeout=0.5)), TriggerTimeoutError)
+        await asyncio.sleep(1.0)
+        assert statuses.statistics().queued == 2 * before > 0
 
 
 async def test_lost_command_is_a_timeout_and_nothing_was_done() -> None:

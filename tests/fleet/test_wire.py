@@ -12,7 +12,22 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.fleet._wire import Run, decode, decode_runs, encode, encode_runs, timestamp
+from smartcam.fleet._wire import (
+    Order,
+    Run,
+    decode,
+    decode_order,
+    decode_outcome,
+    decode_runs,
+    decode_state,
+    encode,
+    encode_order,
+    encode_outcome,
+    encode_runs,
+    encode_state,
+    encode_status,
+    timestamp,
+)
 
 NUMBERS = st.integers(0, 2**32 - 1)
 CLOCKS = st.floats(-1e9, 1e9)
@@ -35,7 +50,7 @@ def runs(draw: st.DrawFn) -> Run:
     return Run(
         number=draw(st.integers(0, 2**40)),
         application=draw(NUMBERS),
-        endian=draw(st.integers(0, 255)),
+        endian=draw(NUMBERS),
         flags=draw(st.integers(0, 255)),
         owner=draw(NUMBERS),
         call=draw(NUMBERS),
@@ -79,9 +94,91 @@ def test_rest_of_a_run(run: Run, number: int) -> None:
     assert number > len(run.payloads) or rest.next == run.next
 
 
+ORDERS = st.builds(
+    Order,
+    call=st.integers(0, 2**64 - 1),
+    epoch=st.integers(0, 2**64 - 1),
+    deadline=CLOCKS,
+    timeout=CLOCKS,
+    application=st.none() | st.integers(-(2**63) + 1, 2**63 - 1),
+    expected=st.none() | NUMBERS,
+    results=NUMBERS,
+    wait=st.booleans(),
+    by_application=st.booleans(),
+    data=st.none() | st.binary(max_size=9),
+    layouts=st.none(),
+)
+
+
+@given(order=ORDERS, program=st.text(max_size=60))
+def test_order_is_what_was_said(order: Order, program: str) -> None:
+    assert decode_order(encode_order(program, order), "it") == (program, order)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("application", 2**63), ("results", -1), ("layouts", "@sequence: uint32")]
+)
+def test_order_that_does_not_fit_is_a_message(field: str, value: Any) -> None:
+    order = Order(1, 2, 3.0, 4.0, None, 5, 6, wait=True, by_application=False, data=b"7")
+    payload = encode_order("it", order._replace(**{field: value}))
+    assert decode_order(payload, "it") is None
+    fields, blobs = decode(payload, "it")
+    assert blobs == [b"7"]
+    assert fields.pop("arguments") == {
+        "application": None,
+        "expected": 5,
+        "results": 6,
+        "wait": True,
+        "by_application": False,
+        "layouts": None,
+        field: value,
+    }
+    assert fields == {
+        "program": "it",
+        "call": 1,
+        "do": "trigger",
+        "epoch": 2,
+        "deadline": 3.0,
+        "timeout": 4.0,
+    }
+
+
+@given(told=st.lists(st.binary(max_size=9), max_size=4), some=st.lists(runs(), max_size=3))
+def test_outcome_is_what_was_said(told: list[bytes], some: list[Run]) -> None:
+    batch = encode_runs(9, 8, [one.encode() for one in some])
+    outcome = decode_outcome(encode_outcome(1, 2, 3.5, 4, told, batch), "it")
+    assert outcome is not None
+    assert outcome[:5] == (1, 2, 3.5, 4, told)
+    assert repr(outcome.batch) == repr(decode_runs(batch, "it"))
+
+
+@given(number=NUMBERS, status=NUMBERS, endian=NUMBERS, application=st.none() | NUMBERS)
+def test_status_is_what_was_said(
+    number: int, status: int, endian: int, application: int | None
+) -> None:
+    fields = {
+        "kind": "Status",
+        "connected": True,
+        "number": number,
+        "status": status,
+        "endian": endian,
+        "application": application,
+    }
+    assert decode_state(encode_status(number, status, endian, application)) == fields
+    assert decode_state(encode_state(fields)) == fields
+
+
+@pytest.mark.parametrize("data", [b"", b"scs1", b"[]", b'{"number": "1"}', b"\xff"])
+def test_what_is_no_state_is_told(data: bytes) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - json's own texts
+        decode_state(data)
+
+
 MESSAGE = encode({"call": 7, "do": "trigger", "arguments": {"a": [1, None]}}, [b"1234", b"", b"5"])
 RUN = Run(5, 1, 0, 1, 2, 3, 1.5, 1.7e9, 1.7e9, 0.1, [b"abc", b"", b"de"], b"{}").encode()
 BATCH = encode_runs(9, 8, [RUN, RUN])
+ORDER = encode_order("it", Order(1, 2, 3.0, 4.0, None, 5, 6, True, False, None))
+OUTCOME = encode_outcome(1, 2, 3.0, 4, [b"abc", b"d"], BATCH)
 
 
 @pytest.mark.parametrize("length", range(len(MESSAGE)))
@@ -97,9 +194,20 @@ def test_no_part_of_runs_is_one(length: int) -> None:
 
 
 def test_nothing_may_stand_behind() -> None:
-    for read, payload in ((decode, MESSAGE), (decode_runs, BATCH)):
+    for read, payload in ((decode, MESSAGE), (decode_runs, BATCH), (decode_outcome, OUTCOME)):
         with pytest.raises(RemoteProtocolError, match="1 bytes are left over"):
             read(payload + b"\0", "it")
+    with pytest.raises(RemoteProtocolError, match=r"^it is broken: "):
+        decode_order(ORDER + b"\0", "it")
+
+
+@pytest.mark.parametrize("length", range(4, len(OUTCOME)))
+def test_no_part_of_a_trigger_is_one(length: int) -> None:
+    with pytest.raises(RemoteProtocolError, match=r"^a reply is broken: "):
+        decode_outcome(OUTCOME[:length], "a reply")
+    if length < len(ORDER):
+        with pytest.raises(RemoteProtocolError, match=r"^a call is broken: "):
+            decode_order(ORDER[:length], "a call")
 
 
 def with_head(text: str, behind: bytes = b"") -> bytes:
