@@ -46,7 +46,7 @@ def encode_state(fields: dict[str, Any]) -> bytes:
     return _as_json(fields).encode()
 
 
-_STATUS = struct.Struct("<4sQIIq")
+_STATUS = struct.Struct("<4sQQIq")
 _IS_STATUS = b"scs1"
 _NONE = -(1 << 63)  # in place of a number
 
