@@ -40,9 +40,9 @@ SOON = 0.3
 async def demo(options: Options) -> None:
     """Start agents, share a camera, reserve it, trigger all, end agents."""
     from smartcam.fleet import open
-    from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+    from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
 
-    ZenohEnd(Link())  # without the engine it ends here
+    ZenohEnd(BusLink())  # without the engine it ends here
     say = Steps(options)
     (endpoint,) = with_ports(["tcp/127.0.0.1:0"])
     url = f"fleet://{endpoint.partition('/')[2]}"

@@ -9,7 +9,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._zenoh import Link
+from smartcam.fleet._zenoh import BusLink
 from smartcam.settings import FLEET_SCHEMES, Address, masked
 
 if TYPE_CHECKING:
@@ -154,11 +154,11 @@ class FleetAddress(NamedTuple):
         return cls(parts.scheme, parts.hostname, port, fleet, camera, certificates)
 
     @property
-    def link(self) -> Link:
+    def link(self) -> BusLink:
         """How a program comes to it."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         kind = "tls" if self.scheme == "fleet+tls" else "tcp"
-        return Link(connect=(f"{kind}/{host}:{self.port}",), certificates=self.certificates)
+        return BusLink(connect=(f"{kind}/{host}:{self.port}",), certificates=self.certificates)
 
     def of(self, camera: str) -> Address:
         """Return the address of a camera of it."""

@@ -20,15 +20,15 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
-from smartcam.fleet._calls import ACTIONS, PASSES_GATE, Call, now
+from smartcam.fleet._calls import ACTIONS, PASSES_GATE, ProgramCall, now
 from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._plain import Plain
 from smartcam.fleet._shared import Owner
 from smartcam.fleet._wire import (
-    Message,
-    Order,
+    BusMessage,
+    TriggerOrder,
     decode,
     decode_order,
     encode,
@@ -273,7 +273,7 @@ class Agent:
 
         return hear
 
-    def _on_call(self, host: Host, message: Message, command: bool) -> None:
+    def _on_call(self, host: Host, message: BusMessage, command: bool) -> None:
         fields = message.fields
         program, number = str(fields["program"]), int(fields["call"])
         if "cancel" in fields:
@@ -287,16 +287,18 @@ class Agent:
         left = self._admit(host, guest, program, number, epoch, said, deadline, timeout, command)
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
-            call = Call(host, program, owner, arguments, message.blobs, left, guest.entered)
+            call = ProgramCall(host, program, owner, arguments, message.blobs, left, guest.entered)
             self._start(said, call, guest)
 
-    def _on_order(self, host: Host, program: str, order: Order, command: bool) -> None:
+    def _on_order(self, host: Host, program: str, order: TriggerOrder, command: bool) -> None:
         number, guest, said = order.call, self._programs.get(program), "trigger"
         epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
         left = self._admit(host, guest, program, number, epoch, said, deadline, timeout, command)
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
-            self._start(said, Call(host, program, owner, {}, [], left, guest.entered, order), guest)
+            self._start(
+                said, ProgramCall(host, program, owner, {}, [], left, guest.entered, order), guest
+            )
 
     def _admit(
         self,
@@ -335,7 +337,7 @@ class Agent:
             return None
         return min(timeout, left)
 
-    def _start(self, said: str, call: Call, guest: Guest) -> None:
+    def _start(self, said: str, call: ProgramCall, guest: Guest) -> None:
         guest.tasks[call.owner.call] = asyncio.get_running_loop().create_task(
             self._do(said, call, guest), name=f"smartcam.fleet.{call.host.name}.{said}"
         )
@@ -354,7 +356,7 @@ class Agent:
             camera, before = entered
             camera.leave(before)
 
-    async def _do(self, said: str, call: Call, guest: Guest) -> None:
+    async def _do(self, said: str, call: ProgramCall, guest: Guest) -> None:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
         inside = False
@@ -384,7 +386,7 @@ class Agent:
         reply |= {"states": host.states.following, "results": host.results.following}
         self._reply(call.program, call.owner.call, reply, blobs)
 
-    def _reply_to_trigger(self, call: Call, guest: Guest, runs: bytes) -> None:
+    def _reply_to_trigger(self, call: ProgramCall, guest: Guest, runs: bytes) -> None:
         """Reply, with the states that nobody was told of; others hear of them a little later."""
         host, following = call.host, call.host.states.following
         told = host.untold(guest.told.get(host.name, 0))

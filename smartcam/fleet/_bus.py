@@ -79,7 +79,7 @@ class Bus(abc.ABC):
         """Have ``hear(key, payload)`` called for what is said under ``pattern``."""
 
     @abc.abstractmethod
-    def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
+    def answer(self, pattern: str, answer: Callable[[BusQuestion], None]) -> Handle:
         """Have ``answer(question)`` called for what is asked under ``pattern``."""
 
     @abc.abstractmethod
@@ -99,7 +99,7 @@ class Bus(abc.ABC):
         """Have ``see(key, present)`` called for who is there, and who comes and goes."""
 
 
-class Question(abc.ABC):
+class BusQuestion(abc.ABC):
     """What somebody asks.
 
     Attributes:
@@ -139,10 +139,12 @@ class MemoryBus:
         return MemoryEnd(self)
 
 
-class _Declared(Handle):
+class _MemoryDeclared(Handle):
     """What an end has declared under a pattern."""
 
-    def __init__(self, place: list[_Declared], pattern: str, call: Callable[..., None]) -> None:
+    def __init__(
+        self, place: list[_MemoryDeclared], pattern: str, call: Callable[..., None]
+    ) -> None:
         self.pattern = pattern
         self.call = call
         self._place = place
@@ -170,10 +172,10 @@ class MemoryEnd(Bus):
 
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
-        self.heard: list[_Declared] = []
-        self.answered: list[_Declared] = []
-        self.watched: list[_Declared] = []
-        self.present_here: list[_Declared] = []
+        self.heard: list[_MemoryDeclared] = []
+        self.answered: list[_MemoryDeclared] = []
+        self.watched: list[_MemoryDeclared] = []
+        self.present_here: list[_MemoryDeclared] = []
         self.publishers: list[_MemoryPublisher] = []
 
     @property
@@ -216,12 +218,12 @@ class MemoryEnd(Bus):
         return _MemoryPublisher(self, self.publishers, key, on_heard)
 
     def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
-        made = _Declared(self.heard, pattern, hear).then(self._tell_heard)
+        made = _MemoryDeclared(self.heard, pattern, hear).then(self._tell_heard)
         self._tell_heard()
         return made
 
-    def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
-        return _Declared(self.answered, pattern, answer)
+    def answer(self, pattern: str, answer: Callable[[BusQuestion], None]) -> Handle:
+        return _MemoryDeclared(self.answered, pattern, answer)
 
     async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
         questions = [
@@ -239,7 +241,7 @@ class MemoryEnd(Bus):
         return [answer for _, question in questions for answer in question.answers]
 
     def be_present(self, key: str) -> Handle:
-        made = _Declared(self.present_here, key, _nothing)
+        made = _MemoryDeclared(self.present_here, key, _nothing)
         self._tell(key, True)
         return made.then(lambda: self._tell(key, False))
 
@@ -248,7 +250,7 @@ class MemoryEnd(Bus):
         return [one.pattern for one in found if meets(pattern, one.pattern)]
 
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
-        made = _Declared(self.watched, pattern, see)
+        made = _MemoryDeclared(self.watched, pattern, see)
         for end in self._others():
             for one in end.present_here:
                 if meets(made.pattern, one.pattern):
@@ -286,7 +288,7 @@ class MemoryEnd(Bus):
         return any(end.matching(end.heard, key) for end in self._others())
 
     @staticmethod
-    def matching(place: list[_Declared], key: str) -> list[_Declared]:
+    def matching(place: list[_MemoryDeclared], key: str) -> list[_MemoryDeclared]:
         """Return what of ``place`` is meant by ``key``."""
         return [one for one in place if meets(one.pattern, key)]
 
@@ -325,7 +327,7 @@ class _MemoryPublisher(Publisher):
             self._place.remove(self)
 
 
-class _MemoryQuestion(Question):
+class _MemoryQuestion(BusQuestion):
     def __init__(self, key: str, payload: bytes) -> None:
         self.key, self.payload = key, payload
         self.answers: list[tuple[str, bytes]] = []
@@ -339,7 +341,7 @@ class _MemoryQuestion(Question):
         self.done.set()
 
 
-def _call(one: _Declared, *arguments: object) -> None:
+def _call(one: _MemoryDeclared, *arguments: object) -> None:
     """Call back what is still wanted; an error in it is nobody else's."""
     if not one.closed:
         one.call(*arguments)

@@ -16,7 +16,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._errors import from_fields
 from smartcam.fleet._keys import COMMANDS
-from smartcam.fleet._wire import Message, Order, Outcome, encode, encode_order, grace
+from smartcam.fleet._wire import BusMessage, TriggerOrder, TriggerReply, encode, encode_order, grace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -245,7 +245,7 @@ class Caller:
         blobs: Sequence[bytes] = (),
         number: int | None = None,
         timeout: float | None = None,
-    ) -> Message:
+    ) -> BusMessage:
         """Have something done by the agent; return its reply.
 
         Args:
@@ -278,7 +278,7 @@ class Caller:
         blobs: Sequence[bytes] = (),
         number: int | None = None,
         timeout: float | None = None,
-    ) -> Message:
+    ) -> BusMessage:
         begun = asyncio.get_running_loop().time()
         number = number or self.program.next_call()
         fields: dict[str, Any] = {
@@ -292,7 +292,7 @@ class Caller:
             fields |= {"epoch": met.epoch, "deadline": self.clock(deadline), "timeout": timeout}
             deadline += grace(timeout)
         reply = await self._ask(do, number, encode(fields, blobs), begun, deadline, agent, met)
-        if not isinstance(reply, Message):
+        if not isinstance(reply, BusMessage):
             raise RemoteProtocolError(f"{self.name}: the agent {agent} answers {do} as a trigger")
         return reply
 
@@ -303,7 +303,7 @@ class Caller:
         expected: int | None,
         number: int,
         timeout: float,
-    ) -> Outcome:
+    ) -> TriggerReply:
         """Have the agent trigger; return its reply.
 
         Args:
@@ -322,7 +322,7 @@ class Caller:
         begun = asyncio.get_running_loop().time()
         deadline = begun + timeout
         interpretation = request.interpretation
-        order = Order(
+        order = TriggerOrder(
             number,
             met.epoch,
             self.clock(deadline),
@@ -339,7 +339,7 @@ class Caller:
         reply = await self._ask(
             "trigger", number, payload, begun, deadline + grace(timeout), met.agent, met
         )
-        if not isinstance(reply, Outcome):
+        if not isinstance(reply, TriggerReply):
             raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
         self.sample(reply.clock)
         return reply
@@ -372,7 +372,7 @@ class Caller:
             timer.cancel()
             program.forget(number)
         self.counters.frames_received += 1
-        if isinstance(reply, Outcome):
+        if isinstance(reply, TriggerReply):
             return reply
         if reply.fields.get("stranger") and self.met is met and met is not None:
             self.lose(f"the agent {met.agent} was restarted, or took this program for gone")

@@ -10,7 +10,7 @@ from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Carrier, Owner
-from smartcam.fleet._wire import Order, encode_runs
+from smartcam.fleet._wire import TriggerOrder, encode_runs
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -23,7 +23,7 @@ MOST_FILLED = 1 << 20
 """Bytes of results, or states, that one reply brings."""
 
 
-class Call(NamedTuple):
+class ProgramCall(NamedTuple):
     """A call under way.
 
     Attributes:
@@ -44,7 +44,7 @@ class Call(NamedTuple):
     blobs: list[bytes]
     timeout: float
     entered: dict[tuple[str, int], Any]
-    order: Order | None = None
+    order: TriggerOrder | None = None
 
     def argument(self, name: str, *kinds: type) -> Any:
         """Return an argument; None where it is not said.
@@ -70,7 +70,7 @@ class Call(NamedTuple):
 _PLAIN = Carrier()
 
 
-async def _trigger(call: Call) -> Answer:
+async def _trigger(call: ProgramCall) -> Answer:
     order = call.order
     layouts = None
     if order is not None:
@@ -113,24 +113,24 @@ async def outcomes(
     return runs
 
 
-async def _switch_application(call: Call) -> Answer:
+async def _switch_application(call: ProgramCall) -> Answer:
     camera = call.host.require()
     await camera.switch_application(call.wanted("application", int, str), timeout=call.timeout)
     return {"application": camera.active_application}, []
 
 
-async def _ensure(call: Call) -> Answer:
+async def _ensure(call: ProgramCall) -> Answer:
     await call.host.require().ensure(call.wanted("application", int), call.timeout)
     return NOTHING
 
 
-async def _enter(call: Call) -> Answer:
+async def _enter(call: ProgramCall) -> Answer:
     before = await call.host.require().enter(call.wanted("application", int), call.timeout)
     call.entered[call.host.name, call.owner.call] = (call.host.camera, before)
     return {"before": before.application, "wanted": before.wanted.application}, []
 
 
-async def _leave(call: Call) -> Answer:
+async def _leave(call: ProgramCall) -> Answer:
     found = call.entered.pop((call.host.name, call.wanted("entered", int)), None)
     if found is not None:
         camera, before = found
@@ -141,41 +141,41 @@ async def _leave(call: Call) -> Answer:
     return NOTHING
 
 
-async def _start(call: Call) -> Answer:
+async def _start(call: ProgramCall) -> Answer:
     await call.host.require().start(timeout=call.timeout)
     return NOTHING
 
 
-async def _stop(call: Call) -> Answer:
+async def _stop(call: ProgramCall) -> Answer:
     await call.host.require().stop(timeout=call.timeout)
     return NOTHING
 
 
-async def _query_application(call: Call) -> Answer:
+async def _query_application(call: ProgramCall) -> Answer:
     return {"application": await call.host.require().query_application(timeout=call.timeout)}, []
 
 
-async def _query_status(call: Call) -> Answer:
+async def _query_status(call: ProgramCall) -> Answer:
     return {"status": int(await call.host.require().query_status(timeout=call.timeout))}, []
 
 
-async def _wait_ready(call: Call) -> Answer:
+async def _wait_ready(call: ProgramCall) -> Answer:
     return {"status": int(await call.host.require().wait_ready(timeout=call.timeout))}, []
 
 
-async def _reset_errors(call: Call) -> Answer:
+async def _reset_errors(call: ProgramCall) -> Answer:
     return {"status": int(await call.host.require().reset_errors(timeout=call.timeout))}, []
 
 
-async def _read_image(call: Call) -> Answer:
+async def _read_image(call: ProgramCall) -> Answer:
     return {}, [await call.host.require().read_image(timeout=call.timeout)]
 
 
-async def _get_clock(call: Call) -> Answer:
+async def _get_clock(call: ProgramCall) -> Answer:
     return {"clock": (await call.host.require().get_clock(timeout=call.timeout)).isoformat()}, []
 
 
-async def _set_clock(call: Call) -> Answer:
+async def _set_clock(call: ProgramCall) -> Answer:
     text = call.wanted("when", str)
     try:
         when = datetime.fromisoformat(text)
@@ -185,22 +185,22 @@ async def _set_clock(call: Call) -> Answer:
     return NOTHING
 
 
-async def _set_input(call: Call) -> Answer:
+async def _set_input(call: ProgramCall) -> Answer:
     await call.host.require().set_input(call.blobs[0] if call.blobs else b"")
     return NOTHING
 
 
-async def _set_sequence_number(call: Call) -> Answer:
+async def _set_sequence_number(call: ProgramCall) -> Answer:
     await call.host.require().set_sequence_number(call.wanted("number", int))
     return NOTHING
 
 
-async def _reboot(call: Call) -> Answer:
+async def _reboot(call: ProgramCall) -> Answer:
     await call.host.require().reboot()
     return NOTHING
 
 
-async def _request(call: Call) -> Answer:
+async def _request(call: ProgramCall) -> Answer:
     answer = await call.host.require().request(
         call.wanted("message_id", int, str),
         call.blobs[0] if call.blobs else b"",
@@ -210,27 +210,27 @@ async def _request(call: Call) -> Answer:
     return {}, [] if answer is None else [answer]
 
 
-async def _refresh(call: Call) -> Answer:
+async def _refresh(call: ProgramCall) -> Answer:
     return {"asked": await call.host.require().refresh(call.timeout)}, []
 
 
-async def _wait_connected(call: Call) -> Answer:
+async def _wait_connected(call: ProgramCall) -> Answer:
     await call.host.require().wait_connected(call.timeout)
     return NOTHING
 
 
-async def _reserve(call: Call) -> Answer:
+async def _reserve(call: ProgramCall) -> Answer:
     reservation = (call.program, call.owner.call)
     await call.host.reserve(call.program, reservation, call.timeout)
     return NOTHING
 
 
-async def _release(call: Call) -> Answer:
+async def _release(call: ProgramCall) -> Answer:
     call.host.gate.release((call.program, call.wanted("reservation", int)))
     return NOTHING
 
 
-async def _hello(call: Call) -> Answer:
+async def _hello(call: ProgramCall) -> Answer:
     host = call.host
     return {
         **host.about(),
@@ -241,26 +241,26 @@ async def _hello(call: Call) -> Answer:
     }, []
 
 
-async def _find(call: Call) -> Answer:
+async def _find(call: ProgramCall) -> Answer:
     """Say which result came first since a time of the agent's clock."""
     results = call.host.results
     since = float(call.wanted("since", int, float))
     return {"first": results.first_since(since), "following": results.following}, []
 
 
-async def _results(call: Call) -> Answer:
+async def _results(call: ProgramCall) -> Answer:
     part = call.host.results.part(call.wanted("first", int), MOST_FILLED)
     return {"first": part.first, "following": part.following}, [
         encode_runs(0, part.following, part.data)
     ]
 
 
-async def _states(call: Call) -> Answer:
+async def _states(call: ProgramCall) -> Answer:
     part = call.host.states.part(call.wanted("first", int), MOST_FILLED)
     return {"first": part.first, "following": part.following}, part.data
 
 
-ACTIONS: dict[str, Callable[[Call], Awaitable[Answer]]] = {
+ACTIONS: dict[str, Callable[[ProgramCall], Awaitable[Answer]]] = {
     "hello": _hello,
     "find": _find,
     "results": _results,

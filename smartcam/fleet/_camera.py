@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
     from smartcam.fleet._program import Program
-    from smartcam.fleet._wire import Message
+    from smartcam.fleet._wire import BusMessage
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
@@ -497,7 +497,7 @@ class FleetCamera(Camera[ValueT]):
         blobs: Sequence[bytes] = (),
         call: int | None = None,
         **arguments: Any,
-    ) -> Message:
+    ) -> BusMessage:
         """Have the agent do something; what it said before its reply is taken first."""
         limit = self.settings.request_timeout if timeout is None else timeout
         deadline = self._deadline(limit)

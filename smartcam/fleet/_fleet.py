@@ -84,7 +84,7 @@ class CameraLeft(FleetEvent):
     camera: str
 
 
-class _Bell(asyncio.Event):
+class _QueueBell(asyncio.Event):
     """Calls somebody where a queue has something, or ends."""
 
     def __init__(self, ring: Callable[[], None]) -> None:
@@ -123,7 +123,7 @@ class FleetResults(Generic[ValueT]):
             return
         stream = self._subscribe(camera)
         known.append(stream)
-        stream.share(_Bell(functools.partial(self._queue, stream)))
+        stream.share(_QueueBell(functools.partial(self._queue, stream)))
 
     def _queue(self, stream: Subscription[Result[ValueT]]) -> None:
         if stream not in self._in_line:

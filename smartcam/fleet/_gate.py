@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False, slots=True)
-class _Waiting:
+class _InLine:
     program: str
     reservation: Hashable | None  # None: a command
     granted: asyncio.Future[None]
@@ -29,7 +29,7 @@ class Gate:
     holder: str | None = None
     _reservations: set[Hashable] = field(default_factory=set["Hashable"])
     _active: collections.Counter[str] = field(default_factory=collections.Counter[str])
-    _line: collections.deque[_Waiting] = field(default_factory=collections.deque["_Waiting"])
+    _line: collections.deque[_InLine] = field(default_factory=collections.deque["_InLine"])
 
     async def enter(self, program: str, timeout: float) -> None:
         """Let a command of ``program`` begin; it ends with :meth:`leave`.
@@ -82,7 +82,7 @@ class Gate:
             self._grant()
 
     async def _pass(self, program: str, reservation: Hashable | None, timeout: float) -> None:
-        waiting = _Waiting(program, reservation, asyncio.get_running_loop().create_future())
+        waiting = _InLine(program, reservation, asyncio.get_running_loop().create_future())
         if not self._line or self.holder == program:
             self._line.appendleft(waiting)
         else:
@@ -114,7 +114,7 @@ class Gate:
             if not waiting.granted.done():
                 waiting.granted.set_result(None)
 
-    def _may(self, waiting: _Waiting) -> bool:
+    def _may(self, waiting: _InLine) -> bool:
         if self.holder not in {None, waiting.program}:
             return False
         others = self._active.total() - self._active[waiting.program]

@@ -12,13 +12,13 @@ from smartcam._client.interpretation import Interpretation
 from smartcam.exceptions import ConnectionLostError, SmartCamError
 from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._gate import Gate
-from smartcam.fleet._log import Log
+from smartcam.fleet._log import AgentLog
 from smartcam.fleet._shared import SharedCamera, Tap
 from smartcam.fleet._topics import CameraTopics
 from smartcam.fleet._wire import (
     CURRENT,
     LATE,
-    Run,
+    ResultRun,
     encode,
     encode_runs,
     encode_state,
@@ -94,8 +94,8 @@ class Host:
         self.name = name
         self.settings = settings
         self.gate = Gate()
-        self.results = Log(*history)
-        self.states = Log(MOST_STATES, MOST_STATE_BYTES)
+        self.results = AgentLog(*history)
+        self.states = AgentLog(MOST_STATES, MOST_STATE_BYTES)
         self.outcomes: dict[Owner, list[bytes]] = {}
         self.failure: SmartCamError | None = None
         self._epoch, self._tell = epoch, on_event
@@ -322,7 +322,7 @@ class Host:
         flags = (CURRENT if current else 0) | (LATE if late else 0)
         cells = first.value.cells
         clock = asyncio.get_running_loop().time()
-        run = Run(
+        run = ResultRun(
             self.results.following,
             first.application,
             self._camera.endian,

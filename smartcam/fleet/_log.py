@@ -1,8 +1,8 @@
 """Numbered things of one camera: kept by its agent, and put in order by who hears of them.
 
-An agent numbers what it says without gaps and keeps the last of it (:class:`Log`). Who hears it
-(:class:`Feed`) takes each number once and in order: what came twice is dropped, and what is missing
-is asked for. What the agent no longer has was missed, and how many that were is known.
+An agent numbers what it says without gaps and keeps the last of it (:class:`AgentLog`). Who hears
+it (:class:`Feed`) takes each number once and in order: what came twice is dropped, and what is
+missing is asked for. What the agent no longer has was missed, and how many that were is known.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class Numbered(Protocol):
         ...
 
 
-class _Entry(NamedTuple):
+class _Kept(NamedTuple):
     number: int
     next: int
     clock: float
     data: bytes
 
 
-class Part(NamedTuple):
+class LogPart(NamedTuple):
     """A part of a log.
 
     Attributes:
@@ -60,7 +60,7 @@ class Part(NamedTuple):
     following: int
 
 
-class Log:
+class AgentLog:
     """The last things that an agent said of one camera, as bytes; bounded.
 
     Args:
@@ -74,7 +74,7 @@ class Log:
     def __init__(self, most: int, most_bytes: int) -> None:
         self.following: int = 1
         self._most, self._most_bytes = most, most_bytes
-        self._entries: collections.deque[_Entry] = collections.deque()
+        self._entries: collections.deque[_Kept] = collections.deque()
         self._bytes = 0
 
     @property
@@ -86,14 +86,14 @@ class Log:
         """Keep ``count`` things with the next numbers, which ``data`` has in it."""
         entries, number = self._entries, self.following
         self.following = number + count
-        entries.append(_Entry(number, self.following, clock, data))
+        entries.append(_Kept(number, self.following, clock, data))
         self._bytes += len(data)
         while len(entries) > 1 and (
             self._bytes > self._most_bytes or self.following - entries[0].next >= self._most
         ):
             self._bytes -= len(entries.popleft().data)
 
-    def part(self, first: int, most_bytes: int) -> Part:
+    def part(self, first: int, most_bytes: int) -> LogPart:
         """Return what is kept from ``first`` on; as much as ``most_bytes`` hold, and one at least.
 
         An entry that has ``first`` in it comes whole.
@@ -107,7 +107,7 @@ class Log:
             if found and most_bytes < 0:
                 break
             found.append(entry.data)
-        return Part(begin, found, self.following)
+        return LogPart(begin, found, self.following)
 
     def first_since(self, clock: float) -> int:
         """Return the number of the first one that came at ``clock`` or later."""

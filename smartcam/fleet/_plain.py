@@ -33,7 +33,7 @@ from smartcam.settings import validated
 
 if TYPE_CHECKING:
     from smartcam.fleet._agent import Agent
-    from smartcam.fleet._bus import Bus, Handle, Question
+    from smartcam.fleet._bus import Bus, BusQuestion, Handle
     from smartcam.fleet._host import Host
     from smartcam.fleet._keys import Keys
 
@@ -113,7 +113,7 @@ class _PlainCall:
     """
 
     what: object
-    waiting: list[Question] = field(default_factory=list["Question"])
+    waiting: list[BusQuestion] = field(default_factory=list["BusQuestion"])
     answer: bytes | None = None
 
 
@@ -161,14 +161,14 @@ class Plain:
 
     # ------------------------------------------------------------------ questions
 
-    def _on_listing(self, question: Question) -> None:
+    def _on_listing(self, question: BusQuestion) -> None:
         for name, host in self._agent.hosts.items():
             key = self._keys.listing(name)
             if meets(question.key, key):
                 question.reply(key, as_json(host.topics.listing()))
         question.close()
 
-    def _on_service(self, question: Question) -> None:
+    def _on_service(self, question: BusQuestion) -> None:
         if "*" in question.key:
             self._refuse_pattern(question)
             return
@@ -183,7 +183,7 @@ class Plain:
             )
         self._take(question, _Order(camera, name, service, fields, error))
 
-    def _on_thesis(self, question: Question) -> None:
+    def _on_thesis(self, question: BusQuestion) -> None:
         if "*" in question.key:
             self._refuse_pattern(question)
             return
@@ -205,7 +205,7 @@ class Plain:
             return
         self._take(question, _Order(str(camera), name, service, fields, error))
 
-    def _refuse_pattern(self, question: Question) -> None:
+    def _refuse_pattern(self, question: BusQuestion) -> None:
         """A command for whoever it may concern is none."""
         error = ConfigurationError(
             f"{question.key!r:.200}: expected a key with exactly one camera and one service in it, "
@@ -213,7 +213,7 @@ class Plain:
         )
         _say(question, failure(error))
 
-    def _take(self, question: Question, order: _Order) -> None:
+    def _take(self, question: BusQuestion, order: _Order) -> None:
         if order.camera in self._agent.hosts:
             self._begin(question, order)
             return
@@ -226,7 +226,7 @@ class Plain:
             return
         self._start(self._for_stranger(question, order), order)
 
-    def _is_full(self, question: Question, order: _Order) -> bool:
+    def _is_full(self, question: BusQuestion, order: _Order) -> bool:
         """Refuse what is too much for one camera, or for all together that are not here."""
         full = self._under_way[self._place(order)] >= MOST_CALLS
         if full:
@@ -252,7 +252,7 @@ class Plain:
 
     # ------------------------------------------------------------------ other cameras
 
-    async def _for_stranger(self, question: Question, order: _Order) -> None:
+    async def _for_stranger(self, question: BusQuestion, order: _Order) -> None:
         """Answer for a camera that is not here; if nobody has it, one agent does so."""
         try:
             speaks = await self._speaks_for_all(order.camera)
@@ -282,7 +282,7 @@ class Plain:
 
     # ------------------------------------------------------------------ calls
 
-    def _begin(self, question: Question, order: _Order) -> None:
+    def _begin(self, question: BusQuestion, order: _Order) -> None:
         """Have a call done, unless it is one that was done before or is under way."""
         try:
             request = order.request()
@@ -450,6 +450,6 @@ def _no_number(text: str) -> float:
     raise ValueError(f"{text} is no number of JSON's")
 
 
-def _say(question: Question, answer: dict[str, Any]) -> None:
+def _say(question: BusQuestion, answer: dict[str, Any]) -> None:
     question.reply(question.key, as_json(answer))
     question.close()

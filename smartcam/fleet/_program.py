@@ -19,7 +19,7 @@ from smartcam.exceptions import (
     ProtocolError,
 )
 from smartcam.fleet._keys import Keys
-from smartcam.fleet._wire import Message, Outcome, decode, decode_outcome, encode
+from smartcam.fleet._wire import BusMessage, TriggerReply, decode, decode_outcome, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ LAST_LOOK = 1.0
 """Seconds that a look may take at what is there instead."""
 
 
-Reply = Message | Outcome
+Reply = BusMessage | TriggerReply
 
 
 class Pending(NamedTuple):

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from smartcam._client.interpretation import Interpretation, Interpreted
-    from smartcam.fleet._wire import Run
+    from smartcam.fleet._wire import ResultRun
 
 
-def singles(run: Run) -> Iterator[Run]:
+def singles(run: ResultRun) -> Iterator[ResultRun]:
     """Give each container of a run as a run of its own."""
     for place in range(len(run.payloads)):
         yield run._replace(number=run.number + place, payloads=run.payloads[place : place + 1])
 
 
-def interpreted(run: Run, interpretation: Interpretation, camera: str) -> Interpreted:
+def interpreted(run: ResultRun, interpretation: Interpretation, camera: str) -> Interpreted:
     """Return what the one container of ``run`` holds.
 
     Raises:
@@ -42,7 +42,7 @@ def interpreted(run: Run, interpretation: Interpretation, camera: str) -> Interp
     )
 
 
-def as_result(run: Run, camera: str, value: Any, sequence: int | None) -> Result[Any]:
+def as_result(run: ResultRun, camera: str, value: Any, sequence: int | None) -> Result[Any]:
     """Return the one container of ``run`` as a result with this value."""
     latency = None if math.isnan(run.latency) else run.latency
     return Result(
@@ -58,7 +58,9 @@ def as_result(run: Run, camera: str, value: Any, sequence: int | None) -> Result
     )
 
 
-def result_fields(run: Run, interpretation: Interpretation | None, camera: str) -> dict[str, Any]:
+def result_fields(
+    run: ResultRun, interpretation: Interpretation | None, camera: str
+) -> dict[str, Any]:
     """Return the one container of ``run`` as JSON, with ``error`` where it cannot be read.
 
     The value is None then, and without an interpretation.

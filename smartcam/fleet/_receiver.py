@@ -18,7 +18,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._log import Feed
 from smartcam.fleet._reading import as_result, interpreted, singles
-from smartcam.fleet._wire import CURRENT, LATE, Run, decode, decode_runs, decode_state
+from smartcam.fleet._wire import CURRENT, LATE, ResultRun, decode, decode_runs, decode_state
 from smartcam.models import Result
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from smartcam._client.interpretation import Interpretation
     from smartcam.fleet._bus import Handle
     from smartcam.fleet._caller import Caller, Met
-    from smartcam.fleet._wire import Batch, Message, Outcome
+    from smartcam.fleet._wire import Batch, BusMessage, TriggerReply
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
@@ -36,7 +36,7 @@ FILL_TIMEOUT = 5.0
 """Seconds for the answer to what is asked for because it was missing; then it is asked again."""
 
 
-class State(NamedTuple):
+class ToldState(NamedTuple):
     """Something that happened to the camera, and what it was then."""
 
     number: int
@@ -52,19 +52,19 @@ class State(NamedTuple):
         """About the bytes that it keeps."""
         return 500
 
-    def since(self, number: int) -> State:
+    def since(self, number: int) -> ToldState:
         """Return itself: it is one thing."""
         return self
 
 
-def state(data: bytes) -> State:
+def state(data: bytes) -> ToldState:
     """Return what an agent said happened.
 
     Raises:
         ValueError: it is nothing of the kind.
     """
     said = decode_state(data)
-    return State(said["number"], said)
+    return ToldState(said["number"], said)
 
 
 class FleetListeners(Listeners):
@@ -93,7 +93,7 @@ class FleetListeners(Listeners):
             taken = [one for one in taken if one not in late]
         return taken
 
-    def miss(self, count: int, then: Run | None) -> None:
+    def miss(self, count: int, then: ResultRun | None) -> None:
         """Tell the streams of results that some cannot come any more, which came before ``then``.
 
         One that subscribed in between cannot know how many it has missed: it counts all.
@@ -147,8 +147,10 @@ class Receiver:
         self._listeners, self._counters = listeners, counters
         self._interpretation, self._on_state, self._expected = interpretation, on_state, expected
         self._program = 0  # as the agent numbers this one
-        self._states: Feed[State] = Feed(self._take_state, _ignore, lambda: self._lack("states"))
-        self._results: Feed[Run] = Feed(
+        self._states: Feed[ToldState] = Feed(
+            self._take_state, _ignore, lambda: self._lack("states")
+        )
+        self._results: Feed[ResultRun] = Feed(
             self._take_run, listeners.miss, lambda: self._lack("results")
         )
         self._handles: dict[str, Handle] = {}
@@ -326,7 +328,7 @@ class Receiver:
         self._states.receive(epoch, following, states)
         self._wake()
 
-    def take_told(self, reply: Outcome) -> None:
+    def take_told(self, reply: TriggerReply) -> None:
         """Take the states in a reply, which are not said to all yet."""
         if not reply.told:
             return
@@ -364,7 +366,7 @@ class Receiver:
         counters.frames_received += 1
         counters.bytes_received += len(payload)
 
-    def _take_state(self, taken: State) -> None:
+    def _take_state(self, taken: ToldState) -> None:
         self._on_state(taken.said)
 
     # ------------------------------------------------------------------ results
@@ -383,7 +385,7 @@ class Receiver:
                 raise one
         return [one for one in found if not isinstance(one, InterpretationError)]
 
-    def _outcome(self, own: Own, run: Run) -> Result | InterpretationError:
+    def _outcome(self, own: Own, run: ResultRun) -> Result | InterpretationError:
         """Return a trigger's result; made and counted once, whichever way it comes first."""
         known = own.outcomes.get(run.number)
         if known is not None:
@@ -404,7 +406,7 @@ class Receiver:
         own.outcomes[run.number] = outcome
         return outcome
 
-    def _take_run(self, run: Run) -> None:
+    def _take_run(self, run: ResultRun) -> None:
         """Hand containers that came together to who listens, and has listened since before."""
         listeners = self._listeners
         listeners.results.horizon = run.clock
@@ -434,7 +436,7 @@ class Receiver:
             listeners.results.horizon = math.inf
 
     def _offer(
-        self, run: Run, outcome: Result | InterpretationError, now: float, *, owned: bool
+        self, run: ResultRun, outcome: Result | InterpretationError, now: float, *, owned: bool
     ) -> None:
         current, listeners = bool(run.flags & CURRENT), self._listeners
         if isinstance(outcome, InterpretationError):
@@ -443,7 +445,7 @@ class Receiver:
         else:
             listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 
-    def _take_burst(self, run: Run, now: float) -> bool:
+    def _take_burst(self, run: ResultRun, now: float) -> bool:
         """Hand on containers that are only streamed, all at once; False where that cannot be."""
         if run.cells or not run.flags & CURRENT:
             return False
@@ -471,13 +473,13 @@ class Receiver:
         self._listeners.offer_burst(results, now, run.size)
         return True
 
-    def _interpret(self, run: Run, interpretation: Interpretation) -> Result:
+    def _interpret(self, run: ResultRun, interpretation: Interpretation) -> Result:
         value, sequence, empty_slots = interpreted(run, interpretation, self._name)
         if empty_slots:
             self._counters.skip(empty_slots)
         return as_result(run, self._name, value, sequence)
 
-    def _wrong_application(self, run: Run, expected: int) -> WrongApplicationError:
+    def _wrong_application(self, run: ResultRun, expected: int) -> WrongApplicationError:
         return WrongApplicationError(
             f"{self._name}: a result of application {run.application} came, "
             f"application {expected} was expected",
@@ -486,11 +488,11 @@ class Receiver:
         )
 
 
-def _things(kind: str, reply: Message) -> list[Any]:
+def _things(kind: str, reply: BusMessage) -> list[Any]:
     if kind == "states":
         return [state(one) for one in reply.blobs]
     return decode_runs(reply.blobs[0], "results that were asked for").runs
 
 
-def _ignore(_count: int, _then: State | None) -> None:
+def _ignore(_count: int, _then: ToldState | None) -> None:
     """States that are missed for ever: what the camera is now, the next one says."""

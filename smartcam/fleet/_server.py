@@ -13,7 +13,7 @@ from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._keys import Keys
-from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
 from smartcam.models import CameraEvent
 from smartcam.streams import Subscribers, Subscription
 
@@ -50,7 +50,7 @@ class FleetServer(Server):
             raise ConfigurationError(f"fleet {self.file.fleet}: {exc}") from exc
         listen, connect = self.file.endpoints
         self._listen, self._connect = listen, connect = with_ports(listen), connect
-        self._bus = bus or ZenohEnd(Link(listen, connect, self.file.certificates))
+        self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates))
         self._agent: Agent | None = None
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 from smartcam._client.triggering import TriggerRequest
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import UnsupportedError
-from smartcam.fleet._calls import ACTIONS, MOST_FILLED, Call, outcomes
+from smartcam.fleet._calls import ACTIONS, MOST_FILLED, ProgramCall, outcomes
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._reading import result_fields, singles
 from smartcam.fleet._shared import Carrier
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._host import Host
     from smartcam.fleet._shared import Owner
     from smartcam.fleet._topics import CameraTopics
-    from smartcam.fleet._wire import Run
+    from smartcam.fleet._wire import ResultRun
 
 DEFAULT_TIMEOUT = 10.0
 MOST_TIMEOUT = 600.0
@@ -153,7 +153,7 @@ async def triggered(
     data: bytes | None = None,
     wanted: int = 1,
     wait: bool = True,
-) -> list[Run]:
+) -> list[ResultRun]:
     """Trigger; return its containers, each a run of its own.
 
     Raises:
@@ -199,7 +199,7 @@ def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
     async def service(work: Work) -> dict[str, Any]:
         arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
         blobs = [bytes.fromhex(arguments.pop(one)) for one in ("input",) if one in arguments]
-        call = Call(work.host, "", work.owner, arguments, blobs, work.timeout, {})
+        call = ProgramCall(work.host, "", work.owner, arguments, blobs, work.timeout, {})
         fields, found = await ACTIONS[do](call)
         if "status" in fields:
             fields["status_names"] = Status(fields["status"]).names

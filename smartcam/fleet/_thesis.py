@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from smartcam._client.interpretation import Interpretation, without_poses
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConfigurationError, InterpretationError
-from smartcam.fleet._calls import ACTIONS, Call
+from smartcam.fleet._calls import ACTIONS, ProgramCall
 from smartcam.fleet._reading import interpreted
 from smartcam.fleet._services import (
     MOST_TIMEOUT,
@@ -170,7 +170,7 @@ async def _stop(work: Work) -> dict[str, Any]:
 async def _change_application(work: Work) -> dict[str, Any]:
     arguments = {"application": work.request.application_id}
     await ACTIONS["switch_application"](
-        Call(work.host, "", work.owner, arguments, [], work.timeout, {})
+        ProgramCall(work.host, "", work.owner, arguments, [], work.timeout, {})
     )
     return {}
 

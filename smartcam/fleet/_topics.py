@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus, Handle, Publisher
     from smartcam.fleet._host import Host
     from smartcam.fleet._keys import Keys
-    from smartcam.fleet._wire import Run
+    from smartcam.fleet._wire import ResultRun
     from smartcam.models import CameraEvent
 
 MOST_QUEUED_BYTES = 1 << 24
@@ -96,11 +96,11 @@ class Publication:
     publisher: Publisher
     min_delay: float
     queue_size: int
-    _queue: collections.deque[Run] = field(default_factory=collections.deque["Run"])
+    _queue: collections.deque[ResultRun] = field(default_factory=collections.deque["ResultRun"])
     _bytes: int = 0
     _timer: asyncio.TimerHandle | None = None
 
-    def offer(self, runs: Iterable[Run], topics: CameraTopics) -> None:
+    def offer(self, runs: Iterable[ResultRun], topics: CameraTopics) -> None:
         """Have results said, each a run of its own."""
         if not self.publisher.heard:
             return
@@ -214,7 +214,7 @@ class CameraTopics:
 
     # ------------------------------------------------------------------ as JSON
 
-    def result(self, run: Run) -> dict[str, Any]:
+    def result(self, run: ResultRun) -> dict[str, Any]:
         """Return a result; ``run`` has one container."""
         fields = result_fields(run, self.interpretation, self._host.name)
         return {**self._topics.who, **fields}
@@ -260,7 +260,7 @@ class CameraTopics:
 
     # ------------------------------------------------------------------ what comes
 
-    def on_run(self, run: Run) -> None:
+    def on_run(self, run: ResultRun) -> None:
         """Containers came."""
         out = self._topics.heard("results", self._host.name)
         if out is not None:

@@ -2,9 +2,9 @@
 
 A message is a JSON object with byte strings behind it: calls, replies, what the camera is. Results
 go as runs: containers of one camera that came together, with consecutive numbers. What each trigger
-needs goes as a few numbers instead of JSON, which costs most of all: its call (:class:`Order`), its
-reply (:class:`Outcome`), and the statuses meanwhile. Everything is little endian. ``docs/bus.md``
-has the layouts.
+needs goes as a few numbers instead of JSON, which costs most of all: its call
+(:class:`TriggerOrder`), its reply (:class:`TriggerReply`), and the statuses meanwhile. Everything
+is little endian. ``docs/bus.md`` has the layouts.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def grace(timeout: float) -> float:
     return min(0.25, 0.02 + 0.1 * timeout)
 
 
-class Message(NamedTuple):
+class BusMessage(NamedTuple):
     """A JSON object, and the byte strings that came behind it."""
 
     fields: dict[str, Any]
@@ -92,7 +92,7 @@ def encode(fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> bytes:
     return b"".join((_LENGTH.pack(len(head)), head, *blobs))
 
 
-def decode(payload: bytes, what: str) -> Message:
+def decode(payload: bytes, what: str) -> BusMessage:
     """Return the message in ``payload``.
 
     Raises:
@@ -117,7 +117,7 @@ def decode(payload: bytes, what: str) -> Message:
             raise ValueError(f"{len(payload) - end} bytes are left over")
     except (ValueError, TypeError, struct.error, RecursionError) as exc:
         raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    return Message(known, blobs)
+    return BusMessage(known, blobs)
 
 
 # ---------------------------------------------------------------------- results
@@ -132,7 +132,7 @@ _NO_NUMBER = math.nan
 _NEVER = 253_402_300_800.0  # the year 10,000, which no datetime has
 
 
-class Run(NamedTuple):
+class ResultRun(NamedTuple):
     """Containers of one application that came together.
 
     Attributes:
@@ -185,7 +185,7 @@ class Run(NamedTuple):
         at = self.triggered_at
         return None if math.isnan(at) else datetime.fromtimestamp(at, UTC)
 
-    def since(self, number: int) -> Run:
+    def since(self, number: int) -> ResultRun:
         """Return what of it has ``number`` or a later one."""
         if number <= self.number:
             return self
@@ -223,7 +223,7 @@ class Batch(NamedTuple):
 
     epoch: int
     following: int
-    runs: list[Run]
+    runs: list[ResultRun]
 
 
 def decode_runs(payload: bytes, what: str) -> Batch:
@@ -236,7 +236,7 @@ def decode_runs(payload: bytes, what: str) -> Batch:
         magic, epoch, following, count = _BATCH.unpack_from(payload)
         if magic != _MAGIC:
             raise ValueError(f"it begins with {magic!r}, not {_MAGIC!r}")
-        runs: list[Run] = []
+        runs: list[ResultRun] = []
         place = _BATCH.size
         for _ in range(count):
             run, place = _decode_run(payload, place)
@@ -248,7 +248,7 @@ def decode_runs(payload: bytes, what: str) -> Batch:
     return Batch(epoch, following, runs)
 
 
-def _decode_run(payload: bytes, place: int) -> tuple[Run, int]:
+def _decode_run(payload: bytes, place: int) -> tuple[ResultRun, int]:
     number, count, application, endian, flags, owner, call, clock, at, trigger, latency, cells = (
         _RUN.unpack_from(payload, place)
     )
@@ -265,7 +265,7 @@ def _decode_run(payload: bytes, place: int) -> tuple[Run, int]:
         payloads.append(payload[place : place + length])
         place += length
     end = place + cells
-    run = Run(
+    run = ResultRun(
         number,
         application,
         endian,
@@ -291,7 +291,7 @@ _OUTCOME = struct.Struct("<4sQQdQI")
 _IS_OUTCOME = b"sco1"
 
 
-class Order(NamedTuple):
+class TriggerOrder(NamedTuple):
     """A call for a trigger.
 
     Attributes:
@@ -321,7 +321,7 @@ class Order(NamedTuple):
     layouts: Any = None
 
 
-def encode_order(program: str, order: Order) -> bytes:
+def encode_order(program: str, order: TriggerOrder) -> bytes:
     """Return a call of ``program`` as bytes; as a message where it has more than numbers in it."""
     number, epoch, deadline, timeout, application, expected, results, wait, each, data, layouts = (
         order
@@ -365,7 +365,7 @@ def encode_order(program: str, order: Order) -> bytes:
     return encode(fields, () if data is None else (data,))
 
 
-def decode_order(payload: bytes, what: str) -> tuple[str, Order] | None:
+def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
     """Return the program and its call in ``payload``; None where that is a message.
 
     Raises:
@@ -383,7 +383,7 @@ def decode_order(payload: bytes, what: str) -> tuple[str, Order] | None:
         program = str(payload[_ORDER.size : end], "utf-8")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    return program, Order(
+    return program, TriggerOrder(
         number,
         epoch,
         deadline,
@@ -397,7 +397,7 @@ def decode_order(payload: bytes, what: str) -> tuple[str, Order] | None:
     )
 
 
-class Outcome(NamedTuple):
+class TriggerReply(NamedTuple):
     """The reply to a trigger that has succeeded.
 
     Attributes:
@@ -427,7 +427,7 @@ def encode_outcome(
     return b"".join((head, lengths, *told, runs))
 
 
-def decode_outcome(payload: bytes, what: str) -> Outcome | None:
+def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
     """Return the reply to a trigger in ``payload``; None where that is a message.
 
     Raises:
@@ -448,7 +448,7 @@ def decode_outcome(payload: bytes, what: str) -> Outcome | None:
             raise ValueError(f"{place} bytes were announced, {len(payload)} came")
     except (ValueError, struct.error) as exc:
         raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    return Outcome(call, epoch, clock, states, told, decode_runs(payload[place:], what))
+    return TriggerReply(call, epoch, clock, states, told, decode_runs(payload[place:], what))
 
 
 def timestamp(at: datetime | None) -> float:
@@ -456,6 +456,6 @@ def timestamp(at: datetime | None) -> float:
     return _NO_NUMBER if at is None else at.timestamp()
 
 
-def joined(runs: Iterable[Run]) -> list[bytes]:
+def joined(runs: Iterable[ResultRun]) -> list[bytes]:
     """Return runs as bytes."""
     return [run.encode() for run in runs]

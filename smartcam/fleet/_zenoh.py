@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import ConfigurationError, ConnectFailedError, MissingExtraError
-from smartcam.fleet._bus import Bus, Handle, Publisher, Question
+from smartcam.fleet._bus import Bus, BusQuestion, Handle, Publisher
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -75,7 +75,7 @@ _ONE = (1).to_bytes(8, sys.byteorder)
 
 
 @dataclass(frozen=True)
-class Link:
+class BusLink:
     """How an end comes to the bus.
 
     Attributes:
@@ -197,16 +197,16 @@ class ZenohEnd(Bus):
         more: further settings of the engine, by their paths.
     """
 
-    def __init__(self, link: Link, more: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, link: BusLink, more: Mapping[str, Any] | None = None) -> None:
         self._link, self._more = link, dict(more or {})
         self._zenoh = _engine()
         self._session: Any = None
-        self._declared: set[_Declared] = set()
+        self._declared: set[_ZenohDeclared] = set()
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._bytes = 0
         self._woken = False
-        self._bell: _Bell | None = None
+        self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
         self._told_dropped = False
         self._sender: ThreadPoolExecutor | None = None
@@ -250,7 +250,7 @@ class ZenohEnd(Bus):
             opening.add_done_callback(_close_late)
             raise
         self._end_lingering()
-        self._bell = _Bell.on(loop, self._drain)
+        self._bell = _LoopBell.on(loop, self._drain)
         return self
 
     def _end_lingering(self) -> None:
@@ -403,7 +403,7 @@ class ZenohEnd(Bus):
     def publisher(
         self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
     ) -> Publisher:
-        return _Publisher(self, key, on_heard, urgent=urgent)
+        return _ZenohPublisher(self, key, on_heard, urgent=urgent)
 
     def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
         in_loop, full = self._in_loop, self._full
@@ -416,14 +416,14 @@ class ZenohEnd(Bus):
                 said = key or str(sample.key_expr)
                 in_loop(declared.call, len(payload), hear, said, payload)
 
-        declared = _Declared(self)
+        declared = _ZenohDeclared(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, _direct(on_sample)))
 
-    def answer(self, pattern: str, answer: Callable[[Question], None]) -> Handle:
+    def answer(self, pattern: str, answer: Callable[[BusQuestion], None]) -> Handle:
         def on_query(query: Any) -> None:
-            self._in_loop(declared.call, 0, answer, _Question(self, query))
+            self._in_loop(declared.call, 0, answer, _ZenohQuestion(self, query))
 
-        declared = _Declared(self)
+        declared = _ZenohDeclared(self)
         return declared.of(
             lambda session: session.declare_queryable(pattern, _direct(on_query), complete=False)
         )
@@ -474,7 +474,7 @@ class ZenohEnd(Bus):
     # ------------------------------------------------------------------ who is there
 
     def be_present(self, key: str) -> Handle:
-        return _Declared(self).of(lambda session: session.liveliness().declare_token(key))
+        return _ZenohDeclared(self).of(lambda session: session.liveliness().declare_token(key))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
         found = await self._answers(
@@ -488,7 +488,7 @@ class ZenohEnd(Bus):
         def on_sample(sample: Any) -> None:
             self._in_loop(declared.call, 0, see, str(sample.key_expr), sample.kind == put)
 
-        declared = _Declared(self)
+        declared = _ZenohDeclared(self)
         return declared.of(
             lambda session: session.liveliness().declare_subscriber(
                 pattern, _direct(on_sample), history=True
@@ -497,7 +497,7 @@ class ZenohEnd(Bus):
 
     # ------------------------------------------------------------------ for what is declared
 
-    def declare(self, one: _Declared, how: Callable[[Any], Any]) -> Any:
+    def declare(self, one: _ZenohDeclared, how: Callable[[Any], Any]) -> Any:
         """Declare something at the engine; it is closed with this end."""
         if self._session is None:
             raise ConfigurationError("the fleet's bus is not open")
@@ -505,7 +505,7 @@ class ZenohEnd(Bus):
         self._declared.add(one)
         return made
 
-    def forget(self, one: _Declared) -> None:
+    def forget(self, one: _ZenohDeclared) -> None:
         """It is closed."""
         self._declared.discard(one)
 
@@ -523,7 +523,7 @@ class ZenohEnd(Bus):
         self._in_loop(call, 0, *arguments)
 
 
-class _Bell:
+class _LoopBell:
     """Wakes an event loop from any thread; for less than its own ``call_soon_threadsafe``.
 
     Args:
@@ -538,7 +538,7 @@ class _Bell:
         loop.add_reader(self._file.fileno(), self._hear)
 
     @classmethod
-    def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _Bell | None:
+    def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _LoopBell | None:
         """Return a bell; None where the system or the loop has nothing for it."""
         if sys.platform != "linux":
             return None
@@ -562,7 +562,7 @@ class _Bell:
             self._file.close()
 
 
-class _Declared(Handle):
+class _ZenohDeclared(Handle):
     def __init__(self, end: ZenohEnd) -> None:
         self._end = end
         self._closed = False
@@ -584,7 +584,7 @@ class _Declared(Handle):
             _quietly(self._it.undeclare)
 
 
-class _Publisher(Publisher):
+class _ZenohPublisher(Publisher):
     def __init__(
         self, end: ZenohEnd, key: str, on_heard: Callable[[bool], None] | None, *, urgent: bool
     ) -> None:
@@ -604,7 +604,7 @@ class _Publisher(Publisher):
         def on_matching(status: Any) -> None:
             end.later(self._declared.call, self._on_heard, status.matching)
 
-        self._declared = _Declared(end)
+        self._declared = _ZenohDeclared(end)
         self._publisher: Any = None
         self._declared.of(lambda session: self._declare(declare(session), on_matching))
 
@@ -631,7 +631,7 @@ class _Publisher(Publisher):
         self._declared.close()
 
 
-class _Question(Question):
+class _ZenohQuestion(BusQuestion):
     def __init__(self, end: ZenohEnd, query: Any) -> None:
         self.key = str(query.key_expr)
         self.payload = b"" if query.payload is None else query.payload.to_bytes()

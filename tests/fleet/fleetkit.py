@@ -14,7 +14,7 @@ from smartcam.fleet._bus import Bus, MemoryBus, MemoryEnd
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._program import Program
-from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
 from smartcam.settings import Address, CameraSettings
 
 FLEET = "plant"
@@ -115,7 +115,7 @@ class Plant:
     async def start_agent(self, name: str = "agent") -> None:
         """Start an agent: the first one, or the next after one that is gone."""
         if self.places:
-            self.end = ZenohEnd(Link(listen=self.places), self._engine)
+            self.end = ZenohEnd(BusLink(listen=self.places), self._engine)
         else:
             self.end = self.bus.end()
         settings = CameraSettings.make(self.box.url, None, self.session)
@@ -136,7 +136,7 @@ class Plant:
         """Return a camera of a program of its own, to be opened; ``end`` of it is its bus'."""
         options.setdefault("interpret_as", LAYOUT)
         options.setdefault("reconnect", FAST)
-        end = ZenohEnd(Link(connect=self.places)) if self.places else self.bus.end()
+        end = ZenohEnd(BusLink(connect=self.places)) if self.places else self.bus.end()
         settings = CameraSettings.of(self.address, {"name": NAME, **options})
         return FleetCamera(settings, NAME, Program(end, FLEET, NAME))
 

@@ -11,7 +11,7 @@ from smartcam.fleet._bus import Bus, MemoryBus
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._program import Program
-from smartcam.fleet._zenoh import Link, ZenohEnd, with_ports
+from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
 from smartcam.observers import Observer
 from smartcam.settings import Address, CameraSettings
 
@@ -76,5 +76,5 @@ def connect(
         bus = MemoryBus()
         return OwnAgentCamera(url, (bus.end(), bus.end()), options, observers)
     (place,) = with_ports(["tcp/127.0.0.1:0"])
-    ends = ZenohEnd(Link(listen=(place,))), ZenohEnd(Link(connect=(place,)))
+    ends = ZenohEnd(BusLink(listen=(place,))), ZenohEnd(BusLink(connect=(place,)))
     return OwnAgentCamera(url, ends, options, observers)

@@ -17,7 +17,7 @@ import smartcam
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import Keys
-from smartcam.fleet._zenoh import Link, ZenohEnd
+from smartcam.fleet._zenoh import BusLink, ZenohEnd
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FAST, FLEET, NAME, PATIENCE
 
@@ -58,7 +58,7 @@ async def partner(*arguments: str) -> AsyncIterator[Partner]:
 
 async def _agent(place: str, url: str) -> None:
     settings = CameraSettings.make(url, None, {"reconnect": FAST, "name": NAME})
-    agent = Agent("agent", Keys(FLEET), ZenohEnd(Link(listen=(place,))), {NAME: settings})
+    agent = Agent("agent", Keys(FLEET), ZenohEnd(BusLink(listen=(place,))), {NAME: settings})
     await agent.open(PATIENCE)
     await agent.wait_tried()
     await _ready()

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from smartcam.fleet._log import Feed, Log
+from smartcam.fleet._log import AgentLog, Feed
 
 
 class Things(NamedTuple):
@@ -39,14 +39,14 @@ class Things(NamedTuple):
 # ---------------------------------------------------------------------- the log
 
 
-def kept(log: Log, first: int = 1, most_bytes: int = 1 << 20) -> list[int]:
+def kept(log: AgentLog, first: int = 1, most_bytes: int = 1 << 20) -> list[int]:
     """Return the numbers that a part of a log has."""
     part = log.part(first, most_bytes)
     things = [Things.read(one) for one in part.data]
     return [number for one in things for number in range(one.number, one.next)]
 
 
-def add(log: Log, count: int, clock: float = 0.0) -> None:
+def add(log: AgentLog, count: int, clock: float = 0.0) -> None:
     log.add(count, clock, Things(1, log.following, log.following + count).data)
 
 
@@ -58,7 +58,7 @@ def add(log: Log, count: int, clock: float = 0.0) -> None:
 def test_log_keeps_the_last_without_a_gap_and_within_its_bounds(
     counts: list[int], most: int, most_bytes: int
 ) -> None:
-    log = Log(most, most_bytes)
+    log = AgentLog(most, most_bytes)
     sizes: list[tuple[int, int]] = []  # things and bytes of each entry
     for count in counts:
         before = log.following
@@ -77,7 +77,7 @@ def test_log_keeps_the_last_without_a_gap_and_within_its_bounds(
 
 
 def test_log_of_as_many_results_as_it_may_has_them_all() -> None:
-    log = Log(10, 1 << 20)
+    log = AgentLog(10, 1 << 20)
     for _ in range(1000):
         add(log, 1)
     assert kept(log) == [*range(991, 1001)]
@@ -85,7 +85,7 @@ def test_log_of_as_many_results_as_it_may_has_them_all() -> None:
 
 @given(counts=st.lists(st.integers(1, 5), min_size=1, max_size=20), first=st.integers(-5, 120))
 def test_part_begins_where_it_is_asked_to_or_says_where(counts: list[int], first: int) -> None:
-    log = Log(30, 1 << 20)
+    log = AgentLog(30, 1 << 20)
     for count in counts:
         add(log, count)
     part = log.part(first, 1 << 20)
@@ -101,7 +101,7 @@ def test_part_begins_where_it_is_asked_to_or_says_where(counts: list[int], first
 
 @given(most_bytes=st.integers(0, 100), first=st.integers(1, 20))
 def test_part_is_as_much_as_fits_and_one_at_least(most_bytes: int, first: int) -> None:
-    log = Log(100, 1 << 20)
+    log = AgentLog(100, 1 << 20)
     for _ in range(20):
         add(log, 1)
     data = log.part(first, most_bytes).data
@@ -118,7 +118,7 @@ def test_part_is_as_much_as_fits_and_one_at_least(most_bytes: int, first: int) -
     ("clock", "first"), [(0.0, 1), (1.0, 1), (1.5, 4), (2.0, 4), (3.0, 7), (3.1, 10)]
 )
 def test_first_since_a_time(clock: float, first: int) -> None:
-    log = Log(100, 1 << 20)
+    log = AgentLog(100, 1 << 20)
     assert log.first_since(clock) == 1
     for at in (1.0, 2.0, 3.0):
         add(log, 3, at)
@@ -242,7 +242,7 @@ class Hearing(RuleBasedStateMachine):
         super().__init__()
         self.ear = Ear(most_held=120)
         self.epoch = 1
-        self.log = Log(12, 1 << 20)
+        self.log = AgentLog(12, 1 << 20)
         self.way: list[tuple[int, int, list[Things]]] = []  # said, and not heard yet
         self.answers: list[tuple[int, int, int, list[Things]]] = []
         self.known: dict[int, int] = {}  # numbers of each epoch that are accounted for
@@ -289,7 +289,7 @@ class Hearing(RuleBasedStateMachine):
     def restart(self) -> None:
         """Restart the agent: what the program had not heard of the old one, nobody has."""
         self.ear.feed.interrupt()
-        self.epoch, self.log = self.epoch + 1, Log(12, 1 << 20)
+        self.epoch, self.log = self.epoch + 1, AgentLog(12, 1 << 20)
 
     @precondition(lambda self: self.ear.feed.epoch != self.epoch)
     @rule()

@@ -17,7 +17,7 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet import FleetFile
-from smartcam.fleet._log import Log
+from smartcam.fleet._log import AgentLog
 from smartcam.fleet._wire import decode, decode_order, decode_outcome
 from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
@@ -241,7 +241,7 @@ def as_started_anew(plant: Plant) -> None:
     agent, host = plant.agent, plant.agent.hosts[NAME]
     agent.epoch += 1
     host._epoch += 1
-    host.results, host.states = Log(100, 1 << 20), Log(100, 1 << 20)
+    host.results, host.states = AgentLog(100, 1 << 20), AgentLog(100, 1 << 20)
     for program in [*agent._programs]:
         agent._forget(program)
     agent._gone.clear()

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import RemoteProtocolError
 from smartcam.fleet._wire import (
-    Order,
-    Run,
+    ResultRun,
+    TriggerOrder,
     decode,
     decode_order,
     decode_outcome,
@@ -44,10 +44,10 @@ FIELDS = st.dictionaries(st.text(max_size=6).filter(lambda key: key != "blobs"),
 
 
 @st.composite
-def runs(draw: st.DrawFn) -> Run:
+def runs(draw: st.DrawFn) -> ResultRun:
     """A run as an agent may say it."""
     own = draw(st.none() | TIMES)
-    return Run(
+    return ResultRun(
         number=draw(st.integers(0, 2**40)),
         application=draw(NUMBERS),
         endian=draw(NUMBERS),
@@ -63,7 +63,7 @@ def runs(draw: st.DrawFn) -> Run:
     )
 
 
-def same(one: Run, other: Run) -> bool:
+def same(one: ResultRun, other: ResultRun) -> bool:
     """Whether two runs are equal; NaN is NaN here."""
     return repr(one) == repr(other)
 
@@ -75,7 +75,7 @@ def test_message_is_what_was_said(fields: dict[str, Any], blobs: list[bytes]) ->
 
 
 @given(some=st.lists(runs(), max_size=4), epoch=st.integers(0, 2**63), following=NUMBERS)
-def test_runs_are_what_was_said(some: list[Run], epoch: int, following: int) -> None:
+def test_runs_are_what_was_said(some: list[ResultRun], epoch: int, following: int) -> None:
     batch = decode_runs(encode_runs(epoch, following, [one.encode() for one in some]), "it")
     assert (batch.epoch, batch.following) == (epoch, following)
     assert len(batch.runs) == len(some)
@@ -87,7 +87,7 @@ def test_runs_are_what_was_said(some: list[Run], epoch: int, following: int) -> 
 
 
 @given(run=runs(), number=st.integers(-3, 9))
-def test_rest_of_a_run(run: Run, number: int) -> None:
+def test_rest_of_a_run(run: ResultRun, number: int) -> None:
     rest = run.since(run.number + number)
     assert rest.payloads == run.payloads[max(0, number) :]
     assert rest.number == run.number + max(0, number)
@@ -95,7 +95,7 @@ def test_rest_of_a_run(run: Run, number: int) -> None:
 
 
 ORDERS = st.builds(
-    Order,
+    TriggerOrder,
     call=st.integers(0, 2**64 - 1),
     epoch=st.integers(0, 2**64 - 1),
     deadline=CLOCKS,
@@ -111,7 +111,7 @@ ORDERS = st.builds(
 
 
 @given(order=ORDERS, program=st.text(max_size=60))
-def test_order_is_what_was_said(order: Order, program: str) -> None:
+def test_order_is_what_was_said(order: TriggerOrder, program: str) -> None:
     assert decode_order(encode_order(program, order), "it") == (program, order)
 
 
@@ -119,7 +119,7 @@ def test_order_is_what_was_said(order: Order, program: str) -> None:
     ("field", "value"), [("application", 2**63), ("results", -1), ("layouts", "@sequence: uint32")]
 )
 def test_order_that_does_not_fit_is_a_message(field: str, value: Any) -> None:
-    order = Order(1, 2, 3.0, 4.0, None, 5, 6, wait=True, by_application=False, data=b"7")
+    order = TriggerOrder(1, 2, 3.0, 4.0, None, 5, 6, wait=True, by_application=False, data=b"7")
     payload = encode_order("it", order._replace(**{field: value}))
     assert decode_order(payload, "it") is None
     fields, blobs = decode(payload, "it")
@@ -144,7 +144,7 @@ def test_order_that_does_not_fit_is_a_message(field: str, value: Any) -> None:
 
 
 @given(told=st.lists(st.binary(max_size=9), max_size=4), some=st.lists(runs(), max_size=3))
-def test_outcome_is_what_was_said(told: list[bytes], some: list[Run]) -> None:
+def test_outcome_is_what_was_said(told: list[bytes], some: list[ResultRun]) -> None:
     batch = encode_runs(9, 8, [one.encode() for one in some])
     outcome = decode_outcome(encode_outcome(1, 2, 3.5, 4, told, batch), "it")
     assert outcome is not None
@@ -175,9 +175,9 @@ def test_what_is_no_state_is_told(data: bytes) -> None:
 
 
 MESSAGE = encode({"call": 7, "do": "trigger", "arguments": {"a": [1, None]}}, [b"1234", b"", b"5"])
-RUN = Run(5, 1, 0, 1, 2, 3, 1.5, 1.7e9, 1.7e9, 0.1, [b"abc", b"", b"de"], b"{}").encode()
+RUN = ResultRun(5, 1, 0, 1, 2, 3, 1.5, 1.7e9, 1.7e9, 0.1, [b"abc", b"", b"de"], b"{}").encode()
 BATCH = encode_runs(9, 8, [RUN, RUN])
-ORDER = encode_order("it", Order(1, 2, 3.0, 4.0, None, 5, 6, True, False, None))
+ORDER = encode_order("it", TriggerOrder(1, 2, 3.0, 4.0, None, 5, 6, True, False, None))
 OUTCOME = encode_outcome(1, 2, 3.0, 4, [b"abc", b"d"], BATCH)
 
 
@@ -256,7 +256,7 @@ def times(**more: float) -> bytes:
     """Return a batch of one run with such times."""
     fields: dict[str, Any] = {"clock": 0.0, "at": 1.7e9, "triggered_at": math.nan, "latency": 0.0}
     fields |= more
-    run = Run(1, 1, 0, 0, 0, 0, payloads=[b"1"], **fields)
+    run = ResultRun(1, 1, 0, 0, 0, 0, payloads=[b"1"], **fields)
     return encode_runs(1, 2, [run.encode()])
 
 

@@ -21,7 +21,7 @@ import pytest
 import smartcam
 from smartcam.exceptions import ConnectFailedError, ConnectionLostError
 from smartcam.fleet import FleetCamera, _zenoh
-from smartcam.fleet._zenoh import LONG, Link, ZenohEnd, with_ports
+from smartcam.fleet._zenoh import LONG, BusLink, ZenohEnd, with_ports
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant
@@ -47,7 +47,10 @@ def port_of(place: str) -> int:
 async def two_ends(**more: Any) -> AsyncIterator[tuple[ZenohEnd, ZenohEnd]]:
     """Give an end that listens, and one that has connected to it."""
     place = free_place()
-    listens, connects = ZenohEnd(Link(listen=(place,)), more), ZenohEnd(Link(connect=(place,)))
+    listens, connects = (
+        ZenohEnd(BusLink(listen=(place,)), more),
+        ZenohEnd(BusLink(connect=(place,))),
+    )
     await listens.open(PATIENCE)
     try:
         await connects.open(PATIENCE)
@@ -177,7 +180,7 @@ async def test_silent_host_is_given_up_by_the_timeout(accepts: bool) -> None:
 async def test_port_in_use_is_told() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        error = await gone(ZenohEnd(Link(listen=(place,))).open(PATIENCE))
+        error = await gone(ZenohEnd(BusLink(listen=(place,))).open(PATIENCE))
         assert isinstance(error, ConnectFailedError)
         assert f"cannot listen on {place}" in str(error)
 
