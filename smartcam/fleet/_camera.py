@@ -209,7 +209,8 @@ class FleetCamera(Camera[ValueT]):
         if not self.connected:
             trouble = self.trouble
             waited = self.settings.connect_timeout
-            why = f"no agent of the fleet has this camera, or none answered within {waited:g} s"
+            fleet = self._program.keys.fleet
+            why = f"no agent of fleet {fleet} has this camera, or none answered within {waited:g} s"
             raise self._not_reached(
                 why if trouble is None else str(trouble).removeprefix(f"{self.name}: ")
             ) from trouble
