@@ -68,7 +68,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     """
 
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
-        self.settings = settings
+        self.settings: CameraSettings = settings
         self._observers = Observers(observers)
         self._observed = bool(self._observers)
         self._interpretations: dict[str, Interpretation] = {}  # by their text

@@ -357,6 +357,7 @@ def test_jsonable_statistics_hold_the_subscribers_accounts() -> None:
             "dropped": 1,
             "queued": 1,
             "queued_bytes": 40,
+            "missed": 0,
         }
     ]
 

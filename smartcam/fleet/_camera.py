@@ -20,6 +20,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
     ResponseTimeoutError,
     SmartCamError,
+    TriggerTimeoutError,
 )
 from smartcam.fleet._caller import Caller, Met
 from smartcam.fleet._errors import from_fields
@@ -328,7 +329,7 @@ class FleetCamera(Camera[ValueT]):
         said = {name: bool(hello.get(name)) for name in ("y_down", "lenient")}
         changes = {key: on for key, on in said.items() if key not in settings.model_fields_set}
         fields_set = settings.model_fields_set
-        self.settings = settings.model_copy(update=changes)
+        self.settings: CameraSettings = settings.model_copy(update=changes)
         self.settings.model_fields_set.intersection_update(fields_set)
         self._agents_layout = layout
         self._interpretations.clear()
@@ -520,7 +521,7 @@ class FleetCamera(Camera[ValueT]):
         self, application: int | None, request: TriggerRequest, timeout: float
     ) -> list[Result]:
         if self._switch_in_doubt:
-            await self._settle_switch(timeout)
+            timeout = await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
         deadline = self._deadline(timeout)
         self._require_session()
@@ -547,10 +548,20 @@ class FleetCamera(Camera[ValueT]):
             raise
         self._expected, self._switch_in_doubt = reply.fields["answer"]["application"], False
 
-    async def _settle_switch(self, timeout: float) -> None:
-        """Ask which application is active now, from which results are expected then."""
-        self._expected = await self.query_application(timeout=timeout)
+    async def _settle_switch(self, timeout: float) -> float:
+        """Ask which application is active now, from which results are expected then.
+
+        Returns:
+            The seconds that are left for a trigger.
+        """
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        try:
+            self._expected = await self.query_application(timeout=timeout)
+        except ResponseTimeoutError as exc:
+            raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
         self._switch_in_doubt = False
+        return max(0.0, timeout - (loop.time() - begun))
 
     @contextlib.asynccontextmanager
     async def application(self, application: int) -> AsyncGenerator[Self]:

@@ -64,7 +64,8 @@ class Program:
     keys: Keys
 
     def __init__(self, bus: Bus, fleet: str | None, camera: str = "**") -> None:
-        self.bus, self._fleet, self._camera = bus, fleet, camera
+        self.bus: Bus = bus
+        self._fleet, self._camera = fleet, camera
         self.name: str = f"{_own_name()}-{secrets.token_hex(6)}"
         self._calls = 0
         self._pending: dict[int, Pending] = {}
