@@ -16,16 +16,16 @@ from tests.timed_loop import TimedLoop
 
 LOOPS: Mapping[str, Callable[[], asyncio.AbstractEventLoop]] = {
     "wire": functools.partial(TimedLoop),
-    "memory": functools.partial(TimedLoop),
+    "in_process": functools.partial(TimedLoop),
     "zenoh": functools.partial(asyncio.SelectorEventLoop),  # its threads want real time
 }
 """Kinds of cameras, and the event loops that they are tried on."""
 
 _LEFT_OUT = {
     "wire": frozenset[str](),
-    "memory": frozenset(name for names in AT_THE_WIRE.values() for name in names),
+    "in_process": frozenset(name for names in AT_THE_WIRE.values() for name in names),
 }
-_LEFT_OUT["zenoh"] = _LEFT_OUT["memory"] | IN_TIME_OF_THEIR_OWN
+_LEFT_OUT["zenoh"] = _LEFT_OUT["in_process"] | IN_TIME_OF_THEIR_OWN
 
 
 def pytest_asyncio_loop_factories(
@@ -47,7 +47,7 @@ def _kind(item: pytest.Item) -> str | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what does not hold for a kind; those over Zenoh are long."""
+    """Leave out what does not hold for a kind; those over Zenoh are long, and sweeps on a bus."""
     kept: list[pytest.Item] = []
     left_out: list[pytest.Item] = []
     for item in items:
@@ -58,7 +58,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if _LEFT_OUT[kind] & {name, f"{name}[{others}]"}:
                 left_out.append(item)
                 continue
-            if kind == "zenoh":
+            if kind == "zenoh" or (kind == "in_process" and name in IN_TIME_OF_THEIR_OWN):
                 item.add_marker(pytest.mark.long)
         kept.append(item)
     if left_out:

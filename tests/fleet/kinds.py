@@ -72,7 +72,7 @@ def connect(
     if kind == "wire":
         model = options.pop("model", None)
         return SmartCamera(CameraSettings.make(url, model, options), observers=observers)
-    if kind == "memory":
+    if kind == "in_process":
         bus = MemoryBus()
         return OwnAgentCamera(url, (bus.end(), bus.end()), options, observers)
     (place,) = with_ports(["tcp/127.0.0.1:0"])

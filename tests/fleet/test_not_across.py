@@ -36,7 +36,7 @@ async def test_observers_hear_of_results_and_events_and_not_of_frames() -> None:
     ear = Ear()
     async with (
         EmulatedCamera(running=True) as box,
-        connect("memory", box.url, observers=[ear]) as camera,
+        connect("in_process", box.url, observers=[ear]) as camera,
     ):
         await camera.trigger()
     assert (ear.frames, ear.results) == (0, 1)
@@ -59,7 +59,7 @@ def test_option_of_the_session_is_refused(name: str) -> None:
 
 
 async def test_statistics_have_what_came_to_this_program() -> None:
-    async with EmulatedCamera(running=True) as box, connect("memory", box.url) as camera:
+    async with EmulatedCamera(running=True) as box, connect("in_process", box.url) as camera:
         await camera.trigger()
         box.device.trigger()  # nobody listens here
         await camera.trigger(timeout=30)
@@ -76,6 +76,6 @@ async def test_error_crosses_with_kind_text_and_attributes() -> None:
                     await camera.switch_application(99)
         return caught.value
 
-    at_the_wire, over_the_bus = await refused("wire"), await refused("memory")
+    at_the_wire, over_the_bus = await refused("wire"), await refused("in_process")
     assert vars(over_the_bus) == vars(at_the_wire)
     assert str(over_the_bus).replace("line1/cam1", "press") == str(at_the_wire)
