@@ -159,7 +159,10 @@ class Agent:
         return self
 
     async def close(self) -> None:
-        """Leave the bus, end calls and sessions; bounded. Idempotent."""
+        """Leave the bus, end calls and sessions; bounded. Idempotent.
+
+        Cancellation: the sessions' links are dropped at once; the bus is left nevertheless.
+        """
         declared, self._declared = self._declared, []
         self._plain.close()
         for handle in (*declared, *(token for token, _ in self._shared.values())):
@@ -168,10 +171,12 @@ class Agent:
             self._forget(program, going_back=False)
         for task in tuple(self._tasks):
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        closing = (host.close() for host in self.hosts.values())
-        await asyncio.gather(*closing, return_exceptions=True)
-        await self._bus.close()
+        try:
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            closing = (host.close() for host in self.hosts.values())
+            await asyncio.gather(*closing, return_exceptions=True)
+        finally:
+            await self._bus.close()
 
     def share(self, name: str, settings: CameraSettings) -> Host:
         """Begin to have a session with a camera, and to share it.

@@ -223,10 +223,12 @@ class FleetCamera(Camera[ValueT]):
 
     async def close(self) -> None:
         self._finish(ConnectionClosedError(f"{self.name}: the connection is closed"))
-        await self._receiver.close()
-        await self._caller.close()
-        if not self._shared:
-            await self._program.close()
+        try:
+            await self._receiver.close()
+            await self._caller.close()
+        finally:
+            if not self._shared:
+                await self._program.close()
 
     def _finish(self, error: LinkError) -> None:
         """There will be no session any more."""

@@ -133,6 +133,10 @@ AT_THE_WIRE: dict[str, tuple[str, ...]] = {
 
 IN_TIME_OF_THEIR_OWN = frozenset(
     {
+        "test_camera_that_another_client_took_is_not_fought_for",
+        "test_request_cancelled_in_line_sends_nothing",
+        "test_close_while_opening_ends_the_opener",
+        "test_session_lost_again_soon_after_a_reconnect_was_taken",
         "test_events_tell_of_changes_that_are_asked_for",
         "test_connection_lost_again_soon_is_no_other_clients_doing",
         "test_camera_that_takes_no_bytes_is_a_timeout",
