@@ -145,7 +145,6 @@ LIMITS = (
     "fleet._camera.REACH_TIMEOUT",
     "fleet._errors.MAX_CHAIN",
     "fleet._file.MOST_CAMERAS",
-    "fleet._fleet.MOST_AT_ONCE",
     "fleet._program.LOOK_AGAIN",
     "fleet._receiver.FILL_TIMEOUT",
     "fleet._zenoh.LEASE",
