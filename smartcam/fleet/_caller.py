@@ -63,7 +63,6 @@ class Caller:
 
     Attributes:
         met: the agent, None while there is none.
-        last: the same; after a loss the one of before.
         trouble: why there is none.
         end: why there will be none any more.
     """
@@ -80,7 +79,6 @@ class Caller:
         self.name, self.camera, self.program = name, camera, program
         self.counters = counters
         self.met: Met | None = None
-        self.last: Met | None = None
         self.trouble: LinkError | None = None
         self.end: LinkError | None = None
         self._on_met, self._on_lost = on_met, on_lost
@@ -90,7 +88,6 @@ class Caller:
         self._task: asyncio.Task[None] | None = None
         self._ahead = 0.0  # the agent's clock is at least so far ahead of the loop's
         self._measured = 0.0
-        self._waiting: list[asyncio.Future[None]] = []
         self._insisting: set[asyncio.Task[None]] = set()
 
     # ------------------------------------------------------------------ life
@@ -120,30 +117,6 @@ class Caller:
             self.end = error
         self.met = None
         self.program.fail(self, lambda: error)
-        self._wake()
-
-    async def wait_met(self, deadline: float) -> Met:
-        """Return the agent once it has answered.
-
-        Raises:
-            TimeoutError: it has not by ``deadline`` (loop time).
-            LinkError: there will be none.
-        """
-        loop = asyncio.get_running_loop()
-        async with asyncio.timeout_at(deadline):
-            while self.met is None:
-                if self.end is not None:
-                    raise self.end.with_traceback(None)
-                waiting: asyncio.Future[None] = loop.create_future()
-                self._waiting.append(waiting)
-                await waiting
-        return self.met
-
-    def _wake(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        for one in waiting:
-            if not one.done():
-                one.set_result(None)
 
     # ------------------------------------------------------------------ the agent
 
@@ -218,10 +191,9 @@ class Caller:
             raise RemoteProtocolError(f"the agent {agent} says no proper hello: {exc}") from exc
         self._ahead, self._measured = clock - loop.time(), loop.time()
         if agent in self._agents:
-            self.met = self.last = Met(agent, epoch, hello)
+            self.met = Met(agent, epoch, hello)
             self.trouble = None
             self._on_met(self.met)
-            self._wake()
 
     # ------------------------------------------------------------------ the clock
 
