@@ -12,6 +12,8 @@ def plain(schema: Any) -> Any:
     if not isinstance(schema, dict):
         return schema
     found = {key: plain(value) for key, value in schema.items()}
+    for one in found.get("anyOf", ()):  # pydantic 2.7 gives it the default of another field
+        one.pop("default", None)
     if "const" in found:
         found.pop("enum", None)
     if found.get("additionalProperties") is True:

@@ -133,6 +133,7 @@ AT_THE_WIRE: dict[str, tuple[str, ...]] = {
 
 IN_TIME_OF_THEIR_OWN = frozenset(
     {
+        "test_fence_that_was_cancelled_after_its_stop_is_finished_by_the_next",
         "test_switch_cancelled_in_any_phase_leaves_a_camera_that_works",
         "test_camera_that_another_client_took_is_not_fought_for",
         "test_request_cancelled_in_line_sends_nothing",

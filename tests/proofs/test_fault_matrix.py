@@ -14,6 +14,7 @@ import pytest
 
 import smartcam
 from smartcam.camera import Camera
+from smartcam.client import SmartCamera
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.observers import TraceEntry
@@ -133,7 +134,7 @@ async def test_trigger_that_is_sent_twice_is_wrong(monkeypatch: pytest.MonkeyPat
         await trigger(camera, *arguments, **options)
         return await trigger(camera, *arguments, **options)
 
-    monkeypatch.setattr(Camera, "trigger", twice)
+    monkeypatch.setattr(SmartCamera, "trigger", twice)
     assert "one call sent 2 triggers, 0 were refused" in await judged(CUT)
 
 
@@ -141,7 +142,7 @@ async def test_clock_that_is_not_the_cameras_is_wrong(monkeypatch: pytest.Monkey
     async def get_clock(_: Camera) -> datetime:
         return datetime(2000, 1, 1)  # noqa: DTZ001 - it has no zone
 
-    monkeypatch.setattr(Camera, "get_clock", get_clock)
+    monkeypatch.setattr(SmartCamera, "get_clock", get_clock)
     assert "clock 2000-01-01" in await judged(CUT, "query")
 
 

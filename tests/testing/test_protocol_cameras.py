@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from smartcam.camera import Camera
+from smartcam.client import SmartCamera
 from smartcam.exceptions import SmartCamError
 from smartcam.models import Status
 from smartcam.testing import CameraKind, CameraSuite, LiveCamera
@@ -90,7 +91,7 @@ NOBODY = property(lambda _: False)
 def patched(**methods: Any) -> Callable[[pytest.MonkeyPatch], CameraKind]:
     def patch(monkeypatch: pytest.MonkeyPatch) -> CameraKind:
         for name, method in methods.items():
-            monkeypatch.setattr(Camera, name, method)
+            monkeypatch.setattr(SmartCamera, name, method)
         return HANDBOOK
 
     return patch
