@@ -17,13 +17,14 @@ class Code(enum.StrEnum):
     TOO_FEW = "TOO_FEW"
     """Fewer points than the model has need of."""
     COINCIDENT = "COINCIDENT"
-    """Points that should be apart are the same."""
+    """Points that should be apart are the same; or cameras, or views."""
     COLLINEAR = "COLLINEAR"
     """The points lie on a line, or so nearly that the rest is not determined."""
     SHORT_LEVER = "SHORT_LEVER"
     """The points lie too close together for how well they are touched."""
     MIRRORED = "MIRRORED"
-    """The camera's frame is left-handed as seen from the tool's side: y points the wrong way."""
+    """Left and right are exchanged: a camera's frame is left-handed as seen from the tool's side (y
+    points the wrong way), a robot's base is, or pictures were flipped."""
     SIDE_UNKNOWN = "SIDE_UNKNOWN"
     """From which side the plane is touched was not told: mirrored input could not be noticed."""
     SCALE_MISMATCH = "SCALE_MISMATCH"
@@ -124,6 +125,12 @@ class Code(enum.StrEnum):
     """No format, or no robot's convention, of this name."""
     MALFORMED = "MALFORMED"
     """A file of another program that is not what its format says."""
+
+    # what belongs to something else
+    NO_COVARIANCE = "NO_COVARIANCE"
+    """Matrices that are no covariances: not symmetric, or with a negative variance."""
+    SWAPPED_LENSES = "SWAPPED_LENSES"
+    """The known lens of each camera is the other one's."""
 
 
 class Remark(NamedTuple):

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, get_args
 
 import numpy as np
 
+from smartcam.calibration._codes import Code
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.rotations import Array
+from smartcam.calibration._geometry.rotations import Array, as_points
 from smartcam.calibration._targets import MAX_POINTS, Target
+from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable
 
 IDS = storage.Form(
     list[storage.Count],
     read=lambda ids, _: np.array([min(one, MAX_POINTS) for one in ids], dtype=np.intp),
     write=lambda ids: ids.tolist(),
 )
+
+ROUNDED: Final = 1e-9
+"""Part of a covariance by which its elements may be off."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,13 +36,19 @@ class TargetView(storage.Stored):
     Attributes:
         target: what was looked for.
         size: width and height of the image, pixels.
-        ids: (N,), numbers of the points that were found, ascending.
+        ids: (N,), numbers of the points that were found, ascending. Read-only, as are the next two.
         points: (N, 2), where they are, pixels.
-        covariance: (N, 2, 2), of each, pixels^2, as the noise of the image leads to.
+        covariance: (N, 2, 2), of each, pixels^2, as the noise of the image leads to; 0 for points
+            without noise.
         margin: how clearly the origin was told from the other corners: by how many grey levels of
             255 its mark, or the rim by which its dot is larger, is darker there; None where the
             target says it by itself (ids, colours of squares), or looks the same when turned.
         name: of the image, for messages.
+
+    Raises:
+        CalibrationError: ``SHAPE``: no target, no size, arrays that do not fit together, or ids
+            that the target does not have, that stand twice or do not ascend; ``NOT_FINITE``;
+            ``NO_COVARIANCE``.
     """
 
     _called: ClassVar[str] = "view"
@@ -51,20 +63,26 @@ class TargetView(storage.Stored):
     margin: storage.Number | None = None
     name: str = ""
 
+    def __post_init__(self) -> None:
+        """Take read-only copies, and check them."""
+        called = f"target in {self.name}" if self.name else "view of a target"
+        target = checked(self.target, get_args(Target), f"{called}: target")
+        ids = _as_ids(self.ids, len(target.points), called)
+        points = as_points(self.points, 2, f"{called}: points").copy()
+        if len(points) != len(ids):
+            expected = f"{called}: points: expected shape ({len(ids)}, 2) as there are ids"
+            raise _refused(expected, (len(ids), 2), points.shape)
+        covariance = as_covariances(self.covariance, len(ids), f"{called}: covariance").copy()
+        _check_size(self.size, called)
+        for name, value in (("ids", ids), ("points", points), ("covariance", covariance)):
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
     @classmethod
     def _read(cls, found: dict[str, Any], context: storage.Context) -> TargetView:
-        if "target" not in context:
+        if context.get("target") is None:
             raise storage.refused(context["called"], "target: expected the one that it shows", None)
-        # None where the whole that holds the view is refused for it
         return super()._read({"target": context["target"], **found}, context)
-
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
-        count = len(self.ids)
-        known = len(self.target.points) if self.target else MAX_POINTS
-        if count and self.ids.max() >= known:
-            raise storage.refused(called, f"ids: expected less than {known}", int(self.ids.max()))
-        storage.check_shape(self.points, (count, 2), called, "points")
-        storage.check_shape(self.covariance, (count, 2, 2), called, "covariance of the points")
 
     @property
     def object_points(self) -> Array:
@@ -73,7 +91,112 @@ class TargetView(storage.Stored):
         return points
 
     @property
+    def agreement(self) -> float:
+        """How far the target's plane and the image turn alike, -1 to 1; NaN of points on a line.
+
+        Near -1 for the sheet as one reads it (y is up there, and v down), near 1 for one in a
+        mirror, near 0 where points are taken for others.
+        """
+        # det(A^T B) is the sum, over all triples of points, of the products of the triangles' signed
+        # areas (Cauchy and Binet), and a plane before a camera keeps all signs. Over the root of
+        # det(A^T A) det(B^T B) it is the product of the canonical correlations.
+        # Source: Hotelling, Relations Between Two Sets of Variates (1936).
+        flat, seen = self.object_points[:, :2], self.points
+        both = flat - flat.mean(axis=0), seen - seen.mean(axis=0)
+        spread = math.prod(float(np.linalg.det(one.T @ one)) for one in both)
+        turn = float(np.linalg.det(both[0].T @ both[1]))
+        return turn / math.sqrt(spread) if spread > 0 else math.nan
+
+    @property
     def sigmas(self) -> Array:
         """(N,), standard deviation of a coordinate, pixels."""
         sigmas: Array = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2)
         return sigmas
+
+
+def checked(value: Any, kinds: type | tuple[type, ...], what: str) -> Any:
+    """Return a value that is of one of some kinds; else SHAPE, which says what it is instead."""
+    if isinstance(value, kinds):
+        return value
+    names = [one.__name__ for one in (kinds if isinstance(kinds, tuple) else (kinds,))]
+    raise _refused(f"{what}: expected a {' or '.join(names)}", names, described(value))
+
+
+def described(value: Any) -> str:
+    """Return what a value is, in a few words."""
+    shape = getattr(value, "shape", None)
+    kind = "None" if value is None else type(value).__name__
+    return kind if shape is None else f"{kind} of shape {tuple(shape)}"
+
+
+def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
+    """Return views as a list; else SHAPE: something else is among them, or it is no list."""
+    return [checked(one, TargetView, f"{what}: view {n}") for n, one in listed(views, what)]
+
+
+def listed(values: Any, what: str) -> list[tuple[int, Any]]:
+    """Return the numbered items of what may be gone through; else SHAPE. Text and views may not."""
+    if isinstance(values, str | bytes | dict) or not hasattr(values, "__iter__"):
+        raise _refused(f"{what}: expected a list", "a list", described(values))
+    return list(enumerate(values))
+
+
+def as_covariances(values: Any, count: int, what: str) -> Array:
+    """Return covariances of points in an image, (``count``, 2, 2).
+
+    Raises SHAPE, NOT_FINITE, or NO_COVARIANCE: not symmetric, or with a negative variance.
+    """
+    shape = np.shape(values)
+    if shape != (count, 2, 2):
+        raise _refused(f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), shape)
+    found = as_points(np.reshape(values, (-1, 4)), 4, what).reshape(-1, 2, 2)
+    # a symmetric matrix is one where neither its trace nor its determinant is negative
+    trace = np.trace(found, axis1=1, axis2=2)
+    uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > ROUNDED * np.abs(found).max(axis=(1, 2))
+    product = found[:, 0, 0] * found[:, 1, 1]
+    negative = (found[:, 0, 0] < 0) | (product - found[:, 0, 1] ** 2 < -ROUNDED * trace**2)
+    wrong = np.flatnonzero(uneven | negative | (trace < 0))
+    if len(wrong):
+        got = found[wrong[0]].tolist()
+        raise CalibrationError(
+            f"{what}: expected symmetric matrices of no negative variance, got {got} in row "
+            f"{wrong[0]}",
+            code=Code.NO_COVARIANCE,
+            expected="covariances",
+            got=got,
+        )
+    return found
+
+
+def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    try:
+        given = np.asarray(values)
+    except ValueError as exc:
+        raise _refused(f"{called}: ids: expected whole numbers", "(N,)", str(exc)) from exc
+    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+        got = f"{given.dtype} of shape {given.shape}"
+        raise _refused(f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", got)
+    wrong = given[(given < 0) | (given >= known)]
+    if len(wrong) and wrong[0] < 0:
+        raise _refused(f"{called}: ids: expected 0 or more", 0, int(wrong[0]))
+    if len(wrong):
+        raise _refused(f"{called}: ids: expected less than {known}", known, int(wrong[0]))
+    ids = given.astype(np.intp)
+    back = np.flatnonzero(np.diff(ids) <= 0)
+    if len(back):
+        got = ids[back[0] : back[0] + 2].tolist()
+        expected = f"{called}: ids: expected each once, ascending (points in the order of the ids)"
+        raise _refused(expected, "ascending", got)
+    return ids
+
+
+def _check_size(values: Any, called: str) -> None:
+    whole = (int, np.integer)
+    plain = isinstance(values, tuple | list) and len(values) == 2
+    if not plain or not all(isinstance(one, whole) and one > 0 for one in values):
+        expected = f"{called}: size: expected width and height in pixels"
+        raise _refused(expected, "(width, height)", values)
+
+
+def _refused(text: str, expected: object, got: object) -> CalibrationError:
+    return CalibrationError(f"{text}, got {got}", code=Code.SHAPE, expected=expected, got=got)

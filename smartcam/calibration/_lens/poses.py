@@ -12,16 +12,15 @@ from smartcam.calibration._codes import Code
 from smartcam.calibration._files import storage
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
-from smartcam.calibration._geometry.rotations import as_points
 from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight, adjust
+from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.projection import excess
 from smartcam.calibration._optional_imports import load
+from smartcam.calibration._views import TargetView, checked
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration._views import TargetView
 
 CAMERA: Final = "camera"
 """Name of the camera's frame."""
@@ -37,6 +36,12 @@ LEAST_POINTS: Final = 4
 
 LEAST_SPREAD: Final = 1e-3
 """Of the points across their longest direction, in parts of that: less is a line."""
+
+OUTSIDE: Final = 0.1
+"""Part of the image's sides by which a point may lie outside of it."""
+
+LEAST_AGREEMENT: Final = 0.5
+"""Of a view's points with those of the target; views of steep sheets and of fisheyes have 0.8."""
 
 NUDGE: Final = 1e-9
 """Of rays, parts of the focal length, to keep a solver from rounding errors."""
@@ -83,9 +88,11 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
 
     Raises:
         CalibrationError: ``TOO_FEW`` points; ``COLLINEAR`` points; ``WRONG_SIZE``: the image has
-            another size than the camera's; ``NOT_FINITE``: pixels that are no numbers;
-            ``POOR_FIT``: no pose puts the points before the camera.
+            another size than the camera's, or points lie far outside of it; ``MIRRORED``: the
+            picture was flipped; ``POOR_FIT``: the points are taken for others, or no pose puts them
+            before the camera; ``SHAPE``: no view, or no camera.
     """
+    checked(camera, CameraModel, "pose of the target: camera")
     check_view(view, camera.size)
     sights = [Sight(0, 0, view)]
     found = [
@@ -132,31 +139,69 @@ def check_view(view: TargetView, size: tuple[int, int]) -> None:
 
     Raises as :func:`locate` says.
     """
+    called = f"pose of the target{_of(checked(view, TargetView, 'pose of the target'))}"
     count = len(view.ids)
     if count < LEAST_POINTS:
         raise CalibrationError(
-            f"pose of the target{_of(view)}: expected {LEAST_POINTS} points or more, got {count}",
+            f"{called}: expected {LEAST_POINTS} points or more, got {count}",
             code=Code.TOO_FEW,
             expected=LEAST_POINTS,
             got=count,
         )
     if tuple(view.size) != tuple(size):
         raise CalibrationError(
-            f"pose of the target{_of(view)}: expected an image of {size[0]} x {size[1]} pixels, "
-            f"got {view.size[0]} x {view.size[1]}",
+            f"{called}: expected an image of {size[0]} x {size[1]} pixels, got {view.size[0]} x "
+            f"{view.size[1]}",
             code=Code.WRONG_SIZE,
             expected=size,
             got=view.size,
         )
-    as_points(view.points, 2, f"points of the target{_of(view)}")
+    _check_inside(view, called)
     plane = view.object_points[:, :2]
     spread = np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)
     if spread[1] < LEAST_SPREAD * spread[0]:
         raise CalibrationError(
-            f"pose of the target{_of(view)}: expected points that are not on one line, got "
-            f"{count} on one",
+            f"{called}: expected points that are not on one line, got {count} on one",
             code=Code.COLLINEAR,
             got=view.ids.tolist(),
+        )
+    _check_sides(view, called)
+
+
+def _check_inside(view: TargetView, called: str) -> None:
+    """Refuse points (``WRONG_SIZE``) that are far outside of the image."""
+    sides = np.array(view.size)
+    off = (np.maximum(-view.points, view.points - (sides - 1)) / sides).max(axis=1)
+    row = int(np.argmax(off))
+    if off[row] > OUTSIDE:
+        got = view.points[row].tolist()
+        raise CalibrationError(
+            f"{called}: expected points in the image of {sides[0]} x {sides[1]} pixels, got {got} "
+            f"in row {row}",
+            code=Code.WRONG_SIZE,
+            expected=view.size,
+            got=got,
+        )
+
+
+def _check_sides(view: TargetView, called: str) -> None:
+    """Refuse the sheet in a mirror (``MIRRORED``), and points taken for others (``POOR_FIT``)."""
+    turn = view.agreement
+    if turn > LEAST_AGREEMENT:
+        raise CalibrationError(
+            f"{called}: expected its x to turn left to its y as one reads the sheet, got a view as "
+            "in a mirror: was the picture flipped, or are u and v exchanged?",
+            code=Code.MIRRORED,
+            expected="y to the left of x",
+            got=turn,
+        )
+    if turn > -LEAST_AGREEMENT:
+        raise CalibrationError(
+            f"{called}: expected points with the numbers that they have on {view.target}, got an "
+            f"order that agrees with it by {-turn:.2g} of 1 only",
+            code=Code.POOR_FIT,
+            expected=LEAST_AGREEMENT,
+            got=-turn,
         )
 
 

@@ -550,7 +550,7 @@ def test_hand_eye_from_poses_is_stored_bit_by_bit() -> None:
         ("used", [True, True, True], "used: expected 9"),
         ("covariance", [[0.0]], "covariance: expected 12 rows of 12"),
         ("views", [], ""),
-        ("target", None, "views: expected 9, and their target"),
+        ("target", None, "target: expected the one that it shows"),
     ],
 )
 def test_hand_eye_from_other_data_is_refused(

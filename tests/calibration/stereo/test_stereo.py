@@ -286,8 +286,8 @@ def test_point_errors_of_a_view_numbered_from_the_other_end_are_the_same() -> No
 
 def test_point_errors_of_images_of_another_size_are_refused() -> None:
     left, right = pairs(1)
-    small = dataclasses.replace(right[0], size=(320, 240))
-    with pytest.raises(CalibrationError, match="640 x 480 pixels, got 320 x 240") as caught:
+    small = dataclasses.replace(right[0], size=(800, 600))
+    with pytest.raises(CalibrationError, match="640 x 480 pixels, got 800 x 600") as caught:
         _calibrated().point_errors(left, [small])
     assert caught.value.code == Code.WRONG_SIZE
 
