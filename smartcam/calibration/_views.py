@@ -97,9 +97,9 @@ class TargetView(storage.Stored):
         Near -1 for the sheet as one reads it (y is up there, and v down), near 1 for one in a
         mirror, near 0 where points are taken for others.
         """
-        # det(A^T B) is the sum, over all triples of points, of the products of the triangles' signed
-        # areas (Cauchy and Binet), and a plane before a camera keeps all signs. Over the root of
-        # det(A^T A) det(B^T B) it is the product of the canonical correlations.
+        # det(A^T B) is the sum, over all triples of points, of the products of their triangles'
+        # signed areas (Cauchy and Binet), and a plane before a camera keeps all signs. Over the
+        # root of det(A^T A) det(B^T B) it is the product of the canonical correlations.
         # Source: Hotelling, Relations Between Two Sets of Variates (1936).
         flat, seen = self.object_points[:, :2], self.points
         both = flat - flat.mean(axis=0), seen - seen.mean(axis=0)
@@ -112,6 +112,11 @@ class TargetView(storage.Stored):
         """(N,), standard deviation of a coordinate, pixels."""
         sigmas: Array = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2)
         return sigmas
+
+
+def label(view: TargetView, number: int) -> str:
+    """Return a view's name for texts, or its number."""
+    return view.name or f"view {number}"
 
 
 def checked(value: Any, kinds: type | tuple[type, ...], what: str) -> Any:

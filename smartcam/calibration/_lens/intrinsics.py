@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -30,7 +31,8 @@ from smartcam.calibration._lens.poses import (
 from smartcam.calibration._lens.projection import whitening
 from smartcam.calibration._lens.sheet_shape import choose_shape, held_out_residuals, leave_out
 from smartcam.calibration._lens.start import fit_lens, parameter_names
-from smartcam.calibration._views import TargetView
+from smartcam.calibration._lens.suspicions import examined
+from smartcam.calibration._views import TargetView, as_views, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -70,7 +72,7 @@ class ViewFit(storage.Stored):
     """What one view has to do with a lens.
 
     Attributes:
-        view: as it was given.
+        view: as it was given, without points that a remark ``OUTLIER`` says were not used.
         used: whether the lens is fitted to it; False for a bad view.
         transform: ``T_camera_target``.
         residuals: (N, 2), seen minus projected, pixels.
@@ -201,7 +203,11 @@ def calibrate_intrinsics(
     """Return the lens that shows the target's points where the views have them.
 
     The reprojection error is made least, each point weighted by its covariance and by what the
-    residuals show beside it. The order of the views does not matter.
+    residuals show beside it. The order of the views does not matter. Points that are far from where
+    the others of their view have them are left out and named (``OUTLIER``).
+
+    Where *all* pictures were flipped and the target looks the same in a mirror, as a checkerboard
+    does, nothing tells: the lens is that of the flipped pictures, and right for those alone.
 
     Args:
         views: of one target, 3 or more, of images of one size; tilted in several directions, near
@@ -224,7 +230,7 @@ def calibrate_intrinsics(
             or so little that the focal length stays open; ``SHAPE``: no such coefficient, or no
             such model; ``NOT_FINITE`` pixels; ``POOR_FIT``: no lens of this model shows them.
     """
-    given = list(views)
+    given = as_views(views, "intrinsics")
     check_views(given, "intrinsics", LEAST_VIEWS)
     _check_motion(given)
     held = tuple(fixed)
@@ -239,14 +245,17 @@ def calibrate_intrinsics(
         del used[worst]
     check_tilts(adjusted, "intrinsics")
     bad = [used[worst]] if ratio > BAD else []
-    return _summary(
+    found = _summary(
         given, used, adjusted, [*bad, *sorted(set(range(len(given))) - set(used))], sheet
     )
-
-
-def label(view: TargetView, number: int) -> str:
-    """Return a view's name for texts, or its number."""
-    return view.name or f"view {number}"
+    again = functools.partial(
+        calibrate_intrinsics,
+        distortion_model=distortion_model,
+        fixed=held,
+        sheet=sheet,
+        drop_bad=drop_bad,
+    )
+    return examined(found, again, drop=drop_bad)
 
 
 def check_views(

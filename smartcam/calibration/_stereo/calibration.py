@@ -23,7 +23,6 @@ from smartcam.calibration._lens.intrinsics import (
     LEAST_VIEWS,
     MOST_BAD,
     POOR,
-    label,
     remark_sheet,
     worst_view,
 )
@@ -45,7 +44,7 @@ from smartcam.calibration._stereo.start import (
     start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
-from smartcam.calibration._views import TargetView
+from smartcam.calibration._views import TargetView, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from smartcam.calibration._codes import Code, Remark
-from smartcam.calibration._lens.intrinsics import label
 from smartcam.calibration._stereo.start import SIDES
+from smartcam.calibration._views import label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

@@ -1,0 +1,386 @@
+"""What views say of themselves once a lens is fitted: points that are off, pictures that are flipped.
+
+Both are told by what the pose of each view cannot make up for: its part of the residuals, and of
+what another lens would change, is taken off first.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import itertools
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code, Remark
+from smartcam.calibration._least_squares import solve_scaled
+from smartcam.calibration._lens.bundle import lens_values
+from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.calibration._views import label
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._geometry.rigid import Rigid
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._lens.poses import TargetPose
+    from smartcam.calibration._views import TargetView
+
+    Mask = NDArray[np.bool_]
+
+STRAY: Final = 12.0
+"""Standard deviations by which a point that is not the target's is off: those of 400 recorded views
+are 10 off at most (measured), as their noise is not quite normal."""
+
+LEAST_STRAY: Final = 0.25
+"""Pixels: what is less off does no harm among as many points as a view has."""
+
+MOST_STRAYS: Final = 0.2
+"""Of a view's points: more are no strays, the view is bad as a whole."""
+
+LEAST_KEPT: Final = 8
+"""Points that must be left where others are strays: with fewer, each may be the wrong one."""
+
+MEDIAN: Final = 2.0 * math.log(2.0)
+"""Of the squared length of two independent normal numbers."""
+
+NAMED: Final = 5
+"""Points that a text names at most."""
+
+WORST: Final = 10.0
+"""Pixels rms, beyond which the points are not those of the target: the wrong model of a lens leaves
+less."""
+
+WORST_PART: Final = 0.015
+"""The same as a part of the longer side of the image, where that is more."""
+
+WORST_SIGMAS: Final = 20.0
+"""The same as a multiple of the points' standard deviation, where that is more."""
+
+WAYS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
+"""How a picture may be flipped: the axes of the image whose direction changes."""
+
+EXPLAINED: Final = 0.75
+"""Part of what views disagree in about the principal point that flips must explain: true ones
+explain all, those by chance 0.56 at most (measured on recorded views)."""
+
+GAIN: Final = 1.04
+"""Weighted squares over those with pictures flipped back, from which on flips are no chance and do
+harm: what one in 20 views leads to."""
+
+TURNS: Final = 20
+"""In which lens and flips are chosen in turn, at most."""
+
+
+class Fitted(NamedTuple):
+    """A view and what was fitted to it."""
+
+    view: TargetView
+    camera: CameraModel
+    pose: Rigid  # ``T_camera_target``
+    points: Array  # (T, 3), of the target, metres
+
+    def equations(self, more: float) -> Equations:
+        """Return the view's equations; ``more``: variance beside the points' own, pixels^2."""
+        turned = self.points[self.view.ids] @ self.pose.rotation.T
+        seen = linearize(turned + self.pose.translation, self.camera)
+        white = whitening(self.view.covariance, more)
+        return Equations(
+            white @ pose_changes(seen.by_point, turned),
+            white @ seen.by_lens,
+            (white @ (self.view.points - seen.pixels)[..., None])[..., 0],
+        )
+
+
+class Equations(NamedTuple):
+    """Of one view, in standard deviations."""
+
+    by_pose: Array  # (N, 2, 6)
+    by_lens: Array  # (N, 2, 4 + K)
+    residuals: Array  # (N, 2), seen minus projected
+
+    def strays(self, limit: float) -> Mask:
+        """Return which points (N,) are off by a squared length where the others have them."""
+        kept = np.ones(len(self.residuals), dtype=np.bool_)
+        least = max(LEAST_KEPT, (1.0 - MOST_STRAYS) * len(kept))
+        while kept.sum() >= least:
+            rows, right = self.by_pose[kept].reshape(-1, 6), self.residuals[kept].ravel()
+            step = solve_scaled(rows.T @ rows, rows.T @ right)
+            off = ((self.residuals - self.by_pose @ step) ** 2).sum(axis=1)
+            worst = int(np.argmax(np.where(kept, off, 0.0)))
+            if off[worst] <= limit:
+                found: Mask = ~kept & (off > limit)
+                return found
+            kept[worst] = False
+        return np.zeros(len(kept), dtype=np.bool_)
+
+
+class Stray(NamedTuple):
+    """A point of a view that is not where the others have it."""
+
+    number: int  # of the view
+    row: int  # of the point in the view
+    ident: int  # its number on the target
+    off: float  # pixels
+
+
+def strays(fitted: Sequence[Fitted], more: float) -> list[Stray]:
+    """Return the points that are far off what all others say."""
+    if not fitted:
+        return []
+    equations = [one.equations(more) for one in fitted]
+    squares = np.concatenate([(one.residuals**2).sum(axis=1) for one in equations])
+    # the median stays what it is, whatever a few strays do to ``more``
+    limit = STRAY**2 * float(np.median(squares)) / MEDIAN
+    found = []
+    for number, (one, equation) in enumerate(zip(fitted, equations, strict=True)):
+        for row in np.flatnonzero(equation.strays(limit)).tolist():
+            deviation = math.sqrt(more + float(np.trace(one.view.covariance[row])) / 2)
+            off = deviation * float(np.linalg.norm(equation.residuals[row]))
+            if off > LEAST_STRAY:
+                found.append(Stray(number, row, int(one.view.ids[row]), off))
+    return found
+
+
+def without(views: Sequence[TargetView], found: Sequence[Stray]) -> list[TargetView]:
+    """Return views without some of their points."""
+    fewer = list(views)
+    for number, group in itertools.groupby(found, key=lambda one: one.number):
+        view = views[number]
+        kept = np.setdiff1d(np.arange(len(view.ids)), [one.row for one in group])
+        fewer[number] = dataclasses.replace(
+            view,
+            ids=view.ids[kept],
+            points=view.points[kept],
+            covariance=view.covariance[kept],
+        )
+    return fewer
+
+
+def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> Iterator[Remark]:
+    """Yield what is to be said of strays; ``names``: of the views."""
+    counts = collections.Counter(one.ident for one in found)
+    often = {ident for ident, count in counts.items() if count >= max(3, len(names) / 2)}
+    for ident in sorted(often):
+        off = [one.off for one in found if one.ident == ident]
+        yield Remark(
+            Code.OUTLIER,
+            f"point {ident} of the target is {np.median(off):.3g} pixels off in {len(off)} of "
+            f"{len(names)} views: it is not where it was meant to be, or something is taken for "
+            f"it; it {done} there",
+        )
+    rest = [one for one in found if one.ident not in often]
+    if rest:
+        each = [f"{one.ident} in {names[one.number]} ({one.off:.3g} pixels)" for one in rest]
+        more = f", and {len(each) - NAMED} more" if len(each) > NAMED else ""
+        yield Remark(
+            Code.OUTLIER,
+            f"points that are not where the others of their views have them: "
+            f"{', '.join(each[:NAMED])}{more}: each {done}",
+        )
+
+
+def located(
+    views: Sequence[TargetView], poses: Sequence[TargetPose], camera: CameraModel
+) -> tuple[list[TargetView], list[Remark]]:
+    """Return views before a known camera without their strays, and what is to be said of these."""
+    off = np.concatenate([one.residuals for one in poses])
+    noise = np.concatenate([one.covariance for one in views])
+    more = excess(off, noise, off.size - 6 * len(views))
+    fitted = [
+        Fitted(view, camera, pose.transform.rigid, view.target.points)
+        for view, pose in zip(views, poses, strict=True)
+    ]
+    found = strays(fitted, more)
+    names = [label(view, number) for number, view in enumerate(views)]
+    return without(views, found), list(stray_remarks(found, names, "was not used"))
+
+
+def examined(
+    found: IntrinsicCalibration,
+    again: Callable[[list[TargetView]], IntrinsicCalibration],
+    *,
+    drop: bool,
+) -> IntrinsicCalibration:
+    """Return a calibration of a lens without the points that are far off, and with remarks on them.
+
+    ``again`` calibrates it from other views. ``drop``: whether the points are left out. Raises
+    ``POOR_FIT``: the points are not the target's; ``MIRRORED``: some pictures are flipped.
+    """
+    places = [number for number, one in enumerate(found.views) if one.used]
+    views = [one.view for one in found.views]
+    points = views[0].target.points + (0.0 if found.sheet is None else found.sheet)
+    fitted = [
+        Fitted(views[number], found.camera, found.views[number].transform.rigid, points)
+        for number in places
+    ]
+    names = [label(views[number], number) for number in places]
+    check_rms("intrinsics", found.rms, [one.view for one in fitted])
+    check_flips(fitted, found.sigma**2, np.diag(found.covariance) > 0, names)
+    off = strays(fitted, found.sigma**2)
+    if not off:
+        return found
+    done = "was not used" if drop else "is used all the same"
+    remarks = tuple(stray_remarks(off, names, done))
+    if drop:
+        kept = without([one.view for one in fitted], off)
+        for number, view in zip(places, kept, strict=True):
+            views[number] = view
+        found = again(views)
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
+
+
+def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
+    """Raise (``POOR_FIT``) where residuals are so large that the points are not the target's."""
+    most = most_rms(views)
+    if rms > most:
+        raise CalibrationError(
+            f"{what}: expected views of {views[0].target}, got residuals of {rms:.3g} pixels rms, "
+            f"{most:.3g} at most expected: are columns and rows those of the sheet, and are the "
+            "points those that their numbers say?",
+            code=Code.POOR_FIT,
+            expected=most,
+            got=rms,
+        )
+
+
+def most_rms(views: Sequence[TargetView]) -> float:
+    """Return the residuals, rms of a coordinate in pixels, beyond which views cannot be so."""
+    noise = float(np.median(np.concatenate([one.sigmas for one in views])))
+    longer = max(max(one.size) for one in views)
+    return max(WORST, WORST_PART * longer, WORST_SIGMAS * noise)
+
+
+# ---------------------------------------------------------------------- flipped pictures
+
+
+class _Reduced(NamedTuple):
+    """What views say of a lens' values, whatever their poses.
+
+    Where the values change by x, the weighted squares of view i are
+    ``squares[i] - 2 right[i] x + x matrix[i] x``.
+    """
+
+    matrix: Array  # (V, L, L)
+    right: Array  # (V, L)
+    squares: Array  # (V,)
+
+    @classmethod
+    def of(cls, equations: Sequence[Equations]) -> _Reduced:
+        """Return those of views, the best pose of each taken in."""
+        parts = []
+        for one in equations:
+            rows = one.by_pose.reshape(-1, 6)
+            rest = np.column_stack([one.by_lens.reshape(len(rows), -1), one.residuals.ravel()])
+            rest = rest - rows @ solve_scaled(rows.T @ rows, rows.T @ rest)
+            parts.append(rest.T @ rest)
+        found = np.array(parts)
+        return cls(found[:, :-1, :-1], found[:, :-1, -1], found[:, -1, -1])
+
+    def misfits(self, change: Array) -> Array:
+        """Return the weighted squares of each view (V,) where the values change by (L,)."""
+        misfits: Array = self.squares - 2.0 * self.right @ change + self.matrix @ change @ change
+        return misfits
+
+    def own(self, places: Sequence[int], free: Mask) -> float:
+        """Return the least squares where each view has values of its own at some places."""
+        # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
+        matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
+        for whole, side in zip(self.matrix, self.right, strict=True):
+            own = whole[np.ix_(places, places)]
+            both = solve_scaled(own, np.column_stack([whole[places], side[places]]))
+            matrix = matrix - whole[:, places] @ both[:, :-1]
+            right = right - whole[:, places] @ both[:, -1]
+            squares = squares - side[places] @ both[:, -1]
+        basis = np.eye(len(right))[:, free]
+        change = solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
+        return float(squares - change @ (basis.T @ right))
+
+
+class _Flip(NamedTuple):
+    """How a flip changes the values of a lens: by ``shift``, and their changes by ``mirror``."""
+
+    mirror: Array  # (L,), 1 or -1
+    shift: Array  # (L,)
+
+    @classmethod
+    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _Flip:
+        """Return what flipping pictures along some axes does."""
+        values = lens_values(camera)
+        mirror, goal = np.ones(len(values)), values.copy()
+        for axis in axes:
+            mirror[2 + axis], goal[2 + axis] = -1.0, camera.size[axis] - 1 - values[2 + axis]
+            if camera.distortion_model != "equidistant":
+                place = (7, 6)[axis]  # p2 stands for a tilt along x, p1 for one along y
+                mirror[place], goal[place] = -1.0, -values[place]
+        return cls(mirror, goal - values)
+
+    def best(self, reduced: _Reduced, free: Mask, flipped: Mask) -> tuple[Mask, float]:
+        """Return which views are better flipped, from a guess, and the squares of all then."""
+        # Lens and flips are chosen in turn, which only lowers the squares.
+        # Source: Lloyd, Least Squares Quantization in PCM (1982).
+        basis = np.eye(len(self.mirror))[:, free]
+        for _ in range(TURNS):
+            plain, other = (reduced.matrix[one].sum(axis=0) for one in (~flipped, flipped))
+            back = self.mirror * (reduced.right[flipped].sum(axis=0) - other @ self.shift)
+            matrix = plain + self.mirror[:, None] * other * self.mirror
+            right = reduced.right[~flipped].sum(axis=0) + back
+            change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
+            as_is = reduced.misfits(change)
+            mirrored = reduced.misfits(self.shift + self.mirror * change)
+            better = mirrored < as_is
+            if (better == flipped).all():
+                break
+            flipped = better
+        return flipped, float(np.minimum(as_is, mirrored).sum())
+
+
+def check_flips(fitted: Sequence[Fitted], more: float, free: Mask, names: Sequence[str]) -> None:
+    """Raise (``MIRRORED``) where some of the pictures are flipped against the others.
+
+    A picture of a board that looks the same in a mirror is found when it is flipped, too; its
+    points are then what a camera with a mirrored lens sees. ``more``: variance beside the points'
+    own, pixels^2. ``free`` (4 + K,): the lens' values that were fitted. ``names``: of the views.
+    """
+    if len(fitted) < 3:
+        return
+    reduced = _Reduced.of([one.equations(more) for one in fitted])
+    before = float(reduced.squares.sum())
+    best: tuple[float, str, Mask] | None = None
+    for how, axes in WAYS.items():
+        flip, places = _Flip.of(fitted[0].camera, axes), [2 + axis for axis in axes]
+        tried = [flip.best(reduced, free, one) for one in _guesses(reduced, places)]
+        flipped, after = min(tried, key=lambda one: one[1])
+        apart = before - reduced.own(places, free)
+        clear = before > GAIN * after and before - after > EXPLAINED * apart
+        if flipped.any() and not flipped.all() and clear and (best is None or after < best[0]):
+            best = after, how, flipped
+    if best is not None:
+        after, how, flipped = best
+        fewer = flipped if 2 * flipped.sum() <= len(flipped) else ~flipped
+        which = [name for name, one in zip(names, fewer.tolist(), strict=True) if one]
+        raise CalibrationError(
+            f"intrinsics: expected pictures as the camera takes them, got some that are flipped "
+            f"{how} against the others ({', '.join(which)}): all of them fit {before / after:.3g} times "
+            "better (squares) when those are flipped back",
+            code=Code.MIRRORED,
+            expected="pictures as the camera takes them",
+            got=which,
+        )
+
+
+def _guesses(reduced: _Reduced, places: Sequence[int]) -> Iterator[Mask]:
+    """Yield views that may be flipped: those that want the principal point elsewhere."""
+    for place in places:
+        weight = np.maximum(reduced.matrix[:, place, place], np.finfo(np.float64).tiny)
+        wish = reduced.right[:, place] / weight
+        yield wish < np.median(wish)
+        yield wish < 0
+        yield np.abs(wish) > 3 * np.median(np.abs(wish))
