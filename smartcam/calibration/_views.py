@@ -15,7 +15,7 @@ from smartcam.calibration._targets import MAX_POINTS, Target
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
 IDS = storage.Form(
     list[storage.Count],
@@ -136,14 +136,20 @@ def described(value: Any) -> str:
 
 def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
     """Return views as a list; else SHAPE: something else is among them, or it is no list."""
-    return [checked(one, TargetView, f"{what}: view {n}") for n, one in listed(views, what)]
+    return as_list(views, TargetView, f"{what}: view")
 
 
-def listed(values: Any, what: str) -> list[tuple[int, Any]]:
-    """Return the numbered items of what may be gone through; else SHAPE. Text and views may not."""
-    if isinstance(values, str | bytes | dict) or not hasattr(values, "__iter__"):
-        raise _refused(f"{what}: expected a list", "a list", described(values))
-    return list(enumerate(values))
+def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]:
+    """Return what may be gone through as a list; else SHAPE. All of it is of one of some kinds."""
+    if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
+        raise _refused(f"{what}s: expected a list", "a list", described(values))
+    return [checked(one, kinds, f"{what} {number}") for number, one in enumerate(values)]
+
+
+def check_choice(value: object, among: Sequence[str], what: str) -> None:
+    """Raise (SHAPE) where an option is none of those that there are."""
+    if not isinstance(value, str) or value not in among:
+        raise _refused(f"{what}: expected one of {list(among)}", list(among), repr(value))
 
 
 def as_covariances(values: Any, count: int, what: str) -> Array:

@@ -21,6 +21,7 @@ import numpy as np
 from smartcam.calibration._codes import Code
 from smartcam.calibration._geometry.rigid import Rigid, exp_rotation, log_rotation
 from smartcam.calibration._geometry.rotations import (
+    LARGEST,
     matrix_from_quaternion,
     quaternion_from_matrix,
     quaternion_multiply,
@@ -65,8 +66,17 @@ class Transform:
 
     def __post_init__(self) -> None:
         """Take read-only copies, and check them."""
-        rotation = np.array(self.rotation, dtype=np.float64)
-        translation = np.array(self.translation, dtype=np.float64)
+        for name in (self.target, self.source):
+            if not isinstance(name, str):
+                raise CalibrationError(
+                    "transform: expected names of two frames, then a rotation and a translation, "
+                    f"got {type(name).__name__} in place of a name",
+                    code=Code.SHAPE,
+                    expected="names of frames",
+                    got=type(name).__name__,
+                )
+        rotation = _numbers(self.rotation, f"{self.label}: rotation")
+        translation = _numbers(self.translation, f"{self.label}: translation")
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise CalibrationError(
                 f"{self.label}: expected a (3, 3) rotation and a (3,) translation, got "
@@ -78,15 +88,17 @@ class Transform:
         with np.errstate(all="ignore"):
             off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
             turn = float(np.linalg.det(rotation))
-        if not (off < _ORTHONORMAL and turn > 0 and np.isfinite(translation).all()):
+        far = not np.abs(translation).max() <= LARGEST
+        if not (off < _ORTHONORMAL and turn > 0) or far:
+            mirror = " (a reflection: one of the frames is left-handed)" if turn < 0 else ""
             raise CalibrationError(
                 f"{self.label}: expected a rotation and a finite translation, got a matrix of "
-                f"determinant {turn:.6g}, off by {off:.3g}, and {translation.tolist()}",
+                f"determinant {turn:.6g}{mirror}, off by {off:.3g}, and {translation.tolist()}",
                 code=Code.NOT_RIGID,
                 expected="a rotation, determinant 1",
                 got=turn,
             )
-        if self.at is not None and self.at.tzinfo is None:
+        if self.at is not None and getattr(self.at, "tzinfo", None) is None:
             raise CalibrationError(
                 f"{self.label}: expected a time with its time zone, got {self.at}",
                 code=Code.BAD_TIME,
@@ -118,7 +130,7 @@ class Transform:
         Raises:
             CalibrationError: ``NOT_RIGID``: the quaternion's length is more than 1 % off.
         """
-        values = np.asarray(quaternion, dtype=np.float64)
+        values = _numbers(quaternion, f"T_{target}_{source}: quaternion")
         length = float(np.linalg.norm(values))
         if values.shape != (4,) or not abs(length - 1.0) < _UNIT:
             raise CalibrationError(
@@ -129,7 +141,7 @@ class Transform:
                 got=length,
             )
         rotation = matrix_from_quaternion(values / length)
-        return cls(target, source, rotation, np.asarray(translation, dtype=np.float64), at)
+        return cls(target, source, rotation, _numbers(translation, "translation"), at)
 
     @classmethod
     def from_pose(cls, pose: Pose, source: str) -> Transform:
@@ -246,6 +258,31 @@ class Transform:
         step = exp_rotation(part * log_rotation(self.rotation.T @ later.rotation))
         translation = self.translation + part * (later.translation - self.translation)
         return Transform(self.target, self.source, self.rotation @ step, translation, at)
+
+
+def _numbers(values: ArrayLike, what: str) -> Array:
+    """Return a copy as float64; else NOT_RIGID."""
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as exc:
+        raise CalibrationError(
+            f"{what}: expected numbers: {exc}", code=Code.NOT_RIGID, expected="numbers"
+        ) from exc
+
+
+def as_motion(value: object, what: str, target: str, source: str) -> Transform:
+    """Return what is a :class:`Transform`; else SHAPE, which says how one is made."""
+    if isinstance(value, Transform):
+        return value
+    shape = np.shape(value) if isinstance(value, np.ndarray) else ()  # type: ignore[arg-type]
+    kind = "None" if value is None else type(value).__name__
+    raise CalibrationError(
+        f"{what}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
+        f'matrix M (4, 4) it is Transform("{target}", "{source}", M[:3, :3], M[:3, 3])',
+        code=Code.SHAPE,
+        expected="Transform",
+        got=kind,
+    )
 
 
 class PoseHistory:

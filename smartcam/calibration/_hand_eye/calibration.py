@@ -42,11 +42,14 @@ from smartcam.calibration._hand_eye.validation import (
     expected_error,
     most_error,
     poor_fit,
+    seen_poses,
 )
 from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.poses import CAMERA, TARGET, locate
 from smartcam.calibration._lens.projection import excess, whitening
+from smartcam.calibration._lens.suspicions import without_strays
+from smartcam.calibration._views import as_list, as_views
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -132,13 +135,14 @@ def calibrate_hand_eye(
 
     Raises:
         CalibrationError: ``TOO_FEW``, ``POSES_TOO_SIMILAR``, ``INSUFFICIENT_ROTATION``; ``SHAPE``:
-            not as many views as poses, or of another image size; ``WRONG_FRAME``: poses of several
-            frames, or that fit only when inverted or transposed; ``DIFFERENT_TARGETS``;
-            ``POOR_FIT``: nothing fits, as where poses and views are mixed up or lengths are in
+            not as many views as poses, or something else; ``WRONG_SIZE``; ``WRONG_FRAME``: poses of
+            several frames, or that fit only when inverted or transposed; ``MIRRORED``: the robot's
+            base is left-handed, or pictures are flipped; ``DIFFERENT_TARGETS``; ``POOR_FIT``: nothing fits, as where poses and views are mixed up or lengths are in
             millimetres; and what
             :func:`~smartcam.calibration.calibrate_intrinsics` says.
         MissingExtraError: SciPy or OpenCV is not installed, or OpenCV is 5.0.0.
     """
+    views = as_views(views, "hand-eye")
     transforms, order, robot = _robot(robot_poses, len(views), "views", setup)
     if any(one.target != views[0].target for one in views):
         raise CalibrationError(
@@ -149,6 +153,8 @@ def calibrate_hand_eye(
     ordered = [views[i] for i in order]
     lens = camera if camera is not None else calibrate_intrinsics(ordered, sheet="exact").camera
     located = [locate(one, lens) for one in ordered]
+    ordered, strays = without_strays(ordered, located, lens)
+    located = [locate(one, lens) for one in ordered] if strays else located
     poses = Rigid.stacked(one.transform.rigid for one in located)
     problem = Problem(
         robot=robot,
@@ -166,7 +172,7 @@ def calibrate_hand_eye(
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     return dataclasses.replace(
         _reordered(result, np.argsort(order)),
-        warnings=(*result.warnings, *remarks),
+        warnings=(*result.warnings, *remarks, *strays),
         robot_poses=tuple(transforms),
         views=tuple(views),
         target_poses=tuple(located[i].transform for i in np.argsort(order)),
@@ -201,6 +207,7 @@ def calibrate_hand_eye_from_poses(
     Raises:
         CalibrationError: as :func:`calibrate_hand_eye`.
     """
+    target_poses = seen_poses(target_poses)
     transforms, order, robot = _robot(robot_poses, len(target_poses), "poses of the target", setup)
     seen = [target_poses[i] for i in order]
     poses = Rigid.stacked(one.rigid for one in seen)
@@ -236,6 +243,7 @@ def _robot(
             expected=["eye-in-hand", "eye-to-hand"],
             got=setup,
         )
+    robot_poses = as_list(robot_poses, object, "pose of the robot")
     if len(robot_poses) != count or count > MOST_POSES:
         raise CalibrationError(
             f"hand-eye: expected as many {what} as poses of the robot, {MOST_POSES} at most, got "

@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam.calibration._codes import Code
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.frames import Transform, as_motion
 from smartcam.calibration._geometry.rotations import Array, as_points, check_finite
 from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
 from smartcam.calibration._hand_eye.model_selection import on_plane, point_errors
@@ -337,5 +337,10 @@ def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) ->
 
 
 def as_transform(pose: Transform | Pose, flange: str) -> Transform:
-    """Return ``T_base_flange`` of a pose of the robot, whichever way it is given."""
-    return Transform.from_pose(pose, flange) if isinstance(pose, Pose) else pose
+    """Return ``T_base_flange`` of a pose of the robot, whichever way it is given.
+
+    Raises SHAPE: it is given in none of these.
+    """
+    if isinstance(pose, Pose):
+        return Transform.from_pose(pose, flange)
+    return as_motion(pose, "pose of the robot", "base", flange)

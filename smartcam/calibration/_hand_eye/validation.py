@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import as_motion
 from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._hand_eye.closed_forms import solve_linear
 from smartcam.calibration._hand_eye.equations import (
@@ -22,13 +23,16 @@ from smartcam.calibration._hand_eye.equations import (
     Solution,
     carried,
 )
+from smartcam.calibration._lens.poses import CAMERA, TARGET
+from smartcam.calibration._views import as_list
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from smartcam.calibration._geometry.frames import Transform
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.model_selection import Problem
 
@@ -55,6 +59,10 @@ POOREST: Final = RobotSigmas(math.radians(2.0), 0.01)
 
 MILLI: Final = 1e-3
 
+MIRROR: Final = np.diag([-1.0, 1.0, 1.0])
+"""Which axis changes its direction does not matter: mirrors differ by turns, which base and flange
+make up for."""
+
 
 class Agreed(NamedTuple):
     """What most of the poses agree with."""
@@ -71,6 +79,28 @@ class Agreed(NamedTuple):
     def gross(self, limit: float) -> NDArray[np.intp]:
         """Return the poses that are more than ``limit`` off, and far more than the others."""
         return np.flatnonzero(self.off > max(limit, GROSS * self.median))
+
+
+def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
+    """Return poses of the target in the camera's frame as a list.
+
+    Raises SHAPE: something else; WRONG_FRAME: of several frames, or the camera's in the target's.
+    """
+    what = "pose of the target"
+    found = [
+        as_motion(one, f"{what} {number}", CAMERA, TARGET)
+        for number, one in enumerate(as_list(target_poses, object, what))
+    ]
+    for number, one in enumerate(found):
+        if one.label != found[0].label or (one.target, one.source) == (TARGET, CAMERA):
+            wanted = f"T_{CAMERA}_{TARGET}" if number == 0 else found[0].label
+            raise CalibrationError(
+                f"{what} {number}: expected {wanted}, got {one.label}",
+                code=Code.WRONG_FRAME,
+                expected=wanted,
+                got=one.label,
+            )
+    return found
 
 
 def extent(problem: Problem) -> float:
@@ -148,6 +178,9 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
     turned = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
     how = "with rotations transposed: their matrices or quaternions are those of the way back"
     yield RobotPoses(turned, in_hand), OTHERWISE, Code.WRONG_FRAME, how
+    mirrored = Rigid(MIRROR @ poses.rotation @ MIRROR, poses.translation @ MIRROR)
+    how = "in a left-handed base: expected axes x, y, z of a right hand"
+    yield RobotPoses(mirrored, in_hand), OTHERWISE, Code.MIRRORED, how
     how = "as millimetres: expected metres"
     yield RobotPoses(poses.scaled(MILLI), in_hand), OTHERWISE, Code.POOR_FIT, how
     how = "with the target in millimetres: expected its lengths in metres"
@@ -157,7 +190,7 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
 def check_poses(problem: Problem) -> Agreed:
     """Return the motion that most of the poses agree with.
 
-    Raises ``WRONG_FRAME``, or ``POOR_FIT``: the poses fit far better when they are read otherwise,
+    Raises ``WRONG_FRAME``, ``MIRRORED``, or ``POOR_FIT``: the poses fit far better when they are read otherwise,
     or do not fit at all.
     """
     found = agreement(problem)

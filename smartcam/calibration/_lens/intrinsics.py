@@ -7,7 +7,7 @@ import functools
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, get_args
 
 import numpy as np
 from pydantic import Field
@@ -29,10 +29,15 @@ from smartcam.calibration._lens.poses import (
     view_rms,
 )
 from smartcam.calibration._lens.projection import whitening
-from smartcam.calibration._lens.sheet_shape import choose_shape, held_out_residuals, leave_out
+from smartcam.calibration._lens.sheet_shape import (
+    Sheet,
+    choose_shape,
+    held_out_residuals,
+    leave_out,
+)
 from smartcam.calibration._lens.start import fit_lens, parameter_names
 from smartcam.calibration._lens.suspicions import examined
-from smartcam.calibration._views import TargetView, as_views, label
+from smartcam.calibration._views import TargetView, as_views, check_choice, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -40,7 +45,6 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._lens.bundle import AdjustedBundle
     from smartcam.calibration._lens.model import DistortionModel
-    from smartcam.calibration._lens.sheet_shape import Sheet
 
 Bar = Annotated[storage.NonNegative, Field(le=1)]
 BARS = storage.row(tuple[Bar, Bar, Bar, Bar], Coverage._make)
@@ -231,6 +235,7 @@ def calibrate_intrinsics(
             such model; ``NOT_FINITE`` pixels; ``POOR_FIT``: no lens of this model shows them.
     """
     given = as_views(views, "intrinsics")
+    check_choice(sheet, get_args(Sheet), "sheet")
     check_views(given, "intrinsics", LEAST_VIEWS)
     _check_motion(given)
     held = tuple(fixed)

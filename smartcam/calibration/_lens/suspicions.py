@@ -35,12 +35,10 @@ if TYPE_CHECKING:
 
     Mask = NDArray[np.bool_]
 
-STRAY: Final = 12.0
-"""Standard deviations by which a point that is not the target's is off: those of 400 recorded views
-are 10 off at most (measured), as their noise is not quite normal."""
-
-LEAST_STRAY: Final = 0.25
-"""Pixels: what is less off does no harm among as many points as a view has."""
+OFF: Final = ((7.0, 1.5), (12.0, 0.25))
+"""Standard deviations and pixels by which a point that is not the target's is off, either pair: of
+the points of 200 recorded views, whose noise is not quite normal, the farthest is 9.6 and 0.8 off,
+or 5.9 and 1.8 (measured)."""
 
 MOST_STRAYS: Final = 0.2
 """Of a view's points: more are no strays, the view is bad as a whole."""
@@ -77,6 +75,12 @@ harm: recorded views reach 1.037 by chance, and 1.07 and more where three of 29 
 
 DEFORMATIONS: Final = 5
 """Of a sheet that are not taken for flips: x stretches, y leans, and three ways to bend."""
+
+GAIN_OF_POOR: Final = 2.0
+"""The same where the residuals are of a pixel and more: the lens may be of another model."""
+
+POOR: Final = 1.0
+"""This pixel."""
 
 TURNS: Final = 20
 """In which lens and flips are chosen in turn, at most."""
@@ -120,8 +124,11 @@ class Equations(NamedTuple):
     by_shared: Array  # (N, 2, 4 + K + D), by the lens' values, and by deformations of the sheet
     residuals: Array  # (N, 2), seen minus projected
 
-    def strays(self, limit: float) -> Mask:
-        """Return which points (N,) are off by a squared length where the others have them."""
+    def stray_squares(self, limit: float) -> Array:
+        """Return the squared lengths (N,) by which points are off, 0 where that is in the limit.
+
+        That is from where the other points of the view have them.
+        """
         kept = np.ones(len(self.residuals), dtype=np.bool_)
         least = max(LEAST_KEPT, (1.0 - MOST_STRAYS) * len(kept))
         while kept.sum() >= least:
@@ -130,10 +137,9 @@ class Equations(NamedTuple):
             off = ((self.residuals - self.by_pose @ step) ** 2).sum(axis=1)
             worst = int(np.argmax(np.where(kept, off, 0.0)))
             if off[worst] <= limit:
-                found: Mask = ~kept & (off > limit)
-                return found
+                return np.where(~kept & (off > limit), off, 0.0)
             kept[worst] = False
-        return np.zeros(len(kept), dtype=np.bool_)
+        return np.zeros(len(kept))
 
 
 class Stray(NamedTuple):
@@ -152,13 +158,14 @@ def strays(fitted: Sequence[Fitted], more: float) -> list[Stray]:
     equations = [one.equations(more) for one in fitted]
     squares = np.concatenate([(one.residuals**2).sum(axis=1) for one in equations])
     # the median stays what it is, whatever a few strays do to ``more``
-    limit = STRAY**2 * float(np.median(squares)) / MEDIAN
+    scale = float(np.median(squares)) / MEDIAN
     found = []
     for number, (one, equation) in enumerate(zip(fitted, equations, strict=True)):
-        for row in np.flatnonzero(equation.strays(limit)).tolist():
+        squares = equation.stray_squares(OFF[0][0] ** 2 * scale)
+        for row in np.flatnonzero(squares).tolist():
             deviation = math.sqrt(more + float(np.trace(one.view.covariance[row])) / 2)
-            off = deviation * float(np.linalg.norm(equation.residuals[row]))
-            if off > LEAST_STRAY:
+            times, off = math.sqrt(squares[row] / scale), deviation * math.sqrt(squares[row])
+            if any(times > most and off > pixels for most, pixels in OFF):
                 found.append(Stray(number, row, int(one.view.ids[row]), off))
     return found
 
@@ -201,7 +208,7 @@ def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> It
         )
 
 
-def located(
+def without_strays(
     views: Sequence[TargetView], poses: Sequence[TargetPose], camera: CameraModel
 ) -> tuple[list[TargetView], list[Remark]]:
     """Return views before a known camera without their strays, and what is to be said of these."""
@@ -368,13 +375,14 @@ def check_flips(fitted: Sequence[Fitted], more: float, free: Mask, names: Sequen
     reduced = _Reduced.of([one.equations(more) for one in fitted])
     free = np.concatenate([free, np.ones(DEFORMATIONS, dtype=np.bool_)])
     before = reduced.own([], free)
+    gain = GAIN if more <= POOR**2 else GAIN_OF_POOR
     best: tuple[float, str, Mask] | None = None
     for how, axes in WAYS.items():
         flip, places = _Flip.of(fitted[0].camera, axes), [2 + axis for axis in axes]
         tried = [flip.best(reduced, free, one) for one in _guesses(reduced, places)]
         flipped, after = min(tried, key=lambda one: one[1])
         apart = before - reduced.own(places, free)
-        clear = before > GAIN * after and before - after > EXPLAINED * apart
+        clear = before > gain * after and before - after > EXPLAINED * apart
         if flipped.any() and not flipped.all() and clear and (best is None or after < best[0]):
             best = after, how, flipped
     if best is not None:

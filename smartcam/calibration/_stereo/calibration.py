@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, get_args
 
 import numpy as np
 
@@ -28,9 +29,14 @@ from smartcam.calibration._lens.intrinsics import (
 )
 from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.poses import TARGET, check_view
-from smartcam.calibration._lens.sheet_shape import choose_shape, held_out_residuals, leave_out
+from smartcam.calibration._lens.sheet_shape import (
+    Sheet,
+    choose_shape,
+    held_out_residuals,
+    leave_out,
+)
 from smartcam.calibration._stereo import triangulation
-from smartcam.calibration._stereo.checks import check_fit, remark_sides
+from smartcam.calibration._stereo.checks import check_fit, check_pairs, examined, remark_sides
 from smartcam.calibration._stereo.errors import PairErrors, pair_errors
 from smartcam.calibration._stereo.rectification import Rectification, rectify
 from smartcam.calibration._stereo.start import (
@@ -44,7 +50,7 @@ from smartcam.calibration._stereo.start import (
     start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
-from smartcam.calibration._views import TargetView, label
+from smartcam.calibration._views import TargetView, check_choice, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -54,7 +60,6 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._lens.bundle import AdjustedBundle
     from smartcam.calibration._lens.model import DistortionModel
-    from smartcam.calibration._lens.sheet_shape import Sheet
     from smartcam.calibration._targets import Target
 
 PoseInLeft = Annotated[Transform, storage.motion(lambda _: (LEFT, TARGET))]
@@ -326,9 +331,13 @@ def calibrate_stereo(
             ``SHAPE``: lists of different lengths, or a coefficient that is none; ``WRONG_SIZE``,
             ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``; ``POOR_FIT``: no lens or no
             transform shows the views, as where those of many pairs are of different moments;
-            ``INSUFFICIENT_ROTATION``: the target was not tilted.
+            ``INSUFFICIENT_ROTATION``: the target was not tilted; ``MIRRORED`` pictures;
+            ``COINCIDENT``: both sides are of one camera; ``SWAPPED_LENSES``: ``left`` is the right
+            camera's, and ``right`` the left one's.
     """
     moments = as_moments(left_views, right_views)
+    check_pairs(moments, (left, right))
+    check_choice(sheet, get_args(Sheet), "sheet")
     least = LEAST_PAIRS if left and right else LEAST_VIEWS
     both = [number for number, one in enumerate(moments) if None not in one]
     if len(both) < least:
@@ -368,7 +377,17 @@ def calibrate_stereo(
         if not drop_bad or len(bad) > most or len(_pairs(rest)) < least:
             break
         sights, bundle = rest, adjusted.bundle
-    return _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
+    again = functools.partial(
+        calibrate_stereo,
+        left=left,
+        right=right,
+        distortion_model=distortion_model,
+        fixed=lenses.fixed,
+        sheet=sheet,
+        drop_bad=drop_bad,
+    )
+    found = _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
+    return examined(found, again, drop=drop_bad)
 
 
 def _pairs(sights: Sequence[Sight]) -> list[int]:

@@ -1,21 +1,30 @@
-"""Whether what was found of two cameras can be so."""
+"""Whether what two cameras saw, and what was found of them, can be so."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from smartcam.calibration._codes import Code, Remark
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.poses import locate
+from smartcam.calibration._lens.suspicions import Fitted, stray_remarks, strays, without
 from smartcam.calibration._stereo.start import SIDES
-from smartcam.calibration._views import label
+from smartcam.calibration._views import checked, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.bundle import Sight
+    from smartcam.calibration._stereo.calibration import StereoCalibration
+    from smartcam.calibration._stereo.start import Moment
+    from smartcam.calibration._views import TargetView
 
 WORST: Final = 5.0
 """Pixels rms, beyond which the pairs do not belong together."""
@@ -26,8 +35,120 @@ WORST_PART: Final = 0.005
 WORST_SIGMAS: Final = 20.0
 """The same as a multiple of the points' standard deviation, where that is more."""
 
+EXCHANGED: Final = 1.05
+"""Residuals over those with the lenses exchanged, from which on they are: two lenses of one make
+differ by 1.7 and more where they are not (measured on recorded pairs)."""
+
+MOST_PAIRS: Final = 0.75
+"""Of the pairs that must say so."""
+
+APART: Final = 30.0
+"""Squared standard deviations by which the right camera's place is no chance from the left one's:
+of three axes one in a million is more."""
+
 UPRIGHT: Final = 1.0
 """Trace of the rotation between cameras that are turned by a right angle."""
+
+
+def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]) -> None:
+    """Refuse pairs that one camera took, and known lenses that are those of the other sides.
+
+    Raises ``COINCIDENT``: an image stands on both sides; ``SWAPPED_LENSES``.
+    """
+    for side, lens in zip(SIDES, known, strict=True):
+        checked(lens, (CameraModel, type(None)), f"stereo: {side}")
+    pairs = [
+        (number, left, right)
+        for number, (left, right) in enumerate(moments)
+        if left is not None and right is not None
+    ]
+    for number, left, right in pairs:
+        if np.array_equal(left.ids, right.ids) and np.array_equal(left.points, right.points):
+            raise CalibrationError(
+                "stereo: expected what two cameras see, got the same image on both sides in "
+                f"{label(left, number)}",
+                code=Code.COINCIDENT,
+                expected="two cameras",
+                got=number,
+            )
+    first, second = known
+    if first is None or second is None or first.size != second.size or not pairs:
+        return
+    views = [(left, right) for _, left, right in pairs if left.size == right.size == first.size]
+    so, other = (
+        np.array([sum(_squares(*one) for one in zip(pair, lenses, strict=True)) for pair in views])
+        for lenses in ((first, second), (second, first))
+    )
+    ratio = math.sqrt(float(so.sum() / other.sum())) if other.sum() > 0 else 1.0
+    if ratio > EXCHANGED and (other < so).mean() >= MOST_PAIRS:
+        raise CalibrationError(
+            "stereo: expected the left camera's lens as left and the right one's as right, got "
+            f"residuals {ratio:.3g} times as large as with the two exchanged",
+            code=Code.SWAPPED_LENSES,
+            expected=1.0,
+            got=ratio,
+        )
+
+
+def _squares(view: TargetView, camera: CameraModel) -> float:
+    return float((locate(view, camera).residuals ** 2).sum())
+
+
+def check_apart(transform: Transform, covariance: Array) -> None:
+    """Raise (``COINCIDENT``) where the right camera is where the left one is.
+
+    ``covariance`` (6, 6): of ``T_right_left``.
+    """
+    shift, spread = transform.translation, covariance[3:, 3:]
+    if float(shift @ np.linalg.pinv(spread) @ shift) < APART:
+        raise CalibrationError(
+            "stereo: expected two cameras that stand apart, got one "
+            f"{1e3 * float(np.linalg.norm(shift)):.2g} mm from the other, which may be nothing: "
+            "are the images of both sides those of one camera?",
+            code=Code.COINCIDENT,
+            expected="two places",
+            got=float(np.linalg.norm(shift)),
+        )
+
+
+def examined(
+    found: StereoCalibration,
+    again: Callable[..., StereoCalibration],
+    *,
+    drop: bool,
+) -> StereoCalibration:
+    """Return a calibration without points that are far off in their views, and remarks on them.
+
+    ``again`` calibrates from other views of both sides. ``drop``: whether the points are left out.
+    Raises ``COINCIDENT``: the cameras do not stand apart.
+    """
+    check_apart(found.transform, found.covariance)
+    sides = [[one.left for one in found.pairs], [one.right for one in found.pairs]]
+    cameras, rigs = (found.left, found.right), (None, found.transform)
+    fitted, places = [], []
+    for side, (camera, rig) in enumerate(zip(cameras, rigs, strict=True)):
+        for number, pair in enumerate(found.pairs):
+            view = sides[side][number]
+            if view is not None and pair.used[side] and pair.transform is not None:
+                pose = pair.transform if rig is None else rig @ pair.transform
+                points = view.target.points + (0.0 if found.sheet is None else found.sheet)
+                fitted.append(Fitted(view, camera, pose.rigid, points))
+                places.append((side, number))
+    off = strays(fitted, found.sigma**2)
+    if not off:
+        return found
+    names = [
+        f"{label(one.view, number)}, {SIDES[side]}"
+        for one, (side, number) in zip(fitted, places, strict=True)
+    ]
+    done = "was not used" if drop else "is used all the same"
+    remarks = tuple(stray_remarks(off, names, done))
+    if drop:
+        kept = without([one.view for one in fitted], off)
+        for (side, number), view in zip(places, kept, strict=True):
+            sides[side][number] = view
+        found = again(*sides)
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
 
 
 def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None:

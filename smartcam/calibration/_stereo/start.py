@@ -15,6 +15,7 @@ from smartcam.calibration._lens.intrinsics import check_tilts, check_views
 from smartcam.calibration._lens.poses import locate
 from smartcam.calibration._lens.start import fit_lens, lens_basis
 from smartcam.calibration._targets import Charuco
+from smartcam.calibration._views import TargetView, as_list
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from smartcam.calibration._geometry.frames import Transform
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.model import CameraModel, DistortionModel
-    from smartcam.calibration._views import TargetView
 
 LEFT: Final = "left"
 """Name of the left camera's frame."""
@@ -73,6 +73,10 @@ def as_moments(
     ``TOO_FEW``, ``COLLINEAR``, ``NOT_FINITE``: views that do not belong together, or one that is of
     no use.
     """
+    left_views, right_views = (
+        as_list(views, (TargetView, type(None)), f"{side} view")
+        for side, views in zip(SIDES, (left_views, right_views), strict=True)
+    )
     if len(left_views) != len(right_views):
         raise CalibrationError(
             f"stereo: expected as many left views as right ones, got {len(left_views)} and "
