@@ -58,6 +58,7 @@ class Checkerboard:
     def __post_init__(self) -> None:
         _check_counts(self.kind, self.columns, self.rows)
         _check_lengths(self.kind, square=self.square)
+        _check_flags(self.kind, origin_mark=self.origin_mark)
 
     @property
     def points(self) -> Array:
@@ -115,6 +116,14 @@ class Charuco:
     def __post_init__(self) -> None:
         _check_counts(self.kind, self.columns, self.rows)
         _check_lengths(self.kind, square=self.square, marker=self.marker)
+        _check_flags(self.kind, legacy_pattern=self.legacy_pattern)
+        if not isinstance(self.dictionary, str):
+            raise CalibrationError(
+                f"charuco: expected the name of a dictionary, got {self.dictionary!r}",
+                code=Code.SHAPE,
+                expected="DICT_5X5_250",
+                got=self.dictionary,
+            )
         if self.marker >= self.square:
             raise CalibrationError(
                 f"charuco: expected a marker smaller than its square ({self.square:g} m), "
@@ -157,6 +166,9 @@ class CircleGrid:
     def __post_init__(self) -> None:
         _check_counts(self.kind, self.columns, self.rows)
         _check_lengths(self.kind, spacing=self.spacing, diameter=self.diameter)
+        _check_flags(self.kind, asymmetric=self.asymmetric)
+        if self.origin_diameter is not None:
+            _check_lengths(self.kind, origin_diameter=self.origin_diameter)
         between = (self.diameter + (self.origin_diameter or self.diameter)) / 2
         apart = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
         if between >= apart:
@@ -214,14 +226,15 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
     Raises:
         CalibrationError: SHAPE: not a description of a target.
     """
-    given = dict(data)
-    kind = _KINDS.get(given.pop("kind", ""))
+    given = dict(data) if hasattr(data, "items") else {}
+    named = given.pop("kind", None)
+    kind = _KINDS.get(named) if isinstance(named, str) else None
     if kind is None:
         raise CalibrationError(
-            f"target: expected a kind of {sorted(_KINDS)}, got {data.get('kind')!r}",
+            f"target: expected a kind of {sorted(_KINDS)}, got {named!r}",
             code=Code.SHAPE,
             expected=sorted(_KINDS),
-            got=data.get("kind"),
+            got=named,
         )
     try:
         return kind(**given)
@@ -267,6 +280,17 @@ def _check_counts(kind: str, columns: Any, rows: Any) -> None:
             expected=MAX_POINTS,
             got=columns * rows,
         )
+
+
+def _check_flags(kind: str, **flags: Any) -> None:
+    for name, flag in flags.items():
+        if not isinstance(flag, bool):
+            raise CalibrationError(
+                f"{kind}: expected {name} to be True or False, got {flag!r}",
+                code=Code.SHAPE,
+                expected="True or False",
+                got=flag,
+            )
 
 
 def _check_lengths(kind: str, **lengths: Any) -> None:

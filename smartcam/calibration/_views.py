@@ -65,6 +65,7 @@ class TargetView(storage.Stored):
 
     def __post_init__(self) -> None:
         """Take read-only copies, and check them."""
+        checked(self.name, str, "view of a target: name")
         called = f"target in {self.name}" if self.name else "view of a target"
         target = checked(self.target, get_args(Target), f"{called}: target")
         ids = _as_ids(self.ids, len(target.points), called)
@@ -73,7 +74,7 @@ class TargetView(storage.Stored):
             expected = f"{called}: points: expected shape ({len(ids)}, 2) as there are ids"
             raise _refused(expected, (len(ids), 2), points.shape)
         covariance = as_covariances(self.covariance, len(ids), f"{called}: covariance").copy()
-        _check_size(self.size, called)
+        check_size(self.size, called)
         for name, value in (("ids", ids), ("points", points), ("covariance", covariance)):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -142,7 +143,7 @@ def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
 def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]:
     """Return what may be gone through as a list; else SHAPE. All of it is of one of some kinds."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
-        raise _refused(f"{what}s: expected a list", "a list", described(values))
+        raise _refused(f"{what}: expected a list of such", "a list", described(values))
     return [checked(one, kinds, f"{what} {number}") for number, one in enumerate(values)]
 
 
@@ -157,10 +158,13 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
 
     Raises SHAPE, NOT_FINITE, or NO_COVARIANCE: not symmetric, or with a negative variance.
     """
-    shape = np.shape(values)
-    if shape != (count, 2, 2):
-        raise _refused(f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), shape)
-    found = as_points(np.reshape(values, (-1, 4)), 4, what).reshape(-1, 2, 2)
+    try:
+        given = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as exc:
+        raise _refused(f"{what}: expected numbers", (count, 2, 2), exc) from exc
+    if given.shape != (count, 2, 2):
+        raise _refused(f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape)
+    found = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
     # a symmetric matrix is one where neither its trace nor its determinant is negative
     trace = np.trace(found, axis1=1, axis2=2)
     uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > ROUNDED * np.abs(found).max(axis=(1, 2))
@@ -201,7 +205,8 @@ def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.d
     return ids
 
 
-def _check_size(values: Any, called: str) -> None:
+def check_size(values: Any, called: str) -> None:
+    """Raise (SHAPE) where something is no size of an image: width and height, pixels."""
     whole = (int, np.integer)
     plain = isinstance(values, tuple | list) and len(values) == 2
     if not plain or not all(isinstance(one, whole) and one > 0 for one in values):

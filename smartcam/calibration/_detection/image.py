@@ -45,7 +45,8 @@ def grey_image(image: Any) -> GreyImage:
     ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; else SHAPE is raised. The
     brightest level of uint16 becomes 255, whether the camera fills 10, 12 or 16 bits.
     """
-    shape, kind = np.shape(image), getattr(image, "dtype", None)
+    shape = np.shape(image) if isinstance(image, np.ndarray) else ()
+    kind = getattr(image, "dtype", None)
     fits = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
     if not (
         isinstance(image, np.ndarray)

@@ -131,7 +131,8 @@ class Transform:
             CalibrationError: ``NOT_RIGID``: the quaternion's length is more than 1 % off.
         """
         values = _numbers(quaternion, f"T_{target}_{source}: quaternion")
-        length = float(np.linalg.norm(values))
+        with np.errstate(all="ignore"):
+            length = float(np.linalg.norm(values))
         if values.shape != (4,) or not abs(length - 1.0) < _UNIT:
             raise CalibrationError(
                 f"T_{target}_{source}: expected a quaternion x, y, z, w of length 1, got "
@@ -150,6 +151,13 @@ class Transform:
         Raises:
             CalibrationError: ``NOT_RIGID``, ``BAD_TIME``.
         """
+        if not isinstance(pose, Pose):
+            raise CalibrationError(
+                f"from_pose: expected a Pose, got {type(pose).__name__}",
+                code=Code.SHAPE,
+                expected="Pose",
+                got=type(pose).__name__,
+            )
         header = pose.header
         return cls.from_quaternion(
             header.frame_id, source, pose.position, pose.orientation, header.stamp
@@ -201,6 +209,7 @@ class Transform:
             CalibrationError: ``WRONG_FRAME``: the frames between them differ; ``NOT_SIMULTANEOUS``:
                 their times do.
         """
+        as_motion(other, f"{self.label} @", self.source, "source")
         if self.source != other.target:
             raise CalibrationError(
                 f"{self.label} @ {other.label}: expected a transform into {self.source!r}, got one "
@@ -221,12 +230,12 @@ class Transform:
         return Transform(self.target, other.source, *(self.rigid @ other.rigid), at)
 
     def apply(self, points: ArrayLike) -> Array:
-        """Return points of the source, (..., 3) in metres, in the target."""
-        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        """Return points of the source, (..., 3) in metres, in the target; else SHAPE."""
+        return _rows(points, 3, f"{self.label}: points") @ self.rotation.T + self.translation
 
     def turn(self, quaternions: ArrayLike) -> Array:
-        """Return orientations in the source, (..., 4), as orientations in the target."""
-        return quaternion_multiply(self.quaternion, np.asarray(quaternions, dtype=np.float64))
+        """Return orientations in the source, (..., 4), as those in the target; else SHAPE."""
+        return quaternion_multiply(self.quaternion, _rows(quaternions, 4, "orientations"))
 
     def between(self, later: Transform, at: datetime) -> Transform:
         """Return it at a moment between this one and a later one of the same frames.
@@ -270,11 +279,29 @@ def _numbers(values: ArrayLike, what: str) -> Array:
         ) from exc
 
 
+def _rows(values: ArrayLike, count: int, what: str) -> Array:
+    """Return numbers (..., ``count``); else SHAPE. NaN may be among them."""
+    try:
+        rows = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as exc:
+        raise CalibrationError(
+            f"{what}: expected numbers: {exc}", code=Code.SHAPE, expected="numbers"
+        ) from exc
+    if rows.shape[-1:] != (count,):
+        raise CalibrationError(
+            f"{what}: expected shape (..., {count}), got {rows.shape}",
+            code=Code.SHAPE,
+            expected=f"(..., {count})",
+            got=rows.shape,
+        )
+    return rows
+
+
 def as_motion(value: object, what: str, target: str, source: str) -> Transform:
     """Return what is a :class:`Transform`; else SHAPE, which says how one is made."""
     if isinstance(value, Transform):
         return value
-    shape = np.shape(value) if isinstance(value, np.ndarray) else ()  # type: ignore[arg-type]
+    shape = np.shape(value) if isinstance(value, np.ndarray) else ()
     kind = "None" if value is None else type(value).__name__
     raise CalibrationError(
         f"{what}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "

@@ -7,7 +7,7 @@ arrays of shape (..., 4) in the order x, y, z, w. ``R_a_b`` turns coordinates of
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,8 @@ def as_points(values: ArrayLike, columns: int, what: str) -> Array:
     ``what`` names the points in the text.
     """
     try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex ones came")
         points = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as exc:
         raise CalibrationError(
@@ -68,7 +70,8 @@ def as_points(values: ArrayLike, columns: int, what: str) -> Array:
 
 def as_vector(values: ArrayLike, length: int, what: str) -> Array:
     """Return ``values`` as float64 of shape (``length``,); else SHAPE or NOT_FINITE."""
-    vector: Array = as_points(np.expand_dims(np.asarray(values), 0), length, what)[0]
+    one: Any = [values]
+    vector: Array = as_points(one, length, what)[0]
     return vector
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from smartcam.calibration._codes import Code, Remark
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._geometry.rigid import Rigid
+from smartcam.calibration._geometry.rotations import as_vector
 from smartcam.calibration._hand_eye.closed_forms import check_motion, second_turn
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
@@ -137,9 +138,9 @@ def calibrate_hand_eye(
         CalibrationError: ``TOO_FEW``, ``POSES_TOO_SIMILAR``, ``INSUFFICIENT_ROTATION``; ``SHAPE``:
             not as many views as poses, or something else; ``WRONG_SIZE``; ``WRONG_FRAME``: poses of
             several frames, or that fit only when inverted or transposed; ``MIRRORED``: the robot's
-            base is left-handed, or pictures are flipped; ``DIFFERENT_TARGETS``; ``POOR_FIT``: nothing fits, as where poses and views are mixed up or lengths are in
-            millimetres; and what
-            :func:`~smartcam.calibration.calibrate_intrinsics` says.
+            base is left-handed, or pictures are flipped; ``DIFFERENT_TARGETS``; ``POOR_FIT``:
+            nothing fits, as where poses and views are mixed up or lengths are in millimetres; and
+            what :func:`~smartcam.calibration.calibrate_intrinsics` says.
         MissingExtraError: SciPy or OpenCV is not installed, or OpenCV is 5.0.0.
     """
     views = as_views(views, "hand-eye")
@@ -236,7 +237,7 @@ def _robot(
 
     Raises SHAPE, WRONG_FRAME, and what :func:`check_motion` says.
     """
-    if setup not in ("eye-in-hand", "eye-to-hand"):
+    if not isinstance(setup, str) or setup not in ("eye-in-hand", "eye-to-hand"):
         raise CalibrationError(
             f"hand-eye: expected setup eye-in-hand or eye-to-hand, got {setup!r}",
             code=Code.SHAPE,
@@ -271,14 +272,18 @@ def _robot(
 
 
 def _positive(sigmas: RobotSigmas | None) -> RobotSigmas | None:
-    if sigmas is not None and not all(math.isfinite(one) and one > 0 for one in sigmas):
+    if sigmas is None:
+        return None
+    given = as_vector(sigmas, 2, "robot_sigmas")
+    if not (given > 0).all():
         raise CalibrationError(
-            f"robot_sigmas: expected two positive numbers, radians and metres, got {tuple(sigmas)}",
+            "robot_sigmas: expected two positive numbers, radians and metres, got "
+            f"{tuple(given.tolist())}",
             code=Code.NOT_FINITE,
             expected="two positive numbers",
-            got=tuple(sigmas),
+            got=tuple(given.tolist()),
         )
-    return None if sigmas is None else RobotSigmas(*sigmas)
+    return RobotSigmas(*given.tolist())
 
 
 def _given(views: Sequence[TargetView]) -> Any:
@@ -305,9 +310,9 @@ def _observations(
 
 
 def _allowed(free: Mapping[str, tuple[int, ...]], adjust: str) -> dict[str, tuple[int, ...]]:
-    if adjust == "auto":
+    if isinstance(adjust, str) and adjust == "auto":
         return dict(free)
-    if adjust not in free:
+    if not isinstance(adjust, str) or adjust not in free:
         raise CalibrationError(
             f"adjust: expected auto or one of {list(free)}, got {adjust!r}",
             code=Code.SHAPE,
@@ -416,7 +421,7 @@ def _bad_view(result: HandEyeCalibration, index: int, name: str, done: str) -> R
 
 def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibration:
     free, method = asked.free, asked.method
-    if method != "auto" and method not in METHODS:
+    if not isinstance(method, str) or method not in ("auto", *METHODS):
         raise CalibrationError(
             f"method: expected auto or one of {list(METHODS)}, got {method!r}",
             code=Code.SHAPE,

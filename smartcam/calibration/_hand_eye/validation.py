@@ -190,8 +190,8 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
 def check_poses(problem: Problem) -> Agreed:
     """Return the motion that most of the poses agree with.
 
-    Raises ``WRONG_FRAME``, ``MIRRORED``, or ``POOR_FIT``: the poses fit far better when they are read otherwise,
-    or do not fit at all.
+    Raises ``WRONG_FRAME``, ``MIRRORED``, or ``POOR_FIT``: the poses fit far better when they are
+    read otherwise, or do not fit at all.
     """
     found = agreement(problem)
     off = math.inf if found is None else _on_target(problem, found)

@@ -37,7 +37,7 @@ from smartcam.calibration._lens.sheet_shape import (
 )
 from smartcam.calibration._lens.start import fit_lens, parameter_names
 from smartcam.calibration._lens.suspicions import examined
-from smartcam.calibration._views import TargetView, as_views, check_choice, label
+from smartcam.calibration._views import TargetView, as_list, as_views, check_choice, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def calibrate_intrinsics(
     check_choice(sheet, get_args(Sheet), "sheet")
     check_views(given, "intrinsics", LEAST_VIEWS)
     _check_motion(given)
-    held = tuple(fixed)
+    held = tuple(as_list(fixed, str, "fixed: name"))
     used = list(range(len(given)))
     while True:
         adjusted = fit_lens([given[number] for number in used], distortion_model, held)

@@ -16,6 +16,7 @@ from smartcam.calibration._codes import Code
 from smartcam.calibration._files import storage
 from smartcam.calibration._geometry.rotations import Array, as_points
 from smartcam.calibration._optional_imports import load
+from smartcam.calibration._views import check_size
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ COEFFICIENTS: dict[DistortionModel, int] = {
 
 def coefficient_names(model: DistortionModel) -> tuple[str, ...]:
     """Return the names of a model's coefficients; ``SHAPE``: no such model."""
-    if model not in COEFFICIENT_NAMES:
+    if not isinstance(model, str) or model not in COEFFICIENT_NAMES:
         raise CalibrationError(
             f"distortion model: expected one of {list(COEFFICIENT_NAMES)}, got {model!r}",
             code=Code.SHAPE,
@@ -46,6 +47,17 @@ def coefficient_names(model: DistortionModel) -> tuple[str, ...]:
             got=model,
         )
     return COEFFICIENT_NAMES[model]
+
+
+def _column(values: ArrayLike) -> Array:
+    """Return coefficients as a copy (K,), from rows or columns of them; else SHAPE, NOT_FINITE."""
+    try:
+        column = np.reshape(values, (-1, 1))
+    except (TypeError, ValueError) as exc:
+        raise CalibrationError(
+            f"distortion: expected numbers of shape (K,): {exc}", code=Code.SHAPE, expected="(K,)"
+        ) from exc
+    return as_points(column, 1, "distortion")[:, 0].copy()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,9 +82,10 @@ class CameraModel(storage.Stored):
     distortion_model: DistortionModel = "plumb_bob"
 
     def __post_init__(self) -> None:
+        check_size(self.size, "camera")
         matrix = as_points(self.matrix, 3, "camera matrix").copy()
         count = len(coefficient_names(self.distortion_model))
-        distortion = as_points(np.reshape(self.distortion, (-1, 1)), 1, "distortion")[:, 0].copy()
+        distortion = _column(self.distortion)
         if len(distortion) != count:
             raise CalibrationError(
                 f"{self.distortion_model}: expected {count} coefficients, got {len(distortion)}",

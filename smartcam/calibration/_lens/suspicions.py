@@ -129,7 +129,7 @@ class Equations(NamedTuple):
 
         That is from where the other points of the view have them.
         """
-        kept = np.ones(len(self.residuals), dtype=np.bool_)
+        kept = np.full(len(self.residuals), np.isfinite(self.residuals).all())
         least = max(LEAST_KEPT, (1.0 - MOST_STRAYS) * len(kept))
         while kept.sum() >= least:
             rows, right = self.by_pose[kept].reshape(-1, 6), self.residuals[kept].ravel()
@@ -139,7 +139,7 @@ class Equations(NamedTuple):
             if off[worst] <= limit:
                 return np.where(~kept & (off > limit), off, 0.0)
             kept[worst] = False
-        return np.zeros(len(kept))
+        return np.zeros(len(self.residuals))
 
 
 class Stray(NamedTuple):
@@ -151,12 +151,15 @@ class Stray(NamedTuple):
     off: float  # pixels
 
 
-def strays(fitted: Sequence[Fitted], more: float) -> list[Stray]:
-    """Return the points that are far off what all others say."""
-    if not fitted:
-        return []
+def strays(fitted: Sequence[Fitted], more: float, used: Sequence[bool]) -> list[Stray]:
+    """Return the points that are far off what all others say.
+
+    ``more``: variance beside the points' own, pixels^2. ``used``: the views that it is of; of the
+    others, a view may be bad for a few of its points.
+    """
     equations = [one.equations(more) for one in fitted]
-    squares = np.concatenate([(one.residuals**2).sum(axis=1) for one in equations])
+    of_used = [one for one, good in zip(equations, used, strict=True) if good]
+    squares = np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used])
     # the median stays what it is, whatever a few strays do to ``more``
     scale = float(np.median(squares)) / MEDIAN
     found = []
@@ -219,7 +222,7 @@ def without_strays(
         Fitted(view, camera, pose.transform.rigid, view.target.points)
         for view, pose in zip(views, poses, strict=True)
     ]
-    found = strays(fitted, more)
+    found = strays(fitted, more, [True] * len(fitted))
     names = [label(view, number) for number, view in enumerate(views)]
     return without(views, found), list(stray_remarks(found, names, "was not used"))
 
@@ -235,26 +238,24 @@ def examined(
     ``again`` calibrates it from other views. ``drop``: whether the points are left out. Raises
     ``POOR_FIT``: the points are not the target's; ``MIRRORED``: some pictures are flipped.
     """
-    places = [number for number, one in enumerate(found.views) if one.used]
-    views = [one.view for one in found.views]
+    views, used = [one.view for one in found.views], [one.used for one in found.views]
     points = views[0].target.points + (0.0 if found.sheet is None else found.sheet)
-    fitted = [
-        Fitted(views[number], found.camera, found.views[number].transform.rigid, points)
-        for number in places
-    ]
-    names = [label(views[number], number) for number in places]
-    check_rms("intrinsics", found.rms, [one.view for one in fitted])
-    check_flips(fitted, found.sigma**2, np.diag(found.covariance) > 0, names)
-    off = strays(fitted, found.sigma**2)
+    fitted = [Fitted(one.view, found.camera, one.transform.rigid, points) for one in found.views]
+    names = [label(view, number) for number, view in enumerate(views)]
+    check_rms("intrinsics", found.rms, views)
+    check_flips(
+        list(itertools.compress(fitted, used)),
+        found.sigma**2,
+        np.diag(found.covariance) > 0,
+        list(itertools.compress(names, used)),
+    )
+    off = strays(fitted, found.sigma**2, used)
     if not off:
         return found
     done = "was not used" if drop else "is used all the same"
     remarks = tuple(stray_remarks(off, names, done))
     if drop:
-        kept = without([one.view for one in fitted], off)
-        for number, view in zip(places, kept, strict=True):
-            views[number] = view
-        found = again(views)
+        found = again(without(views, off))
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
 
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import as_motion
+from smartcam.calibration._views import as_list
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -59,6 +61,10 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
         CalibrationError: ``TOO_FEW``: fewer than two; ``WRONG_FRAME``: between different frames;
             ``INSUFFICIENT_ROTATION``: the flange was turned by less than 20 degrees.
     """
+    flanges = [
+        as_motion(one, f"tool tip: pose {number}", "base", "flange")
+        for number, one in enumerate(as_list(flanges, object, "tool tip: pose"))
+    ]
     if len(flanges) < 2:
         raise CalibrationError(
             f"tool tip: expected two touches or more, got {len(flanges)}",

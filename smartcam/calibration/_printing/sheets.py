@@ -38,6 +38,7 @@ from smartcam.calibration._targets import (
     CircleGrid,
     target_from_data,
 )
+from smartcam.calibration._views import checked
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -334,6 +335,7 @@ def _mm(metres: float) -> str:
 
 
 def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
+    checked(target, (Checkerboard, Charuco, CircleGrid, Rays), "make_sheet: target")
     if isinstance(target, Rays):
         return quartered(MM * target.diameter / 2)
     return ink(target)

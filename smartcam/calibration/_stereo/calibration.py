@@ -50,7 +50,7 @@ from smartcam.calibration._stereo.start import (
     start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
-from smartcam.calibration._views import TargetView, check_choice, label
+from smartcam.calibration._views import TargetView, as_covariances, as_list, check_choice, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -348,7 +348,7 @@ def calibrate_stereo(
             expected=least,
             got=len(both),
         )
-    lenses = Lenses((left, right), distortion_model, tuple(fixed))
+    lenses = Lenses((left, right), distortion_model, tuple(as_list(fixed, str, "fixed: name")))
     moments, bundle, apart = start(moments, lenses)
     sights = [
         Sight(side, number, view)
@@ -528,13 +528,4 @@ def _remarks(calibration: StereoCalibration, found: _Found) -> Iterator[Remark]:
 def _covariances(given: ArrayLike | None, count: int, side: str) -> Array:
     if given is None:
         return np.tile(np.eye(2), (count, 1, 1))
-    values = np.asarray(given, dtype=np.float64)
-    if values.shape != (count, 2, 2):
-        raise CalibrationError(
-            f"{side} covariance: expected shape ({count}, 2, 2), got {values.shape}",
-            code=Code.SHAPE,
-            expected=(count, 2, 2),
-            got=values.shape,
-        )
-    as_points(values.reshape(-1, 4), 4, f"{side} covariance")
-    return values
+    return as_covariances(given, count, f"{side} covariance")

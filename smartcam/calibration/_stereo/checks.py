@@ -125,16 +125,17 @@ def examined(
     check_apart(found.transform, found.covariance)
     sides = [[one.left for one in found.pairs], [one.right for one in found.pairs]]
     cameras, rigs = (found.left, found.right), (None, found.transform)
-    fitted, places = [], []
+    fitted, places, used = [], [], []
     for side, (camera, rig) in enumerate(zip(cameras, rigs, strict=True)):
         for number, pair in enumerate(found.pairs):
             view = sides[side][number]
-            if view is not None and pair.used[side] and pair.transform is not None:
+            if view is not None and pair.transform is not None:
                 pose = pair.transform if rig is None else rig @ pair.transform
                 points = view.target.points + (0.0 if found.sheet is None else found.sheet)
                 fitted.append(Fitted(view, camera, pose.rigid, points))
                 places.append((side, number))
-    off = strays(fitted, found.sigma**2)
+                used.append(pair.used[side])
+    off = strays(fitted, found.sigma**2, used)
     if not off:
         return found
     names = [

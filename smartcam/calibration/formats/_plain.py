@@ -61,7 +61,7 @@ def malformed(what: str, expected: str, got: object = None) -> CalibrationError:
 
 def known(table: Mapping[str, T], name: str, what: str = "format") -> T:
     """Return a table's value for a name (``UNKNOWN_FORMAT``)."""
-    if name not in table:
+    if not isinstance(name, str) or name not in table:
         raise CalibrationError(
             f"no {what} is called {name!r}; expected one of {', '.join(table)}",
             code=Code.UNKNOWN_FORMAT,

@@ -1,0 +1,117 @@
+"""Pairs that are none, or that are not what they seem: each a typed error or a remark by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._stereo.calibration import StereoCalibration, calibrate_stereo
+from smartcam.calibration._stereo.checks import check_apart
+from smartcam.calibration._views import TargetView
+from tests.calibration.lens.test_wrong_views import flipped, mirrored
+from tests.calibration.lenskit import LEFT, RIG, RIGHT, pairs, poses, seen
+from tests.calibration.scenes import refused
+
+IMAGE = np.zeros((480, 640), dtype=np.uint8)
+
+known = functools.partial(calibrate_stereo, left=LEFT, right=RIGHT, sheet="exact")
+
+
+@pytest.mark.parametrize("views", [None, 3, IMAGE, "left", {}, [IMAGE] * 3])
+def test_calibrate_stereo_of_no_views_is_refused(views: Any) -> None:
+    left, right = pairs(3)
+    with refused("SHAPE", "left view"):
+        known(views, right)
+    with refused("SHAPE", "right view"):
+        known(left, views)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"left": np.eye(3)}, "stereo: left: expected a CameraModel"),
+        ({"right": "right.yaml"}, "stereo: right: expected a CameraModel"),
+        ({"sheet": "flat"}, "sheet: expected one of"),
+        ({"fixed": "k3"}, "fixed: name: expected a list"),
+    ],
+)
+def test_calibrate_stereo_of_wrong_options_is_refused(options: dict[str, Any], text: str) -> None:
+    with refused("SHAPE", text):
+        known(*pairs(3), **options)
+
+
+def test_calibrate_stereo_of_what_may_be_gone_through_once_is_taken() -> None:
+    left, right = pairs(2)
+    once: Any = iter(left)
+    found = known(once, right)
+    assert np.linalg.norm(found.transform.translation - RIG.translation) < 2e-4
+
+
+def test_calibrate_stereo_with_exchanged_lenses_is_refused() -> None:
+    left, right = pairs(4)
+    with refused("SWAPPED_LENSES", "times as large as with the two exchanged"):
+        calibrate_stereo(left, right, left=RIGHT, right=LEFT)
+
+
+def test_calibrate_stereo_with_lenses_that_are_alike_tells_nothing_of_them() -> None:
+    left = poses(4, name="left")
+    views = seen(LEFT, left, seed=1), seen(LEFT, [RIG @ one for one in left], seed=2)
+    found = known(*views, right=LEFT)
+    assert found.warnings == ()
+
+
+def test_calibrate_stereo_of_one_image_on_both_sides_is_refused() -> None:
+    left, right = pairs(3)
+    with refused("COINCIDENT", "the same image on both sides in 00"):
+        known(left, left)
+    with refused("COINCIDENT", "the same image on both sides in 02"):
+        known(left, [*right[:2], left[2]])
+
+
+@pytest.mark.parametrize("lens", [LEFT, pytest.param(None, marks=pytest.mark.long)])
+def test_calibrate_stereo_of_one_camera_twice_is_refused(lens: Any) -> None:
+    both = poses(4, name="left")
+    with refused("COINCIDENT", "are the images of both sides those of one camera?"):
+        known(seen(LEFT, both, seed=1), seen(LEFT, both, seed=2), left=lens, right=lens)
+
+
+def test_cameras_stand_apart_by_more_than_chance() -> None:
+    covariance = np.diag([1e-6] * 6)
+    check_apart(Transform("right", "left", np.eye(3), np.array([0.006, 0.0, 0.0])), covariance)
+    with refused("COINCIDENT", "5 mm from the other"):
+        check_apart(Transform("right", "left", np.eye(3), np.array([0.0, 0.005, 0.0])), covariance)
+
+
+def test_calibrate_stereo_of_mirrored_right_images_is_refused() -> None:
+    left, right = pairs(4)
+    with refused("MIRRORED", "in 00", "was the picture flipped"):
+        known(left, [mirrored(one) for one in right])
+    with refused("POOR_FIT", "are they in the same order"):
+        known(left, [flipped(one, 0) for one in right])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("side", [0, 1])
+def test_calibrate_stereo_names_points_that_are_off_and_leaves_them_out(side: int) -> None:
+    views, random = pairs(6), np.random.default_rng(1)
+    for number, view in enumerate(views[side]):
+        points = view.points.copy()
+        points[random.integers(len(points))] += [2.0, 2.2]
+        views[side][number] = dataclasses.replace(view, points=points)
+    found = known(*views)
+    (remark,) = [one for one in found.warnings if one.code == Code.OUTLIER]
+    assert f"in 00, {('left', 'right')[side]} (" in remark.text
+    assert found.rms < 0.055
+    assert _points(found, side) == [len(one.ids) - 1 for one in views[side]]
+    assert _points(found, 1 - side) == [len(one.ids) for one in views[1 - side]]
+
+
+def _points(found: StereoCalibration, side: int) -> list[int]:
+    views: list[TargetView | None] = [(one.left, one.right)[side] for one in found.pairs]
+    return [len(one.ids) for one in views if one is not None]
