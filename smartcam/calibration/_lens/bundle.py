@@ -1,5 +1,6 @@
 """Lenses, a rig of cameras and poses of targets, adjusted together to the least reprojection error.
 
+Where a sheet is not what it was meant to be its points are adjusted, too, in the same equations.
 Each target pose concerns its own views alone, so the six unknowns of each are eliminated; see
 :mod:`smartcam.calibration._least_squares`.
 """
@@ -15,11 +16,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from smartcam.calibration._geometry.rigid import IDENTITY, Rigid
-from smartcam.calibration._least_squares import Normal, minimize
-from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.calibration._least_squares import Normal, inverse_scaled, minimize, solve_scaled
+from smartcam.calibration._lens.projection import (
+    SMOOTH,
+    excess,
+    linearize,
+    pose_changes,
+    smooth_changes,
+    whitening,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.model import CameraModel
@@ -29,12 +37,28 @@ SETTLED: Final = 1e-7
 """Part of the weighted squares by which the last step still lowers them: of 1000 coordinates it is
 a hundredth of a standard deviation."""
 
-Indices: TypeAlias = np.ndarray[tuple[int], np.dtype[np.intp]]
+LOOSE: Final = 0.1
+"""Standard deviation that a sheet's point is thought to be off, in parts of its distance to the
+next: one that few views show does not go astray."""
+
+TIGHT: Final = 1e-4
+"""The same for place, direction and size of all points as a whole, which no view tells."""
+
+EACH: Final = 3
+"""Dimensions of the shared unknowns' matrix where each pose has its own."""
+
+MOST_AT_ONCE: Final = 4_000_000
+"""Numbers of the matrices of poses that are left out together: 32 MB."""
+
+FEW: Final = 5
+"""Poses up to which a fit without one of them is no small step away."""
+
+Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 """Numbers of things."""
 
 
 class Sight(NamedTuple):
-    """One view."""
+    """One view; a camera has one of each pose at most."""
 
     camera: int  # number of the camera
     pose: int  # number of the target's pose
@@ -52,9 +76,9 @@ class Bundle:
     # of its F unknowns; (4 + K, 0) for a lens that is known
     basis: tuple[Array, ...]
     rigid: bool = False  # whether ``rig`` is known
-    # (T, 3), of the target, metres, where they are not as they were meant to be; they are not
-    # adjusted here
+    # (T, 3), of the target, metres, where they are not as they were meant to be
     points: Array | None = None
+    free: bool = False  # whether ``points`` are adjusted; they are given then
 
     @classmethod
     def single(
@@ -68,6 +92,11 @@ class Bundle:
         known = known_lens(camera) if basis is None else basis
         return cls((camera,), Rigid.stacked([]), poses, (known,), points=points)
 
+    def known(self) -> Bundle:
+        """Return it with nothing to adjust but the poses."""
+        lenses = tuple(known_lens(one) for one in self.cameras)
+        return dataclasses.replace(self, basis=lenses, rigid=True, free=False)
+
     @property
     def lens_columns(self) -> list[slice]:
         """Where each camera's unknowns stand among the shared ones."""
@@ -75,10 +104,16 @@ class Bundle:
         return [slice(first, last) for first, last in itertools.pairwise(ends)]
 
     @property
-    def shared(self) -> int:
-        """Number of unknowns that all views share: the lenses', then 6 of each further camera."""
+    def of_cameras(self) -> int:
+        """Number of unknowns of the cameras: the lenses', then 6 of each further camera."""
         lenses = sum(int(one.shape[1]) for one in self.basis)
         return lenses + (0 if self.rigid else 6 * (len(self.cameras) - 1))
+
+    @property
+    def shared(self) -> int:
+        """Number of unknowns that all views share: the cameras', then 3 of each free point."""
+        free = self.points.size if self.free and self.points is not None else 0
+        return self.of_cameras + free
 
     def from_first(self, camera: int) -> Rigid:
         """Return the motion from the first camera's frame into that of a camera."""
@@ -91,11 +126,13 @@ class Bundle:
             with_lens(camera, lens_values(camera) + basis @ shared[some]) if basis.size else camera
             for camera, basis, some in zip(self.cameras, self.basis, columns, strict=True)
         )
-        rig = self.rig
+        rig, points = self.rig, self.points
         if not self.rigid and rig.size:
-            rig = rig.turned_after(shared[columns[-1].stop :].reshape(-1, 6))
+            rig = rig.turned_after(shared[columns[-1].stop : self.of_cameras].reshape(-1, 6))
+        if points is not None and self.free:
+            points = points + shared[self.of_cameras :].reshape(-1, 3)
         return dataclasses.replace(
-            self, cameras=cameras, rig=rig, poses=self.poses.turned_after(poses)
+            self, cameras=cameras, rig=rig, poses=self.poses.turned_after(poses), points=points
         )
 
 
@@ -125,9 +162,30 @@ class AdjustedBundle:
     residuals: list[Array]  # of each sight (N, 2), seen minus projected, pixels
     weighted: float  # sum of the weighted squares; infinite where points lie behind a camera
     more: float  # variance that each coordinate was given beside its own, pixels^2
-    covariance: Array  # (S, S), of the shared unknowns; NaN where ``weighted`` is infinite
-    pose_covariance: Array  # (P, 6, 6), of each pose
+    normal: Normal  # the equations at the solution
     freedom: int  # coordinates less unknowns
+
+    @property
+    def covariance(self) -> Array:
+        """That of the cameras' unknowns; NaN where ``weighted`` is infinite."""
+        count = self.bundle.of_cameras
+        if not math.isfinite(self.weighted):
+            return np.full((count, count), np.nan)
+        # the inverse's upper left block is that of Schur's complement: see Normal.covariance
+        matrix = self.normal.reduced()[0]
+        between, points = matrix[:count, count:], matrix[count:, count:]
+        return inverse_scaled(matrix[:count, :count] - between @ np.linalg.solve(points, between.T))
+
+    @property
+    def pose_covariance(self) -> Array:
+        """That of each pose (P, 6, 6)."""
+        return self.normal.covariance()[1]
+
+    @property
+    def rms(self) -> float:
+        """Standard deviation of a coordinate of the residuals, pixels."""
+        squares = sum(float((one**2).sum()) for one in self.residuals)
+        return math.sqrt(squares / max(self.freedom, 1))
 
 
 def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) -> AdjustedBundle:
@@ -151,9 +209,8 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
 
 def adjust(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
     """Return the least squares, each point weighted by its covariance and ``more`` variance."""
-    scene = _FixedPart(bundle, sights, more)
+    scene = Scene(bundle, sights, more)
     bundle, normal = minimize(bundle, scene.normal, Bundle.moved, gain=SETTLED)
-    covariance, pose_covariance = normal.covariance()
     count = 2 * sum(len(sight.view.ids) for sight in sights)
     seen = len({sight.pose for sight in sights})
     return AdjustedBundle(
@@ -161,109 +218,264 @@ def adjust(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBund
         residuals=scene.residuals(bundle),
         weighted=normal.cost,
         more=more,
-        covariance=covariance,
-        pose_covariance=pose_covariance,
-        freedom=count - bundle.shared - 6 * seen - _free_points(bundle, sights),
+        normal=normal,
+        freedom=count - bundle.of_cameras - 6 * seen - (free_points(sights) if bundle.free else 0),
     )
 
 
-def _free_points(bundle: Bundle, sights: Sequence[Sight]) -> int:
-    """Return the number of unknowns of the target's points; as a whole they keep 7 of them."""
-    if bundle.points is None:
-        return 0
+class HeldOut(NamedTuple):
+    """One pose under cameras that were fitted without its views."""
+
+    pose: int
+    bundle: Bundle  # the cameras and the sheet, without its views
+    residuals: list[Array]  # of each of its views (N, 2), pixels; the pose alone is fitted to them
+
+
+def held_out(
+    adjusted: AdjustedBundle, sights: Sequence[Sight], poses: Sequence[int]
+) -> Iterator[HeldOut]:
+    """Yield some poses, each left out once; in time that grows with their number.
+
+    Where there are few the fit without them is done anew.
+    """
+    # At the solution the normal equations without a pose are all less its own, both with their
+    # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
+    # without the pose. What it leaves is of second order in how far the pose pulls the others.
+    # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
+    if len(poses) <= FEW:
+        yield from (_anew(adjusted, sights, pose) for pose in poses)
+        return
+    matrix, right, _, _ = adjusted.normal.reduced()
+    together = max(1, MOST_AT_ONCE // max(1, len(right)) ** 2)
+    for first in range(0, len(poses), together):
+        some = list(poses[first : first + together])
+        own = [one._replace(pose=some.index(one.pose)) for one in sights if one.pose in some]
+        alone = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken(some))
+        each = Scene(alone, own, adjusted.more).normal(alone, each=True)
+        both = np.concatenate([each.mixed, each.own_right[..., None]], axis=2)
+        solved = np.linalg.solve(each.own, both)
+        part = each.mixed.swapaxes(1, 2) @ solved
+        for number, pose in enumerate(some):
+            step = solve_scaled(
+                matrix - (each.shared[number] - part[number, :, :-1]),
+                right - (each.shared_right[number] - part[number, :, -1]),
+            )
+            turned = solved[number, :, -1] - solved[number, :, :-1] @ step
+            only = dataclasses.replace(alone, poses=alone.poses.taken([number]))
+            without = only.moved(step, turned[None])
+            seen = [one for one in own if one.pose == number]
+            yield HeldOut(pose, without, [_off(without, one) for one in seen])
+
+
+def _anew(adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int) -> HeldOut:
+    """Return a pose under what is adjusted without it, however far that is."""
+    others = [one for one in sights if one.pose != pose]
+    without = adjust(adjusted.bundle, others, adjusted.more).bundle
+    without = dataclasses.replace(without, poses=without.poses.taken([pose]))
+    own = [one._replace(pose=0) for one in sights if one.pose == pose]
+    return HeldOut(pose, without, adjust(without.known(), own, adjusted.more).residuals)
+
+
+def _off(bundle: Bundle, sight: Sight) -> Array:
+    """Return a view's residuals (N, 2), pixels, its pose being the first."""
+    target = sight.view.target.points if bundle.points is None else bundle.points
+    whole = bundle.from_first(sight.camera) @ bundle.poses.taken(0)
+    seen = bundle.cameras[sight.camera].project(whole.apply(target[sight.view.ids]))
+    return sight.view.points - seen
+
+
+def free_points(sights: Sequence[Sight]) -> int:
+    """Return the number of unknowns of the points that are seen; as a whole they keep 7."""
     return 3 * len(np.unique(np.concatenate([one.view.ids for one in sights]))) - 7
 
 
+def likeness(points: Array) -> Array:
+    """Return orthonormal changes (3 T, 7) of points (T, 3) by shift, turn and scale as a whole."""
+    near = points - points.mean(axis=0)
+    turns = [np.cross(axis, near) for axis in np.eye(3)]
+    shifts = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
+    columns = np.column_stack([one.ravel() for one in (*shifts, *turns, near)])
+    return np.asarray(np.linalg.qr(columns)[0], dtype=np.float64)
+
+
 class _Group(NamedTuple):
-    """All that one camera sees, in one array."""
+    """All that one camera sees, in arrays: V views of N points, where fewer are seen repeated."""
 
     camera: int
     sights: list[int]  # numbers of its views
-    poses: list[int]  # of each of its views
-    bounds: list[slice]  # rows of each of its views
-    rows: Indices  # pose of each row (N,)
-    points: Array  # (N, 3), on the targets, metres
-    pixels: Array  # (N, 2)
-    white: Array  # (N, 2, 2)
+    poses: Indices  # (V,), of each of its views
+    ids: Indices  # (V, N), numbers of the points
+    counts: list[int]  # of each view, how many of these it shows
+    pixels: Array  # (V, N, 2)
+    white: Array  # (V, N, 2, 2); 0 for what is repeated
 
 
-class _FixedPart:
-    """What does not change while a bundle is adjusted."""
+class _Columns(NamedTuple):
+    """Derivatives of what one camera sees, whitened."""
 
-    def __init__(self, bundle: Bundle, sights: Sequence[Sight], more: float) -> None:
-        cameras, poses = len(bundle.cameras), bundle.poses.size
-        self._poses = poses
-        self._count = len(sights)
-        self._seen = np.isin(np.arange(poses), [one.pose for one in sights])
-        chosen = ([i for i, one in enumerate(sights) if one.camera == k] for k in range(cameras))
-        self._groups = [
-            _group(camera, [sights[i] for i in some], some, more, bundle.points)
-            for camera, some in enumerate(chosen)
-            if some
-        ]
+    own: Indices  # which of the shared unknowns the camera has
+    rows: Array  # (V, N, 2, 6 + these + 1): by the pose, by these, and the residuals
+    by_point: Array  # (V, N, 2, 3), by the points on the target
 
-    def normal(self, bundle: Bundle) -> Normal:
-        """Return the normal equations."""
-        columns, normal = bundle.lens_columns, Normal.nothing(bundle.shared, self._poses, 6)
-        normal.own[~self._seen] = np.eye(6)  # poses that nothing moves stay
+
+class Scene:
+    """What does not change while a bundle is adjusted.
+
+    ``smooth``: with
+    further unknowns of each camera, the last of all: any :func:`smooth_changes` of its image.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        sights: Sequence[Sight],
+        more: float,
+        *,
+        smooth: bool = False,
+    ) -> None:
+        self._poses, self._count = bundle.poses.size, len(sights)
+        self._smooth = SMOOTH if smooth else 0
+        self._seen = np.isin(np.arange(self._poses), [one.pose for one in sights])
+        self._meant = sights[0].view.target.points
+        self._prior = _prior(self._meant) if bundle.free else np.zeros((0, 0))
+        chosen = (
+            [i for i, one in enumerate(sights) if one.camera == k]
+            for k in range(len(bundle.cameras))
+        )
+        self._groups = [_group(sights, some, more) for some in chosen if some]
+
+    def normal(self, bundle: Bundle, *, each: bool = False) -> Normal:
+        """Return the normal equations.
+
+        ``each``: those of each pose for itself: what is shared comes as (P, S, S) and (P, S).
+        """
+        shared = bundle.shared + self._smooth * len(bundle.cameras)
+        found = Normal.nothing(shared, self._poses, 6)
+        found.own[~self._seen] = np.eye(6)  # poses that nothing moves stay
+        if each:
+            found = found._replace(
+                shared=np.zeros((self._poses, shared, shared)),
+                shared_right=np.zeros((self._poses, shared)),
+            )
         cost = 0.0
         for group in self._groups:
-            number = group.camera
-            turned = np.einsum("nij,nj->ni", bundle.poses.rotation[group.rows], group.points)
-            near = turned + bundle.poses.translation[group.rows]
-            rig = bundle.from_first(number)
-            there = near @ rig.rotation.T
-            seen = linearize(there + rig.translation, bundle.cameras[number])
-            # p = R_c (R m + t) + t_c moves with a pose' turn by R_c (w x R m), with the rig's by
-            # w x (R_c (R m + t)); see pose_changes.
-            own = np.arange(columns[number].start, columns[number].stop)
-            parts = [
-                pose_changes(seen.by_point @ rig.rotation, turned),
-                seen.by_lens @ bundle.basis[number],
-            ]
-            if number and not bundle.rigid:
-                start = columns[-1].stop + 6 * (number - 1)
-                own = np.concatenate([own, np.arange(start, start + 6)])
-                parts.append(pose_changes(seen.by_point, there))
-            parts.append((group.pixels - seen.pixels)[..., None])
-            jacobian = group.white @ np.concatenate(parts, axis=2)
-            for pose, some in zip(group.poses, group.bounds, strict=True):
-                rows = jacobian[some].reshape(-1, jacobian.shape[2])
-                product = rows.T @ rows  # of the pose', the shared columns and the residuals
-                normal.own[pose] += product[:6, :6]
-                normal.own_right[pose] += product[:6, -1]
-                normal.mixed[pose][:, own] += product[:6, 6:-1]
-                normal.shared[np.ix_(own, own)] += product[6:-1, 6:-1]
-                normal.shared_right[own] += product[6:-1, -1]
-                cost += float(product[-1, -1])
-        return normal._replace(cost=cost if math.isfinite(cost) else math.inf)
+            columns = self._columns(bundle, group)
+            cost += _add(found, group, columns)
+            if bundle.free:
+                _add_points(found, group, columns, bundle.of_cameras)
+        if bundle.points is not None and bundle.free and not each:
+            # minimise also |p - meant|^2 / loose^2, and the same of them as a whole: see _prior
+            some, off = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
+            weights, off = self._prior, off.ravel()
+            found.shared[some, some] += weights
+            found.shared_right[some] -= weights @ off
+            cost += float(off @ weights @ off)
+        return found._replace(cost=cost if math.isfinite(cost) else math.inf)
+
+    def _columns(self, bundle: Bundle, group: _Group) -> _Columns:
+        # p = R_c (R m + t) + t_c moves with a pose' turn by R_c (w x R m), with the rig's by
+        # w x (R_c (R m + t)), with the point by R_c R; see pose_changes.
+        number, rig = group.camera, bundle.from_first(group.camera)
+        pose = bundle.poses.taken(group.poses)
+        turned = self._on_target(bundle)[group.ids] @ pose.rotation.swapaxes(1, 2)
+        there = (turned + pose.translation[:, None]).reshape(-1, 3) @ rig.rotation.T
+        seen = linearize(there + rig.translation, bundle.cameras[number])
+        by_near = seen.by_point @ rig.rotation
+        of_lens = bundle.lens_columns[number]
+        own = np.arange(of_lens.start, of_lens.stop)
+        parts = [pose_changes(by_near, turned.reshape(-1, 3)), seen.by_lens @ bundle.basis[number]]
+        if number and not bundle.rigid:
+            start = bundle.lens_columns[-1].stop + 6 * (number - 1)
+            own = np.concatenate([own, np.arange(start, start + 6)])
+            parts.append(pose_changes(seen.by_point, there))
+        if self._smooth:
+            start = bundle.shared + self._smooth * number
+            own = np.concatenate([own, np.arange(start, start + self._smooth)])
+            parts.append(smooth_changes(seen.pixels, bundle.cameras[number].size))
+        parts.append((group.pixels.reshape(-1, 2) - seen.pixels)[..., None])
+        shape = (*group.ids.shape, 2, -1)
+        by_point = by_near.reshape(shape) @ pose.rotation[:, None] if bundle.free else by_near
+        return _Columns(
+            own,
+            group.white @ np.concatenate(parts, axis=2).reshape(shape),
+            group.white @ by_point.reshape(shape),
+        )
 
     def residuals(self, bundle: Bundle) -> list[Array]:
         """Return them by view, in the order of the sights."""
         found: dict[int, Array] = {}
         for group in self._groups:
-            for number, pose, rows in zip(group.sights, group.poses, group.bounds, strict=True):
-                whole = bundle.from_first(group.camera) @ bundle.poses.taken(pose)
-                seen = bundle.cameras[group.camera].project(whole.apply(group.points[rows]))
-                found[number] = group.pixels[rows] - seen
+            whole = bundle.from_first(group.camera) @ bundle.poses.taken(group.poses)
+            there = whole.apply(self._on_target(bundle)[group.ids])
+            seen = bundle.cameras[group.camera].project(there.reshape(-1, 3))
+            off = group.pixels - seen.reshape(group.pixels.shape)
+            found.update(
+                (number, rows[:count])
+                for number, rows, count in zip(group.sights, off, group.counts, strict=True)
+            )
         return [found[number] for number in range(self._count)]
 
+    def _on_target(self, bundle: Bundle) -> Array:
+        return self._meant if bundle.points is None else bundle.points
 
-def _group(
-    camera: int, sights: Sequence[Sight], numbers: list[int], more: float, points: Array | None
-) -> _Group:
-    views = [one.view for one in sights]
-    ends = np.cumsum([0, *(len(one.view.ids) for one in sights)]).tolist()
-    covariance = np.concatenate([one.view.covariance for one in sights])
+
+def _prior(meant: Array) -> Array:
+    """Return the weights (3 T, 3 T) of how far a sheet's points are from where they were meant."""
+    spacing = float(np.linalg.norm(meant[1:] - meant[0], axis=1).min())
+    whole = likeness(meant)
+    weights: Array = whole @ whole.T / (TIGHT * spacing) ** 2
+    return weights + np.eye(3 * len(meant)) / (LOOSE * spacing) ** 2
+
+
+def _group(sights: Sequence[Sight], numbers: list[int], more: float) -> _Group:
+    views = [sights[number].view for number in numbers]
+    counts = [len(view.ids) for view in views]
+    filled = np.arange(max(counts)) < np.array(counts)[:, None]
+    rows = np.where(filled, np.arange(max(counts)), 0)
+    covariance = np.concatenate([view.covariance for view in views])
+    white = np.zeros((*rows.shape, 2, 2))
+    white[filled] = whitening(covariance, more)
     return _Group(
-        camera=camera,
+        camera=sights[numbers[0]].camera,
         sights=numbers,
-        poses=[one.pose for one in sights],
-        bounds=[slice(first, last) for first, last in itertools.pairwise(ends)],
-        rows=np.repeat([one.pose for one in sights], np.diff(ends)),
-        points=np.concatenate(
-            [one.object_points if points is None else points[one.ids] for one in views]
-        ),
-        pixels=np.concatenate([one.view.points for one in sights]),
-        white=whitening(covariance, more),
+        poses=np.array([sights[number].pose for number in numbers], dtype=np.intp),
+        ids=np.array([view.ids[some] for view, some in zip(views, rows, strict=True)]),
+        counts=counts,
+        pixels=np.array([view.points[some] for view, some in zip(views, rows, strict=True)]),
+        white=white,
     )
+
+
+def _add(found: Normal, group: _Group, columns: _Columns) -> float:
+    """Add what one camera sees to the equations of cameras and poses; return its squares."""
+    own, last = columns.own, columns.rows.shape[-1] - 1
+    rows = columns.rows.reshape(len(group.poses), -1, last + 1)
+    products = rows.swapaxes(1, 2) @ rows  # of the pose', the shared columns and the residuals
+    found.own[group.poses] += products[:, :6, :6]
+    found.own_right[group.poses] += products[:, :6, last]
+    found.mixed[group.poses[:, None], :, own] += products[:, :6, 6:last].swapaxes(1, 2)
+    whole = products.sum(axis=0)
+    if found.shared.ndim == EACH:
+        found.shared[group.poses[:, None, None], own[:, None], own] += products[:, 6:last, 6:last]
+        found.shared_right[group.poses[:, None], own] += products[:, 6:last, last]
+    else:
+        found.shared[np.ix_(own, own)] += whole[6:last, 6:last]
+        found.shared_right[own] += whole[6:last, last]
+    return float(whole[last, last])
+
+
+def _add_points(found: Normal, group: _Group, columns: _Columns, first: int) -> None:
+    """Add the points on the target, which are shared unknowns from ``first`` on."""
+    turned = columns.by_point.swapaxes(2, 3)
+    blocks, others = turned @ columns.by_point, turned @ columns.rows
+    each, own = found.shared.ndim == EACH, columns.own[:, None]
+    for number, (pose, seen) in enumerate(zip(group.poses, group.counts, strict=True)):
+        matrix = found.shared[pose] if each else found.shared
+        right = found.shared_right[pose] if each else found.shared_right
+        places = first + 3 * group.ids[number, :seen, None] + np.arange(3)
+        mixed = others[number, :seen].reshape(3 * seen, -1)
+        matrix[places[:, :, None], places[:, None, :]] += blocks[number, :seen]
+        matrix[own.T, places.reshape(-1, 1)] += mixed[:, 6:-1]
+        matrix[own, places.ravel()] += mixed[:, 6:-1].T
+        right[places.ravel()] += mixed[:, -1]
+        found.mixed[pose][:, places.ravel()] += mixed[:, :6].T
