@@ -468,14 +468,14 @@ def _add_points(found: Normal, group: _Group, columns: _Columns, first: int) -> 
     """Add the points on the target, which are shared unknowns from ``first`` on."""
     turned = columns.by_point.swapaxes(2, 3)
     blocks, others = turned @ columns.by_point, turned @ columns.rows
-    each, own = found.shared.ndim == EACH, columns.own[:, None]
+    each, own = found.shared.ndim == EACH, columns.own
     for number, (pose, seen) in enumerate(zip(group.poses, group.counts, strict=True)):
         matrix = found.shared[pose] if each else found.shared
         right = found.shared_right[pose] if each else found.shared_right
         places = first + 3 * group.ids[number, :seen, None] + np.arange(3)
         mixed = others[number, :seen].reshape(3 * seen, -1)
         matrix[places[:, :, None], places[:, None, :]] += blocks[number, :seen]
-        matrix[own.T, places.reshape(-1, 1)] += mixed[:, 6:-1]
-        matrix[own, places.ravel()] += mixed[:, 6:-1].T
+        matrix[np.ix_(places.ravel(), own)] += mixed[:, 6:-1]
+        matrix[np.ix_(own, places.ravel())] += mixed[:, 6:-1].T
         right[places.ravel()] += mixed[:, -1]
         found.mixed[pose][:, places.ravel()] += mixed[:, :6].T
