@@ -336,7 +336,11 @@ def test_adjust_shape_finds_where_the_points_are() -> None:
 @pytest.mark.parametrize("count", [4, 8])
 def test_held_out_is_that_of_a_fit_without_the_views(count: int, free: bool) -> None:
     views = seen(LEFT, poses(count), points=OFF if free else None)
-    views = views if count == 4 else [*views, *seen(LEFT, poses(7, seed=9), points=OFF)][: 15 if free else 8]
+    views = (
+        views
+        if count == 4
+        else [*views, *seen(LEFT, poses(7, seed=9), points=OFF)][: 15 if free else 8]
+    )
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     whole = fit_lens(views, "plumb_bob")
     if free:
