@@ -27,6 +27,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.measure import Comparison, Goal, Series
+from benchmarks.pairs import compared
+from benchmarks.sheets import Rig, free_sheets
 from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._lens.model import CameraModel
@@ -95,8 +97,10 @@ def run(plan: Plan) -> Iterator[Comparison]:
         print("stereo: no left01.jpg where it is looked for: left out", file=sys.stderr)
     else:
         yield from _recorded(plan, folder)
+    yield from compared(plan)
     yield from _rendered(plan)
     yield _bent(plan)
+    yield from free_sheets(plan, Rig(LEFT, RIGHT, RIG, BOARD))
 
 
 def _folder() -> Folder | None:
