@@ -175,8 +175,8 @@ def opencv_pair(pairs: Sequence[Pair], model: DistortionModel) -> CameraPair:
     else:
         flags, calibrate = cv2.CALIB_USE_INTRINSIC_GUESS, cv2.stereoCalibrate
     found = calibrate(points, *sides, *lenses, size, flags=flags, criteria=STOP)
-    cameras = (_camera(found[place], found[place + 1], size, model) for place in (1, 3))
-    return CameraPair(*cameras, Transform("right", "left", found[5], found[6].ravel()))
+    left, right = (_camera(found[place], found[place + 1], size, model) for place in (1, 3))
+    return CameraPair(left, right, Transform("right", "left", found[5], found[6].ravel()))
 
 
 FISHEYE = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
@@ -246,11 +246,11 @@ def _set(one: RecordedPairs, ours: Sequence[Pair], theirs: Sequence[Pair]) -> It
         errors.setdefault("all OpenCV's, by its own corners", []).extend(
             pair_errors(own, *some).spacing for some in left_out_own
         )
-        for some, away in zip(_sides(rest), _sides(left_out), strict=True):
+        for some, others in zip(_sides(rest), _sides(left_out), strict=True):
             mine = calibrate_intrinsics(some, distortion_model=one.model).camera
-            lens["ours"] += [_scaled(view, mine) for view in away]
+            lens["ours"] += [_scaled(view, mine) for view in others]
             theirs_lens = opencv_lens(some, one.model)
-            lens["OpenCV"] += [_scaled(view, theirs_lens) for view in away]
+            lens["OpenCV"] += [_scaled(view, theirs_lens) for view in others]
     case = f"{one.name} ({one.known}), {len(ours)} in four folds"
     values = {name: 1e3 * _rms(some) for name, some in errors.items()}
     own_ruler = values["all OpenCV's, by its own corners"]

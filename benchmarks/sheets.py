@@ -28,7 +28,7 @@ from smartcam.calibration._stereo.triangulation import CameraPair, triangulate
 from smartcam.calibration.simulation import _scenes as scenes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from benchmarks.measure import Plan
     from smartcam.calibration._geometry.rotations import Array
@@ -44,7 +44,7 @@ RUNS = 12
 SIGMA = 0.05
 """Of the corners, pixels."""
 
-KINDS = {
+KINDS: dict[str, Callable[[Array, np.random.Generator], Array]] = {
     "bent by 2 mm": lambda points, _: points + _height(2e-3 * np.sin(np.pi * _part(points))),
     "stretched by 1 %": lambda points, _: points * [1.01, 1.0, 1.0],
     "stretched by 0.8 %, shrunk by 0.5 % across": lambda points, _: points * [1.008, 0.995, 1.0],
@@ -145,7 +145,8 @@ class Rig:
             moved = bundle.moved(unknowns, np.zeros((bundle.poses.size, 6)))
             transform = Transform("right", "left", *moved.rig.taken(0))
             each = np.tile(np.eye(2), (len(self.space), 1, 1))
-            pair = CameraPair(*moved.cameras, transform)
+            left, right = moved.cameras
+            pair = CameraPair(left, right, transform)
             return triangulate(pair, self.pixels, (each, each)).points
 
         changes = 0.1 * np.diag(steps)

@@ -27,7 +27,7 @@ from smartcam.calibration._lens.projection import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.model import CameraModel
@@ -43,9 +43,6 @@ next: one that few views show does not go astray."""
 
 TIGHT: Final = 1e-4
 """The same for place, direction and size of all points as a whole, which no view tells."""
-
-EACH: Final = 3
-"""Dimensions of the shared unknowns' matrix where each pose has its own."""
 
 MOST_AT_ONCE: Final = 4_000_000
 """Numbers of the matrices of poses that are left out together: 32 MB."""
@@ -209,13 +206,13 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
 
 def adjust(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
     """Return the least squares, each point weighted by its covariance and ``more`` variance."""
-    scene = Scene(bundle, sights, more)
-    bundle, normal = minimize(bundle, scene.normal, Bundle.moved, gain=SETTLED)
+    normal_at = Scene(bundle, sights, more).normal
+    bundle, normal = minimize(bundle, normal_at, Bundle.moved, gain=SETTLED)
     count = 2 * sum(len(sight.view.ids) for sight in sights)
     seen = len({sight.pose for sight in sights})
     return AdjustedBundle(
         bundle=bundle,
-        residuals=scene.residuals(bundle),
+        residuals=residuals(bundle, sights),
         weighted=normal.cost,
         more=more,
         normal=normal,
@@ -263,8 +260,8 @@ def held_out(
             turned = solved[number, :, -1] - solved[number, :, :-1] @ step
             only = dataclasses.replace(alone, poses=alone.poses.taken([number]))
             without = only.moved(step, turned[None])
-            seen = [one for one in own if one.pose == number]
-            yield HeldOut(pose, without, [_off(without, one) for one in seen])
+            seen = [one._replace(pose=0) for one in own if one.pose == number]
+            yield HeldOut(pose, without, residuals(without, seen))
 
 
 def _anew(adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int) -> HeldOut:
@@ -276,206 +273,121 @@ def _anew(adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int) -> HeldO
     return HeldOut(pose, without, adjust(without.known(), own, adjusted.more).residuals)
 
 
-def _off(bundle: Bundle, sight: Sight) -> Array:
-    """Return a view's residuals (N, 2), pixels, its pose being the first."""
-    target = sight.view.target.points if bundle.points is None else bundle.points
-    whole = bundle.from_first(sight.camera) @ bundle.poses.taken(0)
-    seen = bundle.cameras[sight.camera].project(whole.apply(target[sight.view.ids]))
-    return sight.view.points - seen
-
-
 def free_points(sights: Sequence[Sight]) -> int:
     """Return the number of unknowns of the points that are seen; as a whole they keep 7."""
     return 3 * len(np.unique(np.concatenate([one.view.ids for one in sights]))) - 7
 
 
-def likeness(points: Array) -> Array:
-    """Return orthonormal changes (3 T, 7) of points (T, 3) by shift, turn and scale as a whole."""
-    near = points - points.mean(axis=0)
-    turns = [np.cross(axis, near) for axis in np.eye(3)]
-    shifts = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
-    columns = np.column_stack([one.ravel() for one in (*shifts, *turns, near)])
-    return np.asarray(np.linalg.qr(columns)[0], dtype=np.float64)
-
-
-class _Group(NamedTuple):
-    """All that one camera sees, in arrays: V views of N points, where fewer are seen repeated."""
-
-    camera: int
-    sights: list[int]  # numbers of its views
-    poses: Indices  # (V,), of each of its views
-    ids: Indices  # (V, N), numbers of the points
-    counts: list[int]  # of each view, how many of these it shows
-    pixels: Array  # (V, N, 2)
-    white: Array  # (V, N, 2, 2); 0 for what is repeated
-
-
-class _Columns(NamedTuple):
-    """Derivatives of what one camera sees, whitened."""
-
-    own: Indices  # which of the shared unknowns the camera has
-    rows: Array  # (V, N, 2, 6 + these + 1): by the pose, by these, and the residuals
-    by_point: Array  # (V, N, 2, 3), by the points on the target
-
-
 class Scene:
     """What does not change while a bundle is adjusted.
 
-    ``smooth``: with
-    further unknowns of each camera, the last of all: any :func:`smooth_changes` of its image.
+    ``smooth``: with further unknowns of each camera, the last of all: any
+    :func:`~smartcam.calibration._lens.projection.smooth_changes` of its image.
     """
 
     def __init__(
-        self,
-        bundle: Bundle,
-        sights: Sequence[Sight],
-        more: float,
-        *,
-        smooth: bool = False,
+        self, bundle: Bundle, sights: Sequence[Sight], more: float, *, smooth: bool = False
     ) -> None:
-        self._poses, self._count = bundle.poses.size, len(sights)
-        self._smooth = SMOOTH if smooth else 0
-        self._seen = np.isin(np.arange(self._poses), [one.pose for one in sights])
+        counts = [len(one.view.ids) for one in sights]
+        white = whitening(np.concatenate([one.view.covariance for one in sights]), more)
+        self._sights = list(zip(sights, np.split(white, np.cumsum(counts)[:-1]), strict=True))
+        self._unseen = ~np.isin(np.arange(bundle.poses.size), [one.pose for one in sights])
         self._meant = sights[0].view.target.points
+        self._smooth = SMOOTH if smooth else 0
         self._prior = _prior(self._meant) if bundle.free else np.zeros((0, 0))
-        chosen = (
-            [i for i, one in enumerate(sights) if one.camera == k]
-            for k in range(len(bundle.cameras))
-        )
-        self._groups = [_group(sights, some, more) for some in chosen if some]
 
     def normal(self, bundle: Bundle, *, each: bool = False) -> Normal:
         """Return the normal equations.
 
         ``each``: those of each pose for itself: what is shared comes as (P, S, S) and (P, S).
         """
-        shared = bundle.shared + self._smooth * len(bundle.cameras)
-        found = Normal.nothing(shared, self._poses, 6)
-        found.own[~self._seen] = np.eye(6)  # poses that nothing moves stay
+        poses, shared = bundle.poses.size, bundle.shared + self._smooth * len(bundle.cameras)
+        found, cost = Normal.nothing(shared, poses, 6), 0.0
+        found.own[self._unseen] = np.eye(6)  # poses that nothing moves stay
         if each:
-            found = found._replace(
-                shared=np.zeros((self._poses, shared, shared)),
-                shared_right=np.zeros((self._poses, shared)),
-            )
-        cost = 0.0
-        for group in self._groups:
-            columns = self._columns(bundle, group)
-            cost += _add(found, group, columns)
+            matrices, rights = np.zeros((poses, shared, shared)), np.zeros((poses, shared))
+            found = found._replace(shared=matrices, shared_right=rights)
+        for sight, white in self._sights:
+            pose, view = sight.pose, sight.view
+            own, rows, by_point = self._columns(bundle, sight, white)
+            matrix = found.shared[pose] if each else found.shared
+            right = found.shared_right[pose] if each else found.shared_right
+            flat = rows.reshape(-1, rows.shape[2])
+            product = flat.T @ flat  # of the pose', the shared columns and the residuals
+            found.own[pose] += product[:6, :6]
+            found.own_right[pose] += product[:6, -1]
+            found.mixed[pose][:, own] += product[:6, 6:-1]
+            matrix[np.ix_(own, own)] += product[6:-1, 6:-1]
+            right[own] += product[6:-1, -1]
+            cost += float(product[-1, -1])
             if bundle.free:
-                _add_points(found, group, columns, bundle.of_cameras)
+                turned = by_point.swapaxes(1, 2)
+                places = bundle.of_cameras + 3 * view.ids[:, None] + np.arange(3)
+                between = (turned @ rows).reshape(places.size, -1)
+                matrix[places[:, :, None], places[:, None, :]] += turned @ by_point
+                matrix[np.ix_(places.ravel(), own)] += between[:, 6:-1]
+                matrix[np.ix_(own, places.ravel())] += between[:, 6:-1].T
+                right[places.ravel()] += between[:, -1]
+                found.mixed[pose][:, places.ravel()] += between[:, :6].T
         if bundle.points is not None and bundle.free and not each:
             # minimise also |p - meant|^2 / loose^2, and the same of them as a whole: see _prior
             some, off = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
-            weights, off = self._prior, off.ravel()
-            found.shared[some, some] += weights
-            found.shared_right[some] -= weights @ off
-            cost += float(off @ weights @ off)
+            pull = self._prior @ off.ravel()
+            found.shared[some, some] += self._prior
+            found.shared_right[some] -= pull
+            cost += float(off.ravel() @ pull)
         return found._replace(cost=cost if math.isfinite(cost) else math.inf)
 
-    def _columns(self, bundle: Bundle, group: _Group) -> _Columns:
+    def _columns(self, bundle: Bundle, sight: Sight, white: Array) -> tuple[Indices, Array, Array]:
+        """Return which of the shared unknowns a view has to do with, and its derivatives.
+
+        Whitened, (N, 2, ...): by the pose, by these unknowns, and the residuals in one; by the
+        points on the target (N, 2, 3).
+        """
         # p = R_c (R m + t) + t_c moves with a pose' turn by R_c (w x R m), with the rig's by
         # w x (R_c (R m + t)), with the point by R_c R; see pose_changes.
-        number, rig = group.camera, bundle.from_first(group.camera)
-        pose = bundle.poses.taken(group.poses)
-        turned = self._on_target(bundle)[group.ids] @ pose.rotation.swapaxes(1, 2)
-        there = (turned + pose.translation[:, None]).reshape(-1, 3) @ rig.rotation.T
+        number, rig = sight.camera, bundle.from_first(sight.camera)
+        pose = bundle.poses.taken(sight.pose)
+        turned = _on_target(bundle, sight) @ pose.rotation.T
+        there = (turned + pose.translation) @ rig.rotation.T
         seen = linearize(there + rig.translation, bundle.cameras[number])
         by_near = seen.by_point @ rig.rotation
-        of_lens = bundle.lens_columns[number]
-        own = np.arange(of_lens.start, of_lens.stop)
-        parts = [pose_changes(by_near, turned.reshape(-1, 3)), seen.by_lens @ bundle.basis[number]]
+        own = [np.arange(bundle.shared)[bundle.lens_columns[number]]]
+        parts = [pose_changes(by_near, turned), seen.by_lens @ bundle.basis[number]]
         if number and not bundle.rigid:
-            start = bundle.lens_columns[-1].stop + 6 * (number - 1)
-            own = np.concatenate([own, np.arange(start, start + 6)])
+            own.append(bundle.lens_columns[-1].stop + 6 * (number - 1) + np.arange(6))
             parts.append(pose_changes(seen.by_point, there))
         if self._smooth:
-            start = bundle.shared + self._smooth * number
-            own = np.concatenate([own, np.arange(start, start + self._smooth)])
-            parts.append(smooth_changes(seen.pixels, bundle.cameras[number].size))
-        parts.append((group.pixels.reshape(-1, 2) - seen.pixels)[..., None])
-        shape = (*group.ids.shape, 2, -1)
-        by_point = by_near.reshape(shape) @ pose.rotation[:, None] if bundle.free else by_near
-        return _Columns(
-            own,
-            group.white @ np.concatenate(parts, axis=2).reshape(shape),
-            group.white @ by_point.reshape(shape),
-        )
+            own.append(bundle.shared + self._smooth * number + np.arange(self._smooth))
+            parts.append(smooth_changes(seen.pixels, sight.view.size))
+        parts.append((sight.view.points - seen.pixels)[..., None])
+        by_point = white @ (by_near @ pose.rotation)
+        return np.concatenate(own), white @ np.concatenate(parts, axis=2), by_point
 
-    def residuals(self, bundle: Bundle) -> list[Array]:
-        """Return them by view, in the order of the sights."""
-        found: dict[int, Array] = {}
-        for group in self._groups:
-            whole = bundle.from_first(group.camera) @ bundle.poses.taken(group.poses)
-            there = whole.apply(self._on_target(bundle)[group.ids])
-            seen = bundle.cameras[group.camera].project(there.reshape(-1, 3))
-            off = group.pixels - seen.reshape(group.pixels.shape)
-            found.update(
-                (number, rows[:count])
-                for number, rows, count in zip(group.sights, off, group.counts, strict=True)
-            )
-        return [found[number] for number in range(self._count)]
 
-    def _on_target(self, bundle: Bundle) -> Array:
-        return self._meant if bundle.points is None else bundle.points
+def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
+    """Return those of each view (N, 2), seen minus projected, pixels."""
+    found = []
+    for one in sights:
+        whole = bundle.from_first(one.camera) @ bundle.poses.taken(one.pose)
+        seen = bundle.cameras[one.camera].project(whole.apply(_on_target(bundle, one)))
+        found.append(one.view.points - seen)
+    return found
+
+
+def _on_target(bundle: Bundle, sight: Sight) -> Array:
+    """Return where the points of a view are on its target (N, 3), metres."""
+    return sight.view.object_points if bundle.points is None else bundle.points[sight.view.ids]
 
 
 def _prior(meant: Array) -> Array:
-    """Return the weights (3 T, 3 T) of how far a sheet's points are from where they were meant."""
+    """Return the weights (3 T, 3 T) of how far a sheet's points are from where they were meant.
+
+    Each alone hardly, and all of them as a whole: shifts, turns and a scale move no pixel.
+    """
     spacing = float(np.linalg.norm(meant[1:] - meant[0], axis=1).min())
-    whole = likeness(meant)
+    near, axes = meant - meant.mean(axis=0), np.eye(3)
+    moves = [*(np.cross(axis, near) for axis in axes), *(0.0 * near + axis for axis in axes), near]
+    whole = np.linalg.qr(np.column_stack([one.ravel() for one in moves]))[0]
     weights: Array = whole @ whole.T / (TIGHT * spacing) ** 2
     return weights + np.eye(3 * len(meant)) / (LOOSE * spacing) ** 2
-
-
-def _group(sights: Sequence[Sight], numbers: list[int], more: float) -> _Group:
-    views = [sights[number].view for number in numbers]
-    counts = [len(view.ids) for view in views]
-    filled = np.arange(max(counts)) < np.array(counts)[:, None]
-    rows = np.where(filled, np.arange(max(counts)), 0)
-    covariance = np.concatenate([view.covariance for view in views])
-    white = np.zeros((*rows.shape, 2, 2))
-    white[filled] = whitening(covariance, more)
-    return _Group(
-        camera=sights[numbers[0]].camera,
-        sights=numbers,
-        poses=np.array([sights[number].pose for number in numbers], dtype=np.intp),
-        ids=np.array([view.ids[some] for view, some in zip(views, rows, strict=True)]),
-        counts=counts,
-        pixels=np.array([view.points[some] for view, some in zip(views, rows, strict=True)]),
-        white=white,
-    )
-
-
-def _add(found: Normal, group: _Group, columns: _Columns) -> float:
-    """Add what one camera sees to the equations of cameras and poses; return its squares."""
-    own, last = columns.own, columns.rows.shape[-1] - 1
-    rows = columns.rows.reshape(len(group.poses), -1, last + 1)
-    products = rows.swapaxes(1, 2) @ rows  # of the pose', the shared columns and the residuals
-    found.own[group.poses] += products[:, :6, :6]
-    found.own_right[group.poses] += products[:, :6, last]
-    found.mixed[group.poses[:, None], :, own] += products[:, :6, 6:last].swapaxes(1, 2)
-    whole = products.sum(axis=0)
-    if found.shared.ndim == EACH:
-        found.shared[group.poses[:, None, None], own[:, None], own] += products[:, 6:last, 6:last]
-        found.shared_right[group.poses[:, None], own] += products[:, 6:last, last]
-    else:
-        found.shared[np.ix_(own, own)] += whole[6:last, 6:last]
-        found.shared_right[own] += whole[6:last, last]
-    return float(whole[last, last])
-
-
-def _add_points(found: Normal, group: _Group, columns: _Columns, first: int) -> None:
-    """Add the points on the target, which are shared unknowns from ``first`` on."""
-    turned = columns.by_point.swapaxes(2, 3)
-    blocks, others = turned @ columns.by_point, turned @ columns.rows
-    each, own = found.shared.ndim == EACH, columns.own
-    for number, (pose, seen) in enumerate(zip(group.poses, group.counts, strict=True)):
-        matrix = found.shared[pose] if each else found.shared
-        right = found.shared_right[pose] if each else found.shared_right
-        places = first + 3 * group.ids[number, :seen, None] + np.arange(3)
-        mixed = others[number, :seen].reshape(3 * seen, -1)
-        matrix[places[:, :, None], places[:, None, :]] += blocks[number, :seen]
-        matrix[np.ix_(places.ravel(), own)] += mixed[:, 6:-1]
-        matrix[np.ix_(own, places.ravel())] += mixed[:, 6:-1].T
-        right[places.ravel()] += mixed[:, -1]
-        found.mixed[pose][:, places.ravel()] += mixed[:, :6].T

@@ -120,15 +120,14 @@ def _first(
     if length is not None:
         focal = length * max(width, height)
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
-    points = [view.object_points.reshape(-1, 1, 3) for view in views]
-    pixels = [view.points.reshape(-1, 1, 2) for view in views]
+    points = [view.object_points.astype(np.float32).reshape(-1, 1, 3) for view in views]
+    pixels = [view.points.astype(np.float32).reshape(-1, 1, 2) for view in views]
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-6)
     if model == "equidistant":
         names = ["RECOMPUTE_EXTRINSIC", "FIX_SKEW", "FIX_K3", "FIX_K4"]
         calibrate, space = cv2.fisheye.calibrate, cv2.fisheye
     else:
         names, calibrate, space = ["FIX_K3"], cv2.calibrateCamera, cv2
-        points, pixels = ([one.astype(np.float32) for one in some] for some in (points, pixels))
     names += [] if length is None else ["USE_INTRINSIC_GUESS"]
     # OpenCV 5 has the fisheye's flags among the others
     flags = sum(
