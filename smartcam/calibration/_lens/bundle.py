@@ -44,9 +44,6 @@ next: one that few views show does not go astray."""
 TIGHT: Final = 1e-4
 """The same for place, direction and size of all points as a whole, which no view tells."""
 
-MOST_AT_ONCE: Final = 4_000_000
-"""Numbers of the matrices of poses that are left out together: 32 MB."""
-
 FEW: Final = 5
 """Poses up to which a fit without one of them is no small step away."""
 
@@ -231,46 +228,26 @@ class HeldOut(NamedTuple):
 def held_out(
     adjusted: AdjustedBundle, sights: Sequence[Sight], poses: Sequence[int]
 ) -> Iterator[HeldOut]:
-    """Yield some poses, each left out once; in time that grows with their number.
-
-    Where there are few the fit without them is done anew.
-    """
+    """Yield some poses, each left out once; where there are few the fit is done anew."""
     # At the solution the normal equations without a pose are all less its own, both with their
     # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
     # without the pose. What it leaves is of second order in how far the pose pulls the others.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
-    if len(poses) <= FEW:
-        yield from (_anew(adjusted, sights, pose) for pose in poses)
-        return
     matrix, right, _, _ = adjusted.normal.reduced()
-    together = max(1, MOST_AT_ONCE // max(1, len(right)) ** 2)
-    for first in range(0, len(poses), together):
-        some = list(poses[first : first + together])
-        own = [one._replace(pose=some.index(one.pose)) for one in sights if one.pose in some]
-        alone = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken(some))
-        each = Scene(alone, own, adjusted.more).normal(alone, each=True)
-        both = np.concatenate([each.mixed, each.own_right[..., None]], axis=2)
-        solved = np.linalg.solve(each.own, both)
-        part = each.mixed.swapaxes(1, 2) @ solved
-        for number, pose in enumerate(some):
-            step = solve_scaled(
-                matrix - (each.shared[number] - part[number, :, :-1]),
-                right - (each.shared_right[number] - part[number, :, -1]),
-            )
-            turned = solved[number, :, -1] - solved[number, :, :-1] @ step
-            only = dataclasses.replace(alone, poses=alone.poses.taken([number]))
-            without = only.moved(step, turned[None])
-            seen = [one._replace(pose=0) for one in own if one.pose == number]
-            yield HeldOut(pose, without, residuals(without, seen))
-
-
-def _anew(adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int) -> HeldOut:
-    """Return a pose under what is adjusted without it, however far that is."""
-    others = [one for one in sights if one.pose != pose]
-    without = adjust(adjusted.bundle, others, adjusted.more).bundle
-    without = dataclasses.replace(without, poses=without.poses.taken([pose]))
-    own = [one._replace(pose=0) for one in sights if one.pose == pose]
-    return HeldOut(pose, without, adjust(without.known(), own, adjusted.more).residuals)
+    for pose in poses:
+        own = [one._replace(pose=0) for one in sights if one.pose == pose]
+        without = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
+        if len(poses) > FEW:
+            part = Scene(without, own, adjusted.more, prior=False).normal(without).reduced()
+            step = solve_scaled(matrix - part[0], right - part[1])
+            without = without.moved(step, part[3] - part[2] @ step)
+        else:
+            others = [one for one in sights if one.pose != pose]
+            anew = adjust(adjusted.bundle, others, adjusted.more).bundle
+            without = dataclasses.replace(anew, poses=without.poses)
+            at = adjust(without.known(), own, adjusted.more).bundle.poses
+            without = dataclasses.replace(without, poses=at)
+        yield HeldOut(pose, without, residuals(without, own))
 
 
 def free_points(sights: Sequence[Sight]) -> int:
@@ -281,12 +258,19 @@ def free_points(sights: Sequence[Sight]) -> int:
 class Scene:
     """What does not change while a bundle is adjusted.
 
-    ``smooth``: with further unknowns of each camera, the last of all: any
+    ``prior``: whether free points are held where they were meant to be, as far as LOOSE and TIGHT
+    say. ``smooth``: with further unknowns of each camera, the last of all: any
     :func:`~smartcam.calibration._lens.projection.smooth_changes` of its image.
     """
 
     def __init__(
-        self, bundle: Bundle, sights: Sequence[Sight], more: float, *, smooth: bool = False
+        self,
+        bundle: Bundle,
+        sights: Sequence[Sight],
+        more: float,
+        *,
+        prior: bool = True,
+        smooth: bool = False,
     ) -> None:
         counts = [len(one.view.ids) for one in sights]
         white = whitening(np.concatenate([one.view.covariance for one in sights]), more)
@@ -294,24 +278,17 @@ class Scene:
         self._unseen = ~np.isin(np.arange(bundle.poses.size), [one.pose for one in sights])
         self._meant = sights[0].view.target.points
         self._smooth = SMOOTH if smooth else 0
-        self._prior = _prior(self._meant) if bundle.free else np.zeros((0, 0))
+        self._prior = _prior(self._meant) if prior and bundle.free else None
 
-    def normal(self, bundle: Bundle, *, each: bool = False) -> Normal:
-        """Return the normal equations.
-
-        ``each``: those of each pose for itself: what is shared comes as (P, S, S) and (P, S).
-        """
-        poses, shared = bundle.poses.size, bundle.shared + self._smooth * len(bundle.cameras)
-        found, cost = Normal.nothing(shared, poses, 6), 0.0
+    def normal(self, bundle: Bundle) -> Normal:
+        """Return the normal equations."""
+        shared = bundle.shared + self._smooth * len(bundle.cameras)
+        found, cost = Normal.nothing(shared, bundle.poses.size, 6), 0.0
         found.own[self._unseen] = np.eye(6)  # poses that nothing moves stay
-        if each:
-            matrices, rights = np.zeros((poses, shared, shared)), np.zeros((poses, shared))
-            found = found._replace(shared=matrices, shared_right=rights)
+        matrix, right = found.shared, found.shared_right
         for sight, white in self._sights:
             pose, view = sight.pose, sight.view
             own, rows, by_point = self._columns(bundle, sight, white)
-            matrix = found.shared[pose] if each else found.shared
-            right = found.shared_right[pose] if each else found.shared_right
             flat = rows.reshape(-1, rows.shape[2])
             product = flat.T @ flat  # of the pose', the shared columns and the residuals
             found.own[pose] += product[:6, :6]
@@ -329,12 +306,12 @@ class Scene:
                 matrix[np.ix_(own, places.ravel())] += between[:, 6:-1].T
                 right[places.ravel()] += between[:, -1]
                 found.mixed[pose][:, places.ravel()] += between[:, :6].T
-        if bundle.points is not None and bundle.free and not each:
+        if bundle.points is not None and self._prior is not None:
             # minimise also |p - meant|^2 / loose^2, and the same of them as a whole: see _prior
             some, off = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
             pull = self._prior @ off.ravel()
-            found.shared[some, some] += self._prior
-            found.shared_right[some] -= pull
+            matrix[some, some] += self._prior
+            right[some] -= pull
             cost += float(off.ravel() @ pull)
         return found._replace(cost=cost if math.isfinite(cost) else math.inf)
 
