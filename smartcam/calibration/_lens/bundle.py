@@ -255,6 +255,32 @@ def free_points(sights: Sequence[Sight]) -> int:
     return 3 * len(np.unique(np.concatenate([one.view.ids for one in sights]))) - 7
 
 
+class _Group(NamedTuple):
+    """All N points that one camera sees."""
+
+    camera: int
+    poses: list[int]  # of each of its views
+    bounds: list[slice]  # points of each of its views
+    pose: Indices  # (N,)
+    ids: Indices  # (N,), on the target
+    pixels: Array  # (N, 2)
+    white: Array  # (N, 2, 2)
+
+
+def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
+    views, poses = [one.view for one in sights], [one.pose for one in sights]
+    ends = np.cumsum([0, *(len(one.ids) for one in views)])
+    return _Group(
+        camera,
+        poses,
+        bounds=[slice(first, last) for first, last in itertools.pairwise(ends.tolist())],
+        pose=np.repeat(poses, np.diff(ends)),
+        ids=np.concatenate([one.ids for one in views]),
+        pixels=np.concatenate([one.points for one in views]),
+        white=whitening(np.concatenate([one.covariance for one in views]), more),
+    )
+
+
 class Scene:
     """What does not change while a bundle is adjusted.
 
@@ -272,9 +298,8 @@ class Scene:
         prior: bool = True,
         smooth: bool = False,
     ) -> None:
-        counts = [len(one.view.ids) for one in sights]
-        white = whitening(np.concatenate([one.view.covariance for one in sights]), more)
-        self._sights = list(zip(sights, np.split(white, np.cumsum(counts)[:-1]), strict=True))
+        sides = ([one for one in sights if one.camera == k] for k in range(len(bundle.cameras)))
+        self._groups = [_group(k, some, more) for k, some in enumerate(sides) if some]
         self._unseen = ~np.isin(np.arange(bundle.poses.size), [one.pose for one in sights])
         self._meant = sights[0].view.target.points
         self._smooth = SMOOTH if smooth else 0
@@ -286,22 +311,24 @@ class Scene:
         found, cost = Normal.nothing(shared, bundle.poses.size, 6), 0.0
         found.own[self._unseen] = np.eye(6)  # poses that nothing moves stay
         matrix, right = found.shared, found.shared_right
-        for sight, white in self._sights:
-            pose, view = sight.pose, sight.view
-            own, rows, by_point = self._columns(bundle, sight, white)
-            flat = rows.reshape(-1, rows.shape[2])
-            product = flat.T @ flat  # of the pose', the shared columns and the residuals
-            found.own[pose] += product[:6, :6]
-            found.own_right[pose] += product[:6, -1]
-            found.mixed[pose][:, own] += product[:6, 6:-1]
-            matrix[np.ix_(own, own)] += product[6:-1, 6:-1]
-            right[own] += product[6:-1, -1]
-            cost += float(product[-1, -1])
-            if bundle.free:
-                turned = by_point.swapaxes(1, 2)
-                places = bundle.of_cameras + 3 * view.ids[:, None] + np.arange(3)
+        for group in self._groups:
+            own, jacobian, by_points = self._columns(bundle, group)
+            for pose, some in zip(group.poses, group.bounds, strict=True):
+                rows = jacobian[some]
+                flat = rows.reshape(-1, rows.shape[2])
+                product = flat.T @ flat  # of the pose', the shared columns and the residuals
+                found.own[pose] += product[:6, :6]
+                found.own_right[pose] += product[:6, -1]
+                found.mixed[pose][:, own] += product[:6, 6:-1]
+                matrix[np.ix_(own, own)] += product[6:-1, 6:-1]
+                right[own] += product[6:-1, -1]
+                cost += float(product[-1, -1])
+                if not bundle.free:
+                    continue
+                turned = by_points[some].swapaxes(1, 2)
+                places = bundle.of_cameras + 3 * group.ids[some, None] + np.arange(3)
                 between = (turned @ rows).reshape(places.size, -1)
-                matrix[places[:, :, None], places[:, None, :]] += turned @ by_point
+                matrix[places[:, :, None], places[:, None, :]] += turned @ by_points[some]
                 matrix[np.ix_(places.ravel(), own)] += between[:, 6:-1]
                 matrix[np.ix_(own, places.ravel())] += between[:, 6:-1].T
                 right[places.ravel()] += between[:, -1]
@@ -315,18 +342,18 @@ class Scene:
             cost += float(off.ravel() @ pull)
         return found._replace(cost=cost if math.isfinite(cost) else math.inf)
 
-    def _columns(self, bundle: Bundle, sight: Sight, white: Array) -> tuple[Indices, Array, Array]:
-        """Return which of the shared unknowns a view has to do with, and its derivatives.
+    def _columns(self, bundle: Bundle, group: _Group) -> tuple[Indices, Array, Array]:
+        """Return which of the shared unknowns a camera has, and the derivatives of what it sees.
 
         Whitened, (N, 2, ...): by the pose, by these unknowns, and the residuals in one; by the
         points on the target (N, 2, 3).
         """
         # p = R_c (R m + t) + t_c moves with a pose' turn by R_c (w x R m), with the rig's by
         # w x (R_c (R m + t)), with the point by R_c R; see pose_changes.
-        number, rig = sight.camera, bundle.from_first(sight.camera)
-        pose = bundle.poses.taken(sight.pose)
-        turned = _on_target(bundle, sight) @ pose.rotation.T
-        there = (turned + pose.translation) @ rig.rotation.T
+        number, rig, pose = group.camera, bundle.from_first(group.camera), bundle.poses
+        points, rotation = self._meant if bundle.points is None else bundle.points, pose.rotation
+        turned = np.einsum("nij,nj->ni", rotation[group.pose], points[group.ids])
+        there = (turned + pose.translation[group.pose]) @ rig.rotation.T
         seen = linearize(there + rig.translation, bundle.cameras[number])
         by_near = seen.by_point @ rig.rotation
         own = [np.arange(bundle.shared)[bundle.lens_columns[number]]]
@@ -336,25 +363,20 @@ class Scene:
             parts.append(pose_changes(seen.by_point, there))
         if self._smooth:
             own.append(bundle.shared + self._smooth * number + np.arange(self._smooth))
-            parts.append(smooth_changes(seen.pixels, sight.view.size))
-        parts.append((sight.view.points - seen.pixels)[..., None])
-        by_point = white @ (by_near @ pose.rotation)
-        return np.concatenate(own), white @ np.concatenate(parts, axis=2), by_point
+            parts.append(smooth_changes(seen.pixels, bundle.cameras[number].size))
+        parts.append((group.pixels - seen.pixels)[..., None])
+        by_point = group.white @ (by_near @ rotation[group.pose]) if bundle.free else by_near
+        return np.concatenate(own), group.white @ np.concatenate(parts, axis=2), by_point
 
 
 def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
     """Return those of each view (N, 2), seen minus projected, pixels."""
     found = []
-    for one in sights:
-        whole = bundle.from_first(one.camera) @ bundle.poses.taken(one.pose)
-        seen = bundle.cameras[one.camera].project(whole.apply(_on_target(bundle, one)))
-        found.append(one.view.points - seen)
+    for number, pose, view in sights:
+        points = view.object_points if bundle.points is None else bundle.points[view.ids]
+        near = (bundle.from_first(number) @ bundle.poses.taken(pose)).apply(points)
+        found.append(view.points - bundle.cameras[number].project(near))
     return found
-
-
-def _on_target(bundle: Bundle, sight: Sight) -> Array:
-    """Return where the points of a view are on its target (N, 3), metres."""
-    return sight.view.object_points if bundle.points is None else bundle.points[sight.view.ids]
 
 
 def _prior(meant: Array) -> Array:
