@@ -210,9 +210,10 @@ def calibrate_intrinsics(
         fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
         sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
             adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
-            ``auto``: what has the smaller held-out error, where it is clearly smaller. One camera
-            alone tells a bent sheet from a bent lens less well than two: take it where residuals
-            are large and the sheet is to blame.
+            ``auto``: they are adjusted where the residuals show more than chance, or any smooth
+            error of the lens, can be, and the held-out error is not larger for it. Where they are
+            not adjusted although the residuals show it, ``SHEET_NOT_EXACT`` among the warnings
+            says so. Targets of more than 1000 points are taken as exact, untested.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named.
 

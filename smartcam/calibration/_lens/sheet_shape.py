@@ -20,6 +20,7 @@ from smartcam.calibration._least_squares import inverse_scaled, solve_scaled
 from smartcam.calibration._lens.bundle import Scene, adjust_weighted, free_points
 from smartcam.calibration._lens.projection import SMOOTH
 from smartcam.calibration._statistics import Noise
+from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -34,6 +35,10 @@ Sheet: TypeAlias = Literal["auto", "exact", "free"]
 
 CHANCE: Final = 1e-3
 """How seldom noise alone may pass for a sheet that is not as it was meant to be."""
+
+
+MOST_POINTS: Final = 1000
+"""Of a target that may be free: the equations of more would take gigabytes."""
 
 
 class Shape(NamedTuple):
@@ -56,7 +61,17 @@ def choose_shape(
     ``adjusted`` has the points as they were meant. ``sheet``: ``auto``: adjusted where the
     residuals show that they are not, and the held-out error is not larger with them. ``held_out``
     gives the held-out errors of a fit, ``rms`` is of these; NaN where there are none.
+
+    Raises ``SHAPE``: more points than may be free.
     """
+    count = len(sights[0].view.target.points)
+    if sheet == "free" and count > MOST_POINTS:
+        raise CalibrationError(
+            f"sheet: expected a target of {MOST_POINTS} points at most that are free, got {count}",
+            code=Code.SHAPE,
+            expected=MOST_POINTS,
+            got=count,
+        )
     doubt, errors = shape_doubt(adjusted, sights), held_out(adjusted)
     if sheet == "free" or (sheet == "auto" and doubt is not None):
         free = adjust_shape(adjusted.bundle, sights, adjusted.more)
@@ -103,6 +118,9 @@ def shape_doubt(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> Array | No
     # its mean over that of what remains is F.
     # Source: Seber and Lee, Linear Regression Analysis, 2nd edition (2003), section 4.3.
     meant, count = sights[0].view.target.points, free_points(sights)
+    freedom = adjusted.freedom - SMOOTH * len(adjusted.bundle.cameras) - count
+    if len(meant) > MOST_POINTS or freedom <= 0:
+        return None
     bundle = dataclasses.replace(adjusted.bundle, points=meant, free=True)
     normal = Scene(bundle, sights, adjusted.more, smooth=True).normal(bundle)
     matrix, right, _, alone = normal.reduced()
@@ -116,9 +134,8 @@ def shape_doubt(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> Array | No
         matrix[np.ix_(points, points)] - between @ matrix[np.ix_(~points, points)], step_right
     )
     taken = float(step_right @ off)
-    freedom = adjusted.freedom - SMOOTH * len(bundle.cameras) - count
     left = normal.cost - float(before) - taken
-    if freedom <= 0 or left <= 0 or Noise(left / freedom, freedom).chance(taken, count) >= CHANCE:
+    if left <= 0 or Noise(left / freedom, freedom).chance(taken, count) >= CHANCE:
         return None
     return off.reshape(-1, 3)
 

@@ -312,14 +312,15 @@ def calibrate_stereo(
         fixed: coefficients of those that stay 0, such as ``k3``; ``aspect``: fx and fy are one.
         sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
             adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
-            ``auto``: what has the smaller held-out reprojection error, where it is clearly smaller.
+            ``auto``: as :func:`~smartcam.calibration.calibrate_intrinsics` has it.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named. Of a pair whose views do not belong
             together it is the right one.
 
     Raises:
         CalibrationError: ``TOO_FEW``: less than 3 pairs, 2 where both lenses are known;
-            ``SHAPE``: lists of different lengths, or a coefficient that is none; ``WRONG_SIZE``,
+            ``SHAPE``: lists of different lengths, a coefficient that is none, or too many points to be
+            free; ``WRONG_SIZE``,
             ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``; ``POOR_FIT``: no lens or no
             transform shows the views, as where those of many pairs are of different moments;
             ``INSUFFICIENT_ROTATION``: the target was not tilted.
