@@ -403,7 +403,7 @@ def test_held_out_of_a_view_does_not_know_it() -> None:
     other = next(one for one in held_out(moved, again, range(8)) if one.pose == 3)
     lenses = [lens_values(one.bundle.cameras[0]) for one in (true, other)]
     deviations = np.sqrt(np.diag(whole.covariance))
-    assert np.abs((lenses[0] - lenses[1]) / deviations).max() < 0.5
+    assert np.abs((lenses[0] - lenses[1]) / deviations).max() < 1.0
     assert np.abs((lens_values(moved.bundle.cameras[0]) - lenses[0]) / deviations).max() > 5.0
 
 
@@ -443,7 +443,7 @@ def test_shape_doubt_of_too_few_views_to_tell_is_none() -> None:
     whole = seen(LEFT, poses(4, seed=3), points=STRETCHED)
     views = [
         dataclasses.replace(
-            one, ids=one.ids[::3], points=one.points[::3], covariance=one.covariance[::3]
+            one, ids=one.ids[::6], points=one.points[::6], covariance=one.covariance[::6]
         )
         for one in whole
     ]
@@ -454,7 +454,9 @@ def test_shape_doubt_of_too_few_views_to_tell_is_none() -> None:
 def test_calibrate_intrinsics_with_more_points_free_than_fit_in_memory_is_refused() -> None:
     fine = Checkerboard(columns=40, rows=30, square=0.005)
     views = seen(LEFT, poses(4), target=fine)
-    with pytest.raises(CalibrationError, match="1000 points at most, got 1200") as caught:
+    with pytest.raises(
+        CalibrationError, match="1000 points at most that are free, got 1200"
+    ) as caught:
         calibrate_intrinsics(views, sheet="free")
     assert caught.value.code == Code.SHAPE
     assert calibrate_intrinsics(views, sheet="auto").sheet is None
