@@ -6,7 +6,8 @@ less 25 mm, at the same corners whoever calibrated. Parameters of smartcam were 
 odd-numbered pairs. SMARTCAM_PAIRS names the folder that the images are in, or SMARTCAM_DATA one
 that they are under; Debian's package opencv-doc has them, too. Without any of these it is the
 odd-numbered ones of ``tests/data``, and the case says so. Other recorded sets are those of
-:mod:`benchmarks.pairs`; sheets that are not what they were meant to be, of :mod:`benchmarks.sheets`.
+:mod:`benchmarks.pairs`, sheets that are not what they were meant to be those of
+:mod:`benchmarks.sheets`.
 
 Rendered pairs tell a checkerboard from dots, and a bent sheet from a flat one, by what is true: the
 error is that of points all over the space before the cameras.

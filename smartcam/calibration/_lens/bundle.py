@@ -203,7 +203,7 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
 
 def adjust(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
     """Return the least squares, each point weighted by its covariance and ``more`` variance."""
-    normal_at = Scene(bundle, sights, more).normal
+    normal_at = BundleEquations(bundle, sights, more).normal
     bundle, normal = minimize(bundle, normal_at, Bundle.moved, gain=SETTLED)
     count = 2 * sum(len(sight.view.ids) for sight in sights)
     seen = len({sight.pose for sight in sights})
@@ -238,7 +238,9 @@ def held_out(
         own = [one._replace(pose=0) for one in sights if one.pose == pose]
         without = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
         if len(poses) > FEW:
-            part = Scene(without, own, adjusted.more, prior=False).normal(without).reduced()
+            part = (
+                BundleEquations(without, own, adjusted.more, prior=False).normal(without).reduced()
+            )
             step = solve_scaled(matrix - part[0], right - part[1])
             without = without.moved(step, part[3] - part[2] @ step)
         else:
@@ -281,7 +283,7 @@ def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
     )
 
 
-class Scene:
+class BundleEquations:
     """What does not change while a bundle is adjusted.
 
     ``prior``: whether free points are held where they were meant to be, as far as LOOSE and TIGHT

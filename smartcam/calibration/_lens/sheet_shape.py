@@ -17,7 +17,7 @@ import numpy as np
 from smartcam.calibration._codes import Code, Remark
 from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._least_squares import inverse_scaled, solve_scaled
-from smartcam.calibration._lens.bundle import Scene, adjust_weighted, free_points
+from smartcam.calibration._lens.bundle import BundleEquations, adjust_weighted, free_points
 from smartcam.calibration._lens.projection import SMOOTH
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
@@ -122,7 +122,7 @@ def shape_doubt(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> Array | No
     if len(meant) > MOST_POINTS or freedom <= 0:
         return None
     bundle = dataclasses.replace(adjusted.bundle, points=meant, free=True)
-    normal = Scene(bundle, sights, adjusted.more, smooth=True).normal(bundle)
+    normal = BundleEquations(bundle, sights, adjusted.more, smooth=True).normal(bundle)
     matrix, right, _, alone = normal.reduced()
     points = np.zeros(len(right), dtype=bool)
     points[bundle.of_cameras : bundle.shared] = True
