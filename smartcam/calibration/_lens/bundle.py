@@ -217,7 +217,7 @@ def adjust(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBund
     )
 
 
-class HeldOut(NamedTuple):
+class LeftOut(NamedTuple):
     """One pose under cameras that were fitted without its views."""
 
     pose: int
@@ -227,7 +227,7 @@ class HeldOut(NamedTuple):
 
 def held_out(
     adjusted: AdjustedBundle, sights: Sequence[Sight], poses: Sequence[int]
-) -> Iterator[HeldOut]:
+) -> Iterator[LeftOut]:
     """Yield some poses, each left out once; where there are few the fit is done anew."""
     # At the solution the normal equations without a pose are all less its own, both with their
     # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
@@ -249,7 +249,7 @@ def held_out(
             without = dataclasses.replace(anew, poses=without.poses)
             at = adjust(without.known(), own, adjusted.more).bundle.poses
             without = dataclasses.replace(without, poses=at)
-        yield HeldOut(pose, without, residuals(without, own))
+        yield LeftOut(pose, without, residuals(without, own))
 
 
 def free_points(sights: Sequence[Sight]) -> int:
