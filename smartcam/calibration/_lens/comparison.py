@@ -175,6 +175,27 @@ def compare(
     )
 
 
+def rig_difference(
+    a: Transform, b: Transform, first: LensComparison, second: LensComparison
+) -> tuple[float, float]:
+    """Return by how much two calibrations of one pair differ in where the cameras stand.
+
+    What was taken off of either camera belongs to it, so it is put in again.
+
+    Args:
+        a: ``T_second_first`` of the one calibration.
+        b: that of the other.
+        first: of the lenses of the first camera.
+        second: of those of the second.
+
+    Returns:
+        The turn between both, radians, and the shift, metres.
+    """
+    moved = second.motion.rigid @ a.rigid @ first.motion.rigid.inverse()
+    shift = float(np.linalg.norm(moved.translation - b.translation))
+    return float(moved.angle_to(b.rigid)), shift
+
+
 def _lens(one: object) -> CameraModel:
     if isinstance(one, IntrinsicCalibration):
         return one.camera
@@ -232,7 +253,7 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
         known = np.isfinite(off)
         if np.count_nonzero(known) < len(known) / 2:
             break
-        step = np.linalg.lstsq(by_motion[known], off[known])[0]
+        step = np.asarray(np.linalg.lstsq(by_motion[known], off[known])[0], dtype=np.float64)
         motion = motion.turned_after(step)
         if np.abs(by_motion[known] @ step).max() < SETTLED:
             return motion
@@ -279,7 +300,9 @@ def _judged(difference: Array, spread: Array) -> _Judged:
     tests = (_by_values(off, moves), _by_places(off, moves))
     likelier, least = max(tests, key=lambda one: one.chance), min(tests, key=lambda one: one.chance)
     # the least of two chances c is below c with a chance of 2 c at most (Bonferroni)
-    return _Judged((least if 2 * least.chance < 1.0 else likelier).ratio, min(1.0, 2 * least.chance))
+    return _Judged(
+        (least if 2 * least.chance < 1.0 else likelier).ratio, min(1.0, 2 * least.chance)
+    )
 
 
 def _by_values(off: Array, moves: Array) -> _Judged:

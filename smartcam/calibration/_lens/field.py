@@ -104,13 +104,14 @@ def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sen
 
     ``far``: they are directions to points at infinity.
     """
-    known = np.isfinite(points).all(axis=1)[:, None, None]
-    there = np.where(known[:, 0], points, [0.0, 0.0, 1.0])
+    known = np.isfinite(points).all(axis=1, keepdims=True)
+    there = np.where(known, points, [0.0, 0.0, 1.0])
     at = linearize(there, camera)
     motion = pose_changes(at.by_point, there)
     if far:
         motion[:, :, 3:] = 0.0
-    return Sensitivity(*(np.where(known, one, np.nan) for one in (at.by_lens, motion, at.by_point)))
+    missing = np.where(known, 0.0, np.nan)[:, :, None]
+    return Sensitivity(at.by_lens + missing, motion + missing, at.by_point + missing)
 
 
 def known_points(points: Array) -> Array:

@@ -25,10 +25,16 @@ from smartcam.calibration._lens.poses import CAMERA, TARGET
 from smartcam.calibration._lens.projection import NEGLIGIBLE, pose_changes
 
 if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    from numpy.typing import NDArray
+
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import Target
+
+    Mask: TypeAlias = NDArray[np.bool_]
 
 COLUMNS: Final = {0.0: "left", 0.5: "middle", 1.0: "right"}
 ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
@@ -54,6 +60,10 @@ MAP: Final = (9, 12)
 
 DETERMINED: Final = 1e-12
 """Part of the largest variance, in comparable units, below which a value counts as held fixed."""
+
+
+SAME_RAY: Final = 1e-3
+"""Between a point's direction and that of its pixel, radians: else the lens' model folds."""
 
 
 class NextView(NamedTuple):
@@ -166,8 +176,9 @@ def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array
     by_pose = pose_changes(at.by_point, turned.reshape(-1, 3)).reshape(shape)
     both = by_pose.swapaxes(1, 2) @ by_lens
     inner = by_pose.swapaxes(1, 2) @ by_pose
-    left: Array = by_lens.swapaxes(1, 2) @ by_lens
-    left = left - both.swapaxes(1, 2) @ np.linalg.solve(inner, both)
+    left: Array = by_lens.swapaxes(1, 2) @ by_lens - both.swapaxes(1, 2) @ np.linalg.solve(
+        inner, both
+    )
     return left
 
 
@@ -223,15 +234,16 @@ def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> A
     return shifts
 
 
-def _visible(camera: CameraModel, points: Array) -> Array:
+def _visible(camera: CameraModel, points: Array) -> Mask:
     """Return whether all points (C, N, 3) are in the image, and where the lens' model leads."""
     flat = points.reshape(-1, 3)
     seen = camera.project(flat)
-    inside = ((seen >= 0.0) & (seen <= np.array(camera.size) - 1.0)).all(axis=1)
-    back = points_at(camera, np.where(inside[:, None], seen, 0.0), None)
+    inside = ((seen >= 0.0) & (seen <= np.array(camera.size) - 1.0)).all(axis=1, keepdims=True)
+    back = points_at(camera, np.where(inside, seen, 0.0), None)
     ahead = flat / np.linalg.norm(flat, axis=1, keepdims=True)
-    good: Array = (inside & (np.abs(back - ahead).max(axis=1) < 1e-3)).reshape(len(points), -1)
-    return good.all(axis=1)
+    off = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
+    good: Mask = off.max(axis=1) < SAME_RAY
+    return good
 
 
 def _words(fill: float, row: float, column: float, side: str, roll: float) -> str:

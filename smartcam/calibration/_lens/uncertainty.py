@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.model import CameraModel
 
+
 class Figures(NamedTuple):
     """A map in four numbers, of a coordinate; NaN where the lens' model does not reach.
 
