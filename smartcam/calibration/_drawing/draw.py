@@ -110,7 +110,7 @@ def _size(pixels: Array) -> tuple[int, int]:
 
 
 def _said(figures: Figures) -> str:
-    names = ("centre", "corners", "largest", "mean")
+    names = figures._fields
     return ", ".join(f"{name} {value:.2g}" for name, value in zip(names, figures, strict=True))
 
 

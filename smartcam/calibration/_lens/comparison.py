@@ -30,13 +30,15 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from smartcam.calibration._geometry.rigid import Rigid
     from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.field import Sensitivity
 
 CELLS: Final = (6, 8)
 """Rows and columns of an image's cells, by which is told where both have seen the target."""
 
 LEVEL: Final = 0.01
 """How seldom noise alone may make two calibrations differ as much."""
+
+SMALLEST: Final = 1e-9
+"""A chance that is less is not told: the noise is not as normal as that."""
 
 STEPS: Final = 50
 """Of the motion's fit; it takes five."""
@@ -46,6 +48,34 @@ SETTLED: Final = 1e-9
 
 TINY: Final = 1e-3
 """Pixels: what moves places by less does not count as a difference."""
+
+
+class Lens(NamedTuple):
+    """What is known of a lens, where one calibration is compared with another.
+
+    Attributes:
+        camera: the lens.
+        covariance: (4 + K, 4 + K), of its values; None: not known.
+        points: (N, 3), where the target was seen before the camera, metres; None: not known.
+    """
+
+    camera: CameraModel
+    covariance: Array | None = None
+    points: Array | None = None
+
+    @classmethod
+    def of(cls, one: IntrinsicCalibration | CameraModel) -> Lens:
+        """Return that of a calibration, or of a bare lens; ``SHAPE``: neither."""
+        if isinstance(one, IntrinsicCalibration):
+            return cls(one.camera, one.covariance, one.target_points)
+        if isinstance(one, CameraModel):
+            return cls(one)
+        raise CalibrationError(
+            f"compare: expected calibrations of lenses, or camera models, got {type(one).__name__}",
+            code=Code.SHAPE,
+            expected="IntrinsicCalibration or CameraModel",
+            got=type(one).__name__,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,7 +132,8 @@ class LensComparison:
         """The same in words."""
         if self.chance is None or self.ratio is None:
             return "no verdict: it takes the noise of both, as two calibrations with views have it"
-        noise = f"{self.ratio:.2f} times what noise leads to, chance {self.chance:.2g}"
+        chance = f"{self.chance:.2g}" if self.chance > SMALLEST else f"below {SMALLEST:g}"
+        noise = f"{self.ratio:.2f} times what noise leads to, chance {chance}"
         if self.same:
             return f"the same within their noise: {noise}"
         return f"they differ by more than their noise explains: {noise}"
@@ -119,8 +150,8 @@ def compare(
 
     What a small motion of the camera makes up for is taken off: the one that fits best to the
     target's points before the camera, where both calibrations have seen it; of lenses without views
-    to points all over the field, at the distance. The noise of both is taken as independent: of
-    calibrations from the same images the difference is smaller than predicted.
+    to points at the distance, in the largest circle about the image's middle. The noise of both is
+    taken as independent; of calibrations from the same images the difference is smaller.
 
     Args:
         a: the one that the differences begin at; bare lenses are compared without a prediction.
@@ -134,8 +165,15 @@ def compare(
             the lenses have hardly anything of the image in common; ``POOR_FIT``: no motion brings
             the one to the other.
     """
+    return compare_lenses(Lens.of(a), Lens.of(b), distance=distance, shape=shape)
+
+
+def compare_lenses(
+    a: Lens, b: Lens, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
+) -> LensComparison:
+    """Return the comparison of lenses, as :func:`compare`."""
     check_distance(distance)
-    first, second = _lens(a), _lens(b)
+    first, second, far = a.camera, b.camera, distance is None
     if tuple(first.size) != tuple(second.size):
         raise CalibrationError(
             f"compare: expected lenses of images of one size, got {first.size[0]} x "
@@ -144,7 +182,6 @@ def compare(
             expected=first.size,
             got=second.size,
         )
-    far = distance is None
     pixels = places(first.size, shape)
     gauge, bare = _gauge(a, b, distance)
     motion = _align(first, second, gauge, far=far and bare)
@@ -152,15 +189,11 @@ def compare(
     moved = points @ motion.rotation.T + (0.0 if far else motion.translation)
     difference = _project(second, moved) - pixels.reshape(-1, 2)
     expected, ratio, chance = None, None, None
-    if isinstance(a, IntrinsicCalibration) and isinstance(b, IntrinsicCalibration):
+    if a.covariance is not None and b.covariance is not None:
         there = gauge @ motion.rotation.T + motion.translation
-        spread = np.concatenate(
-            [
-                _spread(a, sensitivity(first, points, far=far), sensitivity(first, gauge)),
-                _spread(b, sensitivity(second, moved, far=far), sensitivity(second, there)),
-            ],
-            axis=2,
-        )
+        of_a = sensitivity(first, points, far=far).freed(sensitivity(first, gauge))
+        of_b = sensitivity(second, moved, far=far).freed(sensitivity(second, there))
+        spread = np.concatenate([of_a @ _root(a.covariance), of_b @ _root(b.covariance)], axis=2)
         difference[~np.isfinite(spread).all(axis=(1, 2))] = np.nan
         ratio, chance = _judged(difference, spread)
         expected = (spread @ spread.swapaxes(1, 2)).reshape(*shape, 2, 2)
@@ -196,39 +229,23 @@ def rig_difference(
     return float(moved.angle_to(b.rigid)), shift
 
 
-def _lens(one: object) -> CameraModel:
-    if isinstance(one, IntrinsicCalibration):
-        return one.camera
-    if isinstance(one, CameraModel):
-        return one
-    raise CalibrationError(
-        f"compare: expected calibrations of lenses, or camera models, got {type(one).__name__}",
-        code=Code.SHAPE,
-        expected="IntrinsicCalibration or CameraModel",
-        got=type(one).__name__,
-    )
-
-
-def _gauge(
-    a: IntrinsicCalibration | CameraModel,
-    b: IntrinsicCalibration | CameraModel,
-    distance: float | None,
-) -> tuple[Array, bool]:
+def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
     """Return the points that the motion is fitted to, and whether they are mere directions.
 
-    Of calibrations they are the target's, in those cells of the image in which both have seen it,
-    or in all where those are too few.
+    They are the target's, in those cells of the image in which both have seen it, or in all where
+    those are too few. Of lenses without views they are in the largest circle about the middle of
+    the image: what lenses make of corners in which no view was would turn the camera.
     """
-    camera = _lens(a)
-    known = [one for one in (a, b) if isinstance(one, IntrinsicCalibration)]
+    known = [(one.camera, one.points) for one in (a, b) if one.points is not None]
     if not known:
-        cells = places(camera.size, (2 * CELLS[0], 2 * CELLS[1])).reshape(-1, 2)
-        return known_points(points_at(camera, cells, distance)), True
-    points = [one.target_points for one in known]
-    cells_of = [_cells(one.camera, some) for one, some in zip(known, points, strict=True)]
-    common = set(cells_of[0]).intersection(*cells_of)
-    both = np.concatenate(points)
-    shared = both[np.isin(np.concatenate(cells_of), list(common))]
+        size = np.array(a.camera.size, dtype=np.float64)
+        pixels = places(a.camera.size, SHAPE).reshape(-1, 2)
+        inside = np.linalg.norm(pixels - (size - 1) / 2, axis=1) <= size.min() / 2
+        return known_points(points_at(a.camera, pixels[inside], distance)), True
+    cells = [_cells(camera, points) for camera, points in known]
+    common = set(cells[0]).intersection(*cells)
+    both = np.concatenate([points for _, points in known])
+    shared = both[np.isin(np.concatenate(cells), list(common))]
     return known_points(shared if len(common) >= LEAST else both), False
 
 
@@ -271,11 +288,11 @@ def _project(camera: CameraModel, points: Array) -> Array:
     return np.where(known, camera.project(np.where(known, points, [0.0, 0.0, 1.0])), np.nan)
 
 
-def _spread(one: IntrinsicCalibration, field: Sensitivity, gauge: Sensitivity) -> Array:
-    """Return how pixels (N, 2, 4 + K) move with independent unknowns of variance 1."""
-    values, vectors = np.linalg.eigh(one.covariance)
+def _root(covariance: Array) -> Array:
+    """Return S with S S^T the covariance."""
+    values, vectors = np.linalg.eigh(covariance)
     root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
-    return field.freed(gauge) @ root
+    return root
 
 
 class _Judged(NamedTuple):
@@ -299,7 +316,7 @@ def _judged(difference: Array, spread: Array) -> _Judged:
     off, moves = difference[known], spread[known]
     tests = (_by_values(off, moves), _by_places(off, moves))
     likelier, least = max(tests, key=lambda one: one.chance), min(tests, key=lambda one: one.chance)
-    # the least of two chances c is below c with a chance of 2 c at most (Bonferroni)
+    # the least of two chances is below c with a chance of 2 c at most (Bonferroni)
     return _Judged(
         (least if 2 * least.chance < 1.0 else likelier).ratio, min(1.0, 2 * least.chance)
     )

@@ -52,8 +52,8 @@ SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "
 MARGIN: Final = 0.02
 """Of the image, that stays free beside the target."""
 
-TURNS: Final = 8
-"""In which a target is brought to its place; after five it is there within some pixels."""
+TURNS: Final = 12
+"""In which a target is brought to its place; most are there after five."""
 
 MAP: Final = (9, 12)
 """Rows and columns of the field over which the uncertainty is counted."""
@@ -230,7 +230,7 @@ def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> A
         lowest, room = MARGIN * size + wide / 2, np.maximum((1 - 2 * MARGIN) * size - wide, 0.0)
         step = lowest + room * parts - (first + last) / 2
         at = np.clip(at + np.nan_to_num(step), 0.0, size - 1)
-        depth = depth * np.nan_to_num(np.clip((wide / size).max(axis=1) / fills, 0.5, 2.0), nan=2.0)
+        depth = depth * np.nan_to_num(np.clip((wide / size).max(axis=1) / fills, 0.7, 1.5), nan=1.5)
     return shifts
 
 

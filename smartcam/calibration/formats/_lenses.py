@@ -6,12 +6,15 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from smartcam.calibration._codes import Code
 from smartcam.calibration._files.store import read_document
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
+from smartcam.calibration._lens.comparison import Lens
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._stereo.calibration import StereoCalibration
-from smartcam.calibration.formats._cameras import CameraChain, read_cameras
+from smartcam.calibration.formats._cameras import read_cameras
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -19,8 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration.formats._cameras import CameraForm
+    from smartcam.calibration.formats._cameras import CameraChain, CameraForm
 
 HEAD: Final = 1 << 16
 """Bytes of a file by which its format is told."""
@@ -43,13 +45,15 @@ class Lenses(NamedTuple):
     """
 
     names: tuple[str, ...]
-    lenses: tuple[IntrinsicCalibration | CameraModel, ...]
+    lenses: tuple[Lens, ...]
     transforms: tuple[Transform, ...] = ()
 
 
 def read_lenses(path: str | os.PathLike[str]) -> Lenses:
-    """Return the lenses of a file: a calibration of a lens, a pair, a camera on a robot, or a
-    ``camera_info``, a camchain of Kalibr, a file of OpenCV; its content tells which.
+    """Return the lenses of a file; its content tells the format.
+
+    It may be a calibration of a lens, of a pair or of a camera on a robot, a ``camera_info``, a
+    camchain of Kalibr, or a file of OpenCV.
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``: none of these; ``WRONG_KIND``: a calibration without a
@@ -73,19 +77,49 @@ def read_lenses(path: str | os.PathLike[str]) -> Lenses:
 
 
 def _of_chain(chain: CameraChain) -> Lenses:
-    return Lenses(chain.names, chain.cameras, chain.transforms)
+    return Lenses(chain.names, tuple(Lens(one) for one in chain.cameras), chain.transforms)
+
+
+def _of_pair(pair: StereoCalibration) -> Lenses:
+    """Return a pair's lenses, each with where it saw the target."""
+    sides = []
+    for number, camera in enumerate((pair.left, pair.right)):
+        seen = [
+            one.transform.apply(view.object_points)
+            for one in pair.pairs
+            for view in ((one.left, one.right)[number],)
+            if one.used[number] and one.transform is not None and view is not None
+        ]
+        points = np.concatenate(seen) if seen else None
+        if points is not None and number:
+            points = pair.transform.apply(points)
+        sides.append(Lens(camera, points=points))
+    return Lenses((pair.transform.source, pair.transform.target), tuple(sides), (pair.transform,))
+
+
+def _of_robot(hand: HandEyeCalibration) -> Lenses | None:
+    """Return the lens of a camera on a robot; None where it has none."""
+    if hand.camera is None:
+        return None
+    seen = [
+        pose.apply(view.object_points)
+        for pose, view, used in zip(hand.target_poses, hand.views, hand.used, strict=False)
+        if used
+    ]
+    points = np.concatenate(seen) if seen else None
+    return Lenses(("camera",), (Lens(hand.camera, points=points),))
 
 
 def _ours(path: str | os.PathLike[str]) -> Lenses:
     document = read_document(path)
     if document.kind == IntrinsicCalibration.kind:
-        return Lenses(("camera",), (IntrinsicCalibration.from_data(document.data),))
+        return Lenses(("camera",), (Lens.of(IntrinsicCalibration.from_data(document.data)),))
     if document.kind == StereoCalibration.kind:
-        return _of_chain(CameraChain.of(StereoCalibration.from_data(document.data)))
+        return _of_pair(StereoCalibration.from_data(document.data))
     if document.kind == HandEyeCalibration.kind:
-        camera = HandEyeCalibration.from_data(document.data).camera
-        if camera is not None:
-            return Lenses(("camera",), (camera,))
+        found = _of_robot(HandEyeCalibration.from_data(document.data))
+        if found is not None:
+            return found
     raise CalibrationError(
         f"{path}: holds {document.kind!r}, expected a calibration that has a lens",
         code=Code.WRONG_KIND,
