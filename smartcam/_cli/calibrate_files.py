@@ -56,6 +56,12 @@ class WithFiles(click.Group):
         return (None if name == OWN else name), command, rest
 
 
+def _svg(_context: object, _option: object, path: str | None) -> str | None:
+    if path is not None and Path(path).suffix.lower() != ".svg":
+        raise click.BadParameter(f"{path}: expected a name that ends with .svg")
+    return path
+
+
 def distance_option(function: Any) -> Any:
     """Declare --distance."""
     return click.option(
@@ -82,6 +88,7 @@ def distance_option(function: Any) -> Any:
     "--svg",
     metavar="FILE",
     type=click.Path(dir_okay=False),
+    callback=_svg,
     help="Draw the differences there, beside what noise leads to; of a pair two files, -left and "
     "-right.",
 )
@@ -129,6 +136,7 @@ async def compare(
     metavar="FILE",
     type=click.Path(dir_okay=False),
     required=True,
+    callback=_svg,
     help="Where the picture goes; .svg.",
 )
 @click.option(
@@ -207,7 +215,5 @@ def _draw(path: str, names: Sequence[str], found: Sequence[LensComparison], titl
 
 
 def _write(path: str, drawn: str) -> None:
-    if Path(path).suffix.lower() != ".svg":
-        raise click.UsageError(f"{path}: expected a name that ends with .svg")
     with naming(path):
         Path(path).write_text(drawn, encoding="utf-8", newline="\n")

@@ -66,7 +66,8 @@ def short_names(names: Sequence[str]) -> list[str]:
     begin = _common(names).rstrip(DIGITS)
     rest = [one[len(begin) :] for one in names]
     end = _common([one[::-1] for one in rest])[::-1].lstrip(DIGITS)
-    return [one[: len(one) - len(end)] or one for one in rest]
+    shorts = [one[: len(one) - len(end)] for one in rest]
+    return [short or name for short, name in zip(shorts, names, strict=True)]
 
 
 def _common(names: Sequence[str]) -> str:

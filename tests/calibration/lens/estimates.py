@@ -25,7 +25,8 @@ SIGMA = 0.05
 def spread_poses(camera: CameraModel, count: int, *, seed: int = 5) -> list[Transform]:
     """Return poses of the board all over the image, near and far, tilted."""
     random, size = np.random.default_rng(seed), np.array(camera.size)
-    points, found = lenskit.BOARD.points, []
+    points = lenskit.BOARD.points
+    found: list[Transform] = []
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     while len(found) < count:
         turn = exp_rotation(random.uniform(-0.6, 0.6, 3)) @ np.diag([1.0, -1.0, -1.0])

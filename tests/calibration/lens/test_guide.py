@@ -73,8 +73,11 @@ def test_words_say_where_the_target_is_and_which_side_is_away() -> None:
     for place, (right, lower) in where.items():
         pose = poses[f"{place}, far, not tilted"]
         middle = straight.project(pose.apply(lenskit.BOARD.points)).mean(axis=0) / [640, 480]
-        for part, side in zip(middle, (right, lower), strict=True):
-            assert part == pytest.approx(0.5, abs=0.03) if side is None else (part > 0.55) == side
+        for part, beyond in zip(middle, (right, lower), strict=True):
+            if beyond is None:
+                assert part == pytest.approx(0.5, abs=0.03)
+            else:
+                assert (part > 0.55) == beyond
     for side, axis, sign in (("right", 0, 1), ("left", 0, -1), ("lower", 1, 1), ("upper", 1, -1)):
         text = f"in the middle of the image, near, tilted by 35 degrees, its {side} side farther"
         pose = poses[f"{text} away"]
