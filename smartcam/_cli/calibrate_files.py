@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from smartcam.calibration._lens.comparison import LensComparison
-    from smartcam.calibration._lens.uncertainty import Figures
-    from smartcam.calibration.formats._lenses import Lenses
+    from smartcam.calibration._lens.uncertainty import MapFigures
+    from smartcam.calibration.formats._lenses import StoredLenses
 
 DIFFERENT = 7
 """Exit code after a comparison of calibrations that differ by more than their noise explains."""
@@ -156,7 +156,7 @@ async def draw(file: str, output: str, what: Any, distance: float | None, option
     options.show({"file": output}, output)
 
 
-def _read(path: str) -> Lenses:
+def _read(path: str) -> StoredLenses:
     from smartcam.calibration.formats._lenses import read_lenses
 
     with naming(path):
@@ -194,7 +194,7 @@ def _text(name: str, one: LensComparison) -> str:
     )
 
 
-def _row(name: str, figures: Figures) -> list[object]:
+def _row(name: str, figures: MapFigures) -> list[object]:
     return [name, *(round(float(f"{one:.3g}"), 6) for one in figures)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from smartcam.calibration._codes import Code
 from smartcam.calibration._drawing.bars import Chart, Series, draw_bars, short_names
 from smartcam.calibration._drawing.maps import Map, draw_maps
-from smartcam.calibration._drawing.scene import Axes, Board, Camera, Scene
+from smartcam.calibration._drawing.scene import Axes, Board, DrawnCamera, DrawnScene
 from smartcam.calibration._drawing.scene import draw_scene as _draw_scene
 from smartcam.calibration._geometry.rigid import IDENTITY
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._geometry.frames import Transform
     from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.uncertainty import Figures
+    from smartcam.calibration._lens.uncertainty import MapFigures
     from smartcam.calibration._targets import Target
 
 FromImages = IntrinsicCalibration | StereoCalibration | HandEyeCalibration
@@ -109,7 +109,7 @@ def _size(pixels: Array) -> tuple[int, int]:
     return width, height
 
 
-def _said(figures: Figures) -> str:
+def _said(figures: MapFigures) -> str:
     names = figures._fields
     return ", ".join(f"{name} {value:.2g}" for name, value in zip(names, figures, strict=True))
 
@@ -197,22 +197,24 @@ def _boards(
     ]
 
 
-def _lens_scene(one: IntrinsicCalibration) -> Scene:
+def _lens_scene(one: IntrinsicCalibration) -> DrawnScene:
     names = short_names([label(fit.view, number) for number, fit in enumerate(one.views)])
     poses, off = [fit.transform for fit in one.views], [not fit.used for fit in one.views]
     boards = _boards(names, poses, off, one.views[0].view.target)
-    return Scene(boards, [Camera("camera", IDENTITY, one.camera)])
+    return DrawnScene(boards, [DrawnCamera("camera", IDENTITY, one.camera)])
 
 
-def _pair_scene(one: StereoCalibration) -> Scene:
+def _pair_scene(one: StereoCalibration) -> DrawnScene:
     shown = next(view for fit in one.pairs for view in (fit.left, fit.right) if view is not None)
     poses, off = [fit.transform for fit in one.pairs], [not any(fit.used) for fit in one.pairs]
     boards = _boards(short_names(_pair_names(one)), poses, off, shown.target)
     right = one.transform.rigid.inverse()
-    return Scene(boards, [Camera("left", IDENTITY, one.left), Camera("right", right, one.right)])
+    return DrawnScene(
+        boards, [DrawnCamera("left", IDENTITY, one.left), DrawnCamera("right", right, one.right)]
+    )
 
 
-def _robot_scene(one: HandEyeCalibration) -> Scene:
+def _robot_scene(one: HandEyeCalibration) -> DrawnScene:
     names = short_names(_robot_names(one))
     corners = _corners(one.target)
     base = [Axes("base", IDENTITY)]
@@ -221,15 +223,15 @@ def _robot_scene(one: HandEyeCalibration) -> Scene:
     if one.setup == "eye-in-hand":
         board = Board("target", one.target_pose.apply(corners))
         cameras = [
-            Camera(name, flange @ one.camera_pose.rigid, one.camera)
+            DrawnCamera(name, flange @ one.camera_pose.rigid, one.camera)
             for name, flange in zip(names, flanges, strict=True)
         ]
-        return Scene([board], cameras, base, up)
+        return DrawnScene([board], cameras, base, up)
     boards = [
         Board(name, (flange @ one.target_pose.rigid).apply(corners), not used)
         for name, flange, used in zip(names, flanges, one.used, strict=True)
     ]
-    return Scene(boards, [Camera("camera", one.camera_pose.rigid, one.camera)], base, up)
+    return DrawnScene(boards, [DrawnCamera("camera", one.camera_pose.rigid, one.camera)], base, up)
 
 
 _CHARTS: Final[Mapping[type, Callable[[Any], list[Chart]]]] = {
@@ -238,7 +240,7 @@ _CHARTS: Final[Mapping[type, Callable[[Any], list[Chart]]]] = {
     HandEyeCalibration: _robot_chart,
 }
 
-_SCENES: Final[Mapping[type, Callable[[Any], Scene]]] = {
+_SCENES: Final[Mapping[type, Callable[[Any], DrawnScene]]] = {
     IntrinsicCalibration: _lens_scene,
     StereoCalibration: _pair_scene,
     HandEyeCalibration: _robot_scene,

@@ -56,7 +56,7 @@ class Board(NamedTuple):
     off: bool = False  # left out of the calibration
 
 
-class Camera(NamedTuple):
+class DrawnCamera(NamedTuple):
     """A camera in the scene."""
 
     name: str
@@ -71,26 +71,26 @@ class Axes(NamedTuple):
     pose: Rigid
 
 
-class Scene(NamedTuple):
+class DrawnScene(NamedTuple):
     """What is drawn, in a frame of its own."""
 
     boards: Sequence[Board]
-    cameras: Sequence[Camera]
+    cameras: Sequence[DrawnCamera]
     axes: Sequence[Axes] = ()
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # of a camera's frame; a robot's is z
 
 
-class _Item(NamedTuple):
+class _Drawn(NamedTuple):
     depth: float
     drawn: str
     label: str
     at: Array  # (2,)
 
 
-class _Sight:
+class _Outlook:
     """How points of a scene become pixels."""
 
-    def __init__(self, scene: Scene, points: Array) -> None:
+    def __init__(self, scene: DrawnScene, points: Array) -> None:
         # upright first, z up; then turned about the vertical and looked at from above
         up = np.array(scene.up)
         ahead = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.5 else np.array([0.0, 1.0, 0.0])
@@ -121,7 +121,7 @@ class _Sight:
         return float((points @ self.axes[1]).mean())
 
 
-def draw_scene(scene: Scene, title: str) -> str:
+def draw_scene(scene: DrawnScene, title: str) -> str:
     """Return a scene: boards in blue, those that were left out dashed; cameras in orange."""
     places = np.concatenate(
         [
@@ -134,9 +134,9 @@ def draw_scene(scene: Scene, title: str) -> str:
     long = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
     shapes = [_frustum(one, long) for one in scene.cameras]
     ends = [one.pose.apply(ARROW * extent * np.eye(3)) for one in scene.axes]
-    sight = _Sight(scene, np.concatenate([places, *shapes, *ends]))
+    sight = _Outlook(scene, np.concatenate([places, *shapes, *ends]))
     items = [
-        _Item(
+        _Drawn(
             sight.depth(one.corners),
             polygon(sight.pixels(one.corners), "board-off" if one.off else "board", one.name),
             one.name,
@@ -152,14 +152,14 @@ def draw_scene(scene: Scene, title: str) -> str:
         start = sight.pixels(one.pose.translation)
         for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
             parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
-            items.append(_Item(0.0, "", axis, tip))
-        items.append(_Item(0.0, "", one.name, start + BELOW))
+            items.append(_Drawn(0.0, "", axis, tip))
+        items.append(_Drawn(0.0, "", one.name, start + BELOW))
     parts += _labels([(one.label, one.at) for one in items[::-1] if one.label])
     parts += _scale(sight)
     return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
 
 
-def _frustum(camera: Camera, long: float) -> Array:
+def _frustum(camera: DrawnCamera, long: float) -> Array:
     """Return a camera's centre and the corners of what it sees at a distance (5, 3)."""
     wide, high = 0.5, 0.375
     if camera.model is not None:
@@ -168,11 +168,11 @@ def _frustum(camera: Camera, long: float) -> Array:
     return camera.pose.apply(long * np.array([[0.0, 0.0, 0.0], *rim]))
 
 
-def _camera(sight: _Sight, camera: Camera, shape: Array) -> _Item:
+def _camera(sight: _Outlook, camera: DrawnCamera, shape: Array) -> _Drawn:
     centre, *rim = sight.pixels(shape)
     sides = [line(centre, one, "camera") for one in rim]
     drawn = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
-    return _Item(sight.depth(shape), drawn, camera.name, centre + BELOW)
+    return _Drawn(sight.depth(shape), drawn, camera.name, centre + BELOW)
 
 
 def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
@@ -198,7 +198,7 @@ def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 
-def _scale(sight: _Sight) -> Iterator[str]:
+def _scale(sight: _Outlook) -> Iterator[str]:
     metres = round_down(0.2 * WIDTH / sight.zoom)
     start = np.array([BORDER, HEAD + HEIGHT + 30])
     end = start + np.array([metres * sight.zoom, 0.0])

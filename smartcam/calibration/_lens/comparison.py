@@ -22,7 +22,7 @@ from smartcam.calibration._lens.field import (
 )
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._lens.uncertainty import Figures, figures
+from smartcam.calibration._lens.uncertainty import MapFigures, figures
 from smartcam.calibration._optional_imports import load
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
@@ -111,12 +111,12 @@ class LensComparison:
         return lengths
 
     @property
-    def observed(self) -> Figures:
+    def observed(self) -> MapFigures:
         """The differences in four numbers, of a coordinate, pixels."""
         return figures(self.lengths)
 
     @property
-    def predicted(self) -> Figures | None:
+    def predicted(self) -> MapFigures | None:
         """What noise leads to, in the same four numbers; None where it is not known."""
         if self.expected is None:
             return None

@@ -85,7 +85,7 @@ class NextView(NamedTuple):
     present: float
 
 
-class Candidates(NamedTuple):
+class CandidateViews(NamedTuple):
     """Views that could be taken (C), all of whose points are in the image."""
 
     texts: list[str]
@@ -182,7 +182,7 @@ def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array
     return left
 
 
-def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candidates:
+def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> CandidateViews:
     """Return views that a camera could have of a target, ``roll`` about the line of sight."""
     low, high = target.points[:, :2].min(axis=0), target.points[:, :2].max(axis=0)
     centre = np.append((low + high) / 2, 0.0)
@@ -203,7 +203,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
     good = _visible(camera, turned + shifts[:, None])
     chosen = np.flatnonzero(good).tolist()
     corners = (turned[good, :4] + shifts[good, None]).reshape(-1, 3)
-    return Candidates(
+    return CandidateViews(
         [_words(*ways[number], roll) for number in chosen],
         poses.taken(chosen),
         camera.project(corners).reshape(-1, 4, 2),

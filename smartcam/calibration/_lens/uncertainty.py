@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
 
 
-class Figures(NamedTuple):
+class MapFigures(NamedTuple):
     """A map in four numbers, of a coordinate; NaN where the lens' model does not reach.
 
     Attributes:
@@ -80,17 +80,17 @@ class ProjectionUncertainty:
         return across
 
     @property
-    def figures(self) -> Figures:
+    def figures(self) -> MapFigures:
         """``sigma`` in four numbers, pixels."""
         return figures(self.sigma)
 
 
-def figures(sigma: Array) -> Figures:
+def figures(sigma: Array) -> MapFigures:
     """Return a map (h, w) of standard deviations, or lengths, in four numbers."""
     rows, columns = sigma.shape
     corners = sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
     known = sigma[np.isfinite(sigma)]
-    return Figures(
+    return MapFigures(
         float(sigma[rows // 2, columns // 2]),
         math.sqrt(float((corners**2).mean())),
         float(known.max()) if len(known) else math.nan,

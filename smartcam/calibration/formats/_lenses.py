@@ -35,7 +35,7 @@ MARKS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
 """What tells the formats of other programs apart; ours begin with a brace."""
 
 
-class Lenses(NamedTuple):
+class StoredLenses(NamedTuple):
     """Lenses of a file.
 
     Attributes:
@@ -49,7 +49,7 @@ class Lenses(NamedTuple):
     transforms: tuple[Transform, ...] = ()
 
 
-def read_lenses(path: str | os.PathLike[str]) -> Lenses:
+def read_lenses(path: str | os.PathLike[str]) -> StoredLenses:
     """Return the lenses of a file; its content tells the format.
 
     It may be a calibration of a lens, of a pair or of a camera on a robot, a ``camera_info``, a
@@ -76,11 +76,11 @@ def read_lenses(path: str | os.PathLike[str]) -> Lenses:
     )
 
 
-def _of_chain(chain: CameraChain) -> Lenses:
-    return Lenses(chain.names, tuple(Lens(one) for one in chain.cameras), chain.transforms)
+def _of_chain(chain: CameraChain) -> StoredLenses:
+    return StoredLenses(chain.names, tuple(Lens(one) for one in chain.cameras), chain.transforms)
 
 
-def _of_pair(pair: StereoCalibration) -> Lenses:
+def _of_pair(pair: StereoCalibration) -> StoredLenses:
     """Return a pair's lenses, each with where it saw the target."""
     sides = []
     for number, camera in enumerate((pair.left, pair.right)):
@@ -94,10 +94,12 @@ def _of_pair(pair: StereoCalibration) -> Lenses:
         if points is not None and number:
             points = pair.transform.apply(points)
         sides.append(Lens(camera, points=points))
-    return Lenses((pair.transform.source, pair.transform.target), tuple(sides), (pair.transform,))
+    return StoredLenses(
+        (pair.transform.source, pair.transform.target), tuple(sides), (pair.transform,)
+    )
 
 
-def _of_robot(hand: HandEyeCalibration) -> Lenses | None:
+def _of_robot(hand: HandEyeCalibration) -> StoredLenses | None:
     """Return the lens of a camera on a robot; None where it has none."""
     if hand.camera is None:
         return None
@@ -107,13 +109,13 @@ def _of_robot(hand: HandEyeCalibration) -> Lenses | None:
         if used
     ]
     points = np.concatenate(seen) if seen else None
-    return Lenses(("camera",), (Lens(hand.camera, points=points),))
+    return StoredLenses(("camera",), (Lens(hand.camera, points=points),))
 
 
-def _ours(path: str | os.PathLike[str]) -> Lenses:
+def _ours(path: str | os.PathLike[str]) -> StoredLenses:
     document = read_document(path)
     if document.kind == IntrinsicCalibration.kind:
-        return Lenses(("camera",), (Lens.of(IntrinsicCalibration.from_data(document.data)),))
+        return StoredLenses(("camera",), (Lens.of(IntrinsicCalibration.from_data(document.data)),))
     if document.kind == StereoCalibration.kind:
         return _of_pair(StereoCalibration.from_data(document.data))
     if document.kind == HandEyeCalibration.kind:
