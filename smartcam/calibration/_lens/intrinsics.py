@@ -17,6 +17,7 @@ from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._geometry.rotations import Array
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, held_out
 from smartcam.calibration._lens.coverage import Coverage, coverage
+from smartcam.calibration._lens.field import SHAPE
 from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.poses import (
     CAMERA,
@@ -29,6 +30,7 @@ from smartcam.calibration._lens.poses import (
 from smartcam.calibration._lens.projection import whitening
 from smartcam.calibration._lens.sheet_shape import choose_shape
 from smartcam.calibration._lens.start import fit_lens, parameter_names
+from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
 from smartcam.calibration._views import TargetView
 from smartcam.exceptions import CalibrationError
 
@@ -145,6 +147,35 @@ class IntrinsicCalibration(storage.SavedCalibration):
         """Names of the views that were left out."""
         return tuple(
             label(one.view, number) for number, one in enumerate(self.views) if not one.used
+        )
+
+    def uncertainty(
+        self, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
+    ) -> ProjectionUncertainty:
+        """Return how sure the lens is of where it projects, as a map over its field.
+
+        It is what ``covariance`` leads to for a point that does not move, without the small motion
+        of the camera that fits best to the target's points where they were seen: every pose that
+        is found with this lens has that motion in it. It is least at the distances at which the
+        target was. Where it never was, the map shows what the lens' model makes of that, and no
+        covariance knows whether a model fits there.
+
+        Args:
+            distance: of the points from the camera, metres; None: infinity.
+            shape: rows and columns of the map, 2 to 500 each, from corner to corner.
+
+        Raises:
+            CalibrationError: ``NOT_FINITE``: no such distance; ``SHAPE``: no such rows and columns.
+        """
+        return uncertainty(
+            self.camera, self.covariance, self.target_points, distance=distance, shape=shape
+        )
+
+    @property
+    def target_points(self) -> Array:
+        """(N, 3), where the target's points were before the camera, of all used views, metres."""
+        return np.concatenate(
+            [one.transform.apply(one.view.object_points) for one in self.views if one.used]
         )
 
     def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
