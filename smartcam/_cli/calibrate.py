@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from smartcam._cli.calibrate_files import OWN, OwnContext, WithFiles, compare, draw
 from smartcam._cli.calibrate_terminal import drive, listing_text
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
 from smartcam._cli.page import PageOptions, page_options
@@ -36,8 +37,11 @@ MAX_DESCRIPTION = 65_536
 """Bytes of a target's description."""
 
 
+HELP = "Calibrate a camera against a robot: where its localizations lie in the robot's space. "
+
+
 @click.command(
-    help="Calibrate a camera against a robot: where its localizations lie in the robot's space. "
+    help=f"{HELP}"
     "Asks step by step; an answer is on the disk before the next step is shown, so the same "
     "command goes on where it was broken off. Beside an answer, :undo, :repeat and :abort are "
     "understood. With --json each step is a line of stdout and each line of stdin "
@@ -47,7 +51,9 @@ MAX_DESCRIPTION = 65_536
     f"exit code {STALE} if it is stale. "
     "With --wizard sheet or hand-eye the camera's own pictures are looked at: those of a camera "
     "that sends them, or those that come into the folder of --pictures; then no URL is needed. "
-    f"The camera is connected for each picture only. {CONNECTS}"
+    f"The camera is connected for each picture only. {CONNECTS} "
+    "smartcam calibrate compare A B compares calibrations that are in files, and smartcam "
+    "calibrate draw FILE draws one; --help behind each tells more."
 )
 @click.argument("url", required=False)
 @click.option("--name", "called", metavar="NAME", help="Its name.  [default: that of the wizard]")
@@ -105,7 +111,7 @@ MAX_DESCRIPTION = 65_536
     help="Bound of each step of a picture: connect (default 10), switch (10), trigger (5).",
 )
 @runs(*OUTPUT)
-async def calibrate(
+async def wizard_command(
     url: str | None,
     called: str | None,
     wizard: str | None,
@@ -155,6 +161,12 @@ async def calibrate(
             service.close()
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
+
+
+wizard_command.context_class = OwnContext
+calibrate = WithFiles(
+    "calibrate", commands={OWN: wizard_command, "compare": compare, "draw": draw}, help=HELP
+)
 
 
 def _list(path: str, options: Options) -> None:

@@ -49,7 +49,8 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 )
 """First match decides. 0 done; 1 a fault of ours; 2 wrong usage; 3 no session or a broken one; 4 a
 wait in a session ran out; 5 the camera refused or is not running; 6 a result is not interpretable;
-7 ``calibrate --check``: stale; 130 and 143: cut off by Ctrl-C or SIGTERM."""
+7 ``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143: cut off by Ctrl-C
+or SIGTERM."""
 
 
 TAKEN = (

@@ -51,7 +51,7 @@ EPILOG = (
     "Exit codes: 0 done; 1 a fault of ours; 2 wrong usage, a bad layout text included; 3 no "
     "session: nothing listens, silence or garbage, connection lost; 4 a wait in a session ran "
     "out; 5 the camera refused or is not running; 6 a result is not interpretable; 7 a calibration "
-    "that was checked is stale."
+    "that was checked is stale, or two differ."
 )
 
 

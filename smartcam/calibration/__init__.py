@@ -28,6 +28,7 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.calibration._codes import Code, Remark
     from smartcam.calibration._detection.find import find_target
+    from smartcam.calibration._drawing.draw import draw_scene, draw_uncertainty, draw_views
     from smartcam.calibration._files.directory import Folder
     from smartcam.calibration._files.load import load_calibration
     from smartcam.calibration._geometry.frames import PoseHistory, Transform
@@ -44,9 +45,12 @@ if TYPE_CHECKING:
     )
     from smartcam.calibration._hand_eye.equations import RobotSigmas
     from smartcam.calibration._hand_eye.result import HandEyeCalibration
+    from smartcam.calibration._lens.comparison import LensComparison, compare
+    from smartcam.calibration._lens.guide import NextView, suggest_views
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._lens.poses import TargetPose, locate
+    from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
     from smartcam.calibration._plane.calibration import Drift, PlaneCalibration, fit_plane
     from smartcam.calibration._plane.moving_camera import MovingCamera
     from smartcam.calibration._plane.tool import fit_tool_tip
@@ -79,10 +83,13 @@ __all__ = [
     "HandEyeCalibration",
     "Height",
     "IntrinsicCalibration",
+    "LensComparison",
     "MovingCamera",
+    "NextView",
     "PlaneCalibration",
     "PlaneProjection",
     "PoseHistory",
+    "ProjectionUncertainty",
     "Remark",
     "RobotSigmas",
     "Sheet",
@@ -98,6 +105,10 @@ __all__ = [
     "calibrate_sheet",
     "calibrate_stereo",
     "chain_of",
+    "compare",
+    "draw_scene",
+    "draw_uncertainty",
+    "draw_views",
     "find_target",
     "fit_corners",
     "fit_plane",
@@ -107,6 +118,7 @@ __all__ = [
     "locate",
     "make_sheet",
     "scaled",
+    "suggest_views",
     "target_from_data",
     "target_to_data",
 ]
@@ -117,6 +129,7 @@ if not TYPE_CHECKING:
         {
             "_codes": "Code Remark",
             "_detection.find": "find_target",
+            "_drawing.draw": "draw_scene draw_uncertainty draw_views",
             "_files.directory": "Folder",
             "_files.load": "load_calibration",
             "_geometry.frames": "PoseHistory Transform",
@@ -124,9 +137,12 @@ if not TYPE_CHECKING:
             "_hand_eye.calibration": "calibrate_hand_eye calibrate_hand_eye_from_poses",
             "_hand_eye.equations": "RobotSigmas",
             "_hand_eye.result": "HandEyeCalibration",
+            "_lens.comparison": "LensComparison compare",
+            "_lens.guide": "NextView suggest_views",
             "_lens.intrinsics": "IntrinsicCalibration calibrate_intrinsics",
             "_lens.model": "CameraModel",
             "_lens.poses": "TargetPose locate",
+            "_lens.uncertainty": "ProjectionUncertainty",
             "_plane.calibration": "Drift PlaneCalibration fit_plane",
             "_plane.moving_camera": "MovingCamera",
             "_plane.tool": "fit_tool_tip",

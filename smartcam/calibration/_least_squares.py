@@ -12,6 +12,7 @@ section 6; Hartley and Zisserman, Multiple View Geometry, 2nd edition, appendix 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -34,6 +35,10 @@ LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e12
 
 RANK = 1e-14
 """Of a matrix with ones on its diagonal: singular values that are smaller are rounding errors."""
+
+
+LARGE = 60
+"""Unknowns, beyond which singular values cost too much time to be looked at first."""
 
 
 class Normal(NamedTuple):
@@ -162,6 +167,9 @@ def solve_scaled(matrix: Array, right: Array) -> Array:
     scale = unit_diagonal(matrix)
     by_row = scale.reshape(-1, *[1] * (right.ndim - 1))
     scaled = matrix / np.outer(scale, scale)
+    if len(matrix) > LARGE:
+        with contextlib.suppress(np.linalg.LinAlgError):
+            return np.asarray(np.linalg.solve(scaled, right / by_row) / by_row, dtype=np.float64)
     solution: Array = np.linalg.lstsq(scaled, right / by_row, rcond=RANK)[0] / by_row
     return solution
 

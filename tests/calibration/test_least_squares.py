@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration._least_squares import (
+    LARGE,
     Normal,
     inverse_scaled,
     minimize,
@@ -90,3 +91,12 @@ def test_scaled_equations_of_many_units_are_solved() -> None:
     np.testing.assert_allclose(solve_scaled(matrix, matrix @ expected), expected, rtol=1e-6)
     inverse = np.array([[1e-4, -1e3], [-1e3, 1e12]]) / 9.9e7
     np.testing.assert_allclose(inverse_scaled(matrix), inverse, rtol=1e-9)
+
+
+def test_many_scaled_equations_are_solved_even_where_some_are_missing() -> None:
+    rows = RANDOM.normal(size=(90, LARGE + 10))
+    expected = RANDOM.normal(size=LARGE + 10)
+    np.testing.assert_allclose(solve_scaled(rows.T @ rows, rows.T @ rows @ expected), expected)
+    rows[:, -1] = 0.0
+    again = solve_scaled(rows.T @ rows, rows.T @ rows @ expected)
+    np.testing.assert_allclose(rows @ again, rows @ expected)

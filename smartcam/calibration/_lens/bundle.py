@@ -1,5 +1,6 @@
 """Lenses, a rig of cameras and poses of targets, adjusted together to the least reprojection error.
 
+Where a sheet is not what it was meant to be its points are adjusted, too, in the same equations.
 Each target pose concerns its own views alone, so the six unknowns of each are eliminated; see
 :mod:`smartcam.calibration._least_squares`.
 """
@@ -15,11 +16,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from smartcam.calibration._geometry.rigid import IDENTITY, Rigid
-from smartcam.calibration._least_squares import Normal, minimize
-from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.calibration._least_squares import Normal, inverse_scaled, minimize, solve_scaled
+from smartcam.calibration._lens.projection import (
+    SMOOTH,
+    excess,
+    linearize,
+    pose_changes,
+    smooth_changes,
+    whitening,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.model import CameraModel
@@ -29,12 +37,22 @@ SETTLED: Final = 1e-7
 """Part of the weighted squares by which the last step still lowers them: of 1000 coordinates it is
 a hundredth of a standard deviation."""
 
-Indices: TypeAlias = np.ndarray[tuple[int], np.dtype[np.intp]]
+LOOSE: Final = 0.1
+"""Standard deviation that a sheet's point is thought to be off, in parts of its distance to the
+next: one that few views show does not go astray."""
+
+TIGHT: Final = 1e-4
+"""The same for place, direction and size of all points as a whole, which no view tells."""
+
+FEW: Final = 5
+"""Poses up to which a fit without one of them is no small step away."""
+
+Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 """Numbers of things."""
 
 
 class Sight(NamedTuple):
-    """One view."""
+    """One view; a camera has one of each pose at most."""
 
     camera: int  # number of the camera
     pose: int  # number of the target's pose
@@ -52,9 +70,9 @@ class Bundle:
     # of its F unknowns; (4 + K, 0) for a lens that is known
     basis: tuple[Array, ...]
     rigid: bool = False  # whether ``rig`` is known
-    # (T, 3), of the target, metres, where they are not as they were meant to be; they are not
-    # adjusted here
+    # (T, 3), of the target, metres, where they are not as they were meant to be
     points: Array | None = None
+    free: bool = False  # whether ``points`` are adjusted; they are given then
 
     @classmethod
     def single(
@@ -68,6 +86,11 @@ class Bundle:
         known = known_lens(camera) if basis is None else basis
         return cls((camera,), Rigid.stacked([]), poses, (known,), points=points)
 
+    def known(self) -> Bundle:
+        """Return it with nothing to adjust but the poses."""
+        lenses = tuple(known_lens(one) for one in self.cameras)
+        return dataclasses.replace(self, basis=lenses, rigid=True, free=False)
+
     @property
     def lens_columns(self) -> list[slice]:
         """Where each camera's unknowns stand among the shared ones."""
@@ -75,10 +98,16 @@ class Bundle:
         return [slice(first, last) for first, last in itertools.pairwise(ends)]
 
     @property
-    def shared(self) -> int:
-        """Number of unknowns that all views share: the lenses', then 6 of each further camera."""
+    def of_cameras(self) -> int:
+        """Number of unknowns of the cameras: the lenses', then 6 of each further camera."""
         lenses = sum(int(one.shape[1]) for one in self.basis)
         return lenses + (0 if self.rigid else 6 * (len(self.cameras) - 1))
+
+    @property
+    def shared(self) -> int:
+        """Number of unknowns that all views share: the cameras', then 3 of each free point."""
+        free = self.points.size if self.free and self.points is not None else 0
+        return self.of_cameras + free
 
     def from_first(self, camera: int) -> Rigid:
         """Return the motion from the first camera's frame into that of a camera."""
@@ -91,11 +120,13 @@ class Bundle:
             with_lens(camera, lens_values(camera) + basis @ shared[some]) if basis.size else camera
             for camera, basis, some in zip(self.cameras, self.basis, columns, strict=True)
         )
-        rig = self.rig
+        rig, points = self.rig, self.points
         if not self.rigid and rig.size:
-            rig = rig.turned_after(shared[columns[-1].stop :].reshape(-1, 6))
+            rig = rig.turned_after(shared[columns[-1].stop : self.of_cameras].reshape(-1, 6))
+        if points is not None and self.free:
+            points = points + shared[self.of_cameras :].reshape(-1, 3)
         return dataclasses.replace(
-            self, cameras=cameras, rig=rig, poses=self.poses.turned_after(poses)
+            self, cameras=cameras, rig=rig, poses=self.poses.turned_after(poses), points=points
         )
 
 
@@ -125,9 +156,30 @@ class AdjustedBundle:
     residuals: list[Array]  # of each sight (N, 2), seen minus projected, pixels
     weighted: float  # sum of the weighted squares; infinite where points lie behind a camera
     more: float  # variance that each coordinate was given beside its own, pixels^2
-    covariance: Array  # (S, S), of the shared unknowns; NaN where ``weighted`` is infinite
-    pose_covariance: Array  # (P, 6, 6), of each pose
+    normal: Normal  # the equations at the solution
     freedom: int  # coordinates less unknowns
+
+    @property
+    def covariance(self) -> Array:
+        """That of the cameras' unknowns; NaN where ``weighted`` is infinite."""
+        count = self.bundle.of_cameras
+        if not math.isfinite(self.weighted):
+            return np.full((count, count), np.nan)
+        # the inverse's upper left block is that of Schur's complement: see Normal.covariance
+        matrix = self.normal.reduced()[0]
+        between, points = matrix[:count, count:], matrix[count:, count:]
+        return inverse_scaled(matrix[:count, :count] - between @ np.linalg.solve(points, between.T))
+
+    @property
+    def pose_covariance(self) -> Array:
+        """That of each pose (P, 6, 6)."""
+        return self.normal.covariance()[1]
+
+    @property
+    def rms(self) -> float:
+        """Standard deviation of a coordinate of the residuals, pixels."""
+        squares = sum(float((one**2).sum()) for one in self.residuals)
+        return math.sqrt(squares / max(self.freedom, 1))
 
 
 def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) -> AdjustedBundle:
@@ -151,119 +203,192 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
 
 def adjust(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
     """Return the least squares, each point weighted by its covariance and ``more`` variance."""
-    scene = _FixedPart(bundle, sights, more)
-    bundle, normal = minimize(bundle, scene.normal, Bundle.moved, gain=SETTLED)
-    covariance, pose_covariance = normal.covariance()
+    normal_at = BundleEquations(bundle, sights, more).normal
+    bundle, normal = minimize(bundle, normal_at, Bundle.moved, gain=SETTLED)
     count = 2 * sum(len(sight.view.ids) for sight in sights)
     seen = len({sight.pose for sight in sights})
     return AdjustedBundle(
         bundle=bundle,
-        residuals=scene.residuals(bundle),
+        residuals=residuals(bundle, sights),
         weighted=normal.cost,
         more=more,
-        covariance=covariance,
-        pose_covariance=pose_covariance,
-        freedom=count - bundle.shared - 6 * seen - _free_points(bundle, sights),
+        normal=normal,
+        freedom=count - bundle.of_cameras - 6 * seen - (free_points(sights) if bundle.free else 0),
     )
 
 
-def _free_points(bundle: Bundle, sights: Sequence[Sight]) -> int:
-    """Return the number of unknowns of the target's points; as a whole they keep 7 of them."""
-    if bundle.points is None:
-        return 0
+class LeftOut(NamedTuple):
+    """One pose under cameras that were fitted without its views."""
+
+    pose: int
+    bundle: Bundle  # the cameras and the sheet, without its views
+    residuals: list[Array]  # of each of its views (N, 2), pixels; the pose alone is fitted to them
+
+
+def held_out(
+    adjusted: AdjustedBundle, sights: Sequence[Sight], poses: Sequence[int]
+) -> Iterator[LeftOut]:
+    """Yield some poses, each left out once; where there are few the fit is done anew."""
+    # At the solution the normal equations without a pose are all less its own, both with their
+    # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
+    # without the pose. What it leaves is of second order in how far the pose pulls the others.
+    # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
+    matrix, right, _, _ = adjusted.normal.reduced()
+    for pose in poses:
+        own = [one._replace(pose=0) for one in sights if one.pose == pose]
+        without = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
+        if len(poses) > FEW:
+            part = (
+                BundleEquations(without, own, adjusted.more, prior=False).normal(without).reduced()
+            )
+            step = solve_scaled(matrix - part[0], right - part[1])
+            without = without.moved(step, part[3] - part[2] @ step)
+        else:
+            others = [one for one in sights if one.pose != pose]
+            anew = adjust(adjusted.bundle, others, adjusted.more).bundle
+            without = dataclasses.replace(anew, poses=without.poses)
+            at = adjust(without.known(), own, adjusted.more).bundle.poses
+            without = dataclasses.replace(without, poses=at)
+        yield LeftOut(pose, without, residuals(without, own))
+
+
+def free_points(sights: Sequence[Sight]) -> int:
+    """Return the number of unknowns of the points that are seen; as a whole they keep 7."""
     return 3 * len(np.unique(np.concatenate([one.view.ids for one in sights]))) - 7
 
 
 class _Group(NamedTuple):
-    """All that one camera sees, in one array."""
+    """All N points that one camera sees."""
 
     camera: int
-    sights: list[int]  # numbers of its views
     poses: list[int]  # of each of its views
-    bounds: list[slice]  # rows of each of its views
-    rows: Indices  # pose of each row (N,)
-    points: Array  # (N, 3), on the targets, metres
+    bounds: list[slice]  # points of each of its views
+    pose: Indices  # (N,)
+    ids: Indices  # (N,), on the target
     pixels: Array  # (N, 2)
     white: Array  # (N, 2, 2)
 
 
-class _FixedPart:
-    """What does not change while a bundle is adjusted."""
+def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
+    views, poses = [one.view for one in sights], [one.pose for one in sights]
+    ends = np.cumsum([0, *(len(one.ids) for one in views)])
+    return _Group(
+        camera,
+        poses,
+        bounds=[slice(first, last) for first, last in itertools.pairwise(ends.tolist())],
+        pose=np.repeat(poses, np.diff(ends)),
+        ids=np.concatenate([one.ids for one in views]),
+        pixels=np.concatenate([one.points for one in views]),
+        white=whitening(np.concatenate([one.covariance for one in views]), more),
+    )
 
-    def __init__(self, bundle: Bundle, sights: Sequence[Sight], more: float) -> None:
-        cameras, poses = len(bundle.cameras), bundle.poses.size
-        self._poses = poses
-        self._count = len(sights)
-        self._seen = np.isin(np.arange(poses), [one.pose for one in sights])
-        chosen = ([i for i, one in enumerate(sights) if one.camera == k] for k in range(cameras))
-        self._groups = [
-            _group(camera, [sights[i] for i in some], some, more, bundle.points)
-            for camera, some in enumerate(chosen)
-            if some
-        ]
+
+class BundleEquations:
+    """What does not change while a bundle is adjusted.
+
+    ``prior``: whether free points are held where they were meant to be, as far as LOOSE and TIGHT
+    say. ``smooth``: with further unknowns of each camera, the last of all: any
+    :func:`~smartcam.calibration._lens.projection.smooth_changes` of its image.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        sights: Sequence[Sight],
+        more: float,
+        *,
+        prior: bool = True,
+        smooth: bool = False,
+    ) -> None:
+        sides = ([one for one in sights if one.camera == k] for k in range(len(bundle.cameras)))
+        self._groups = [_group(k, some, more) for k, some in enumerate(sides) if some]
+        self._unseen = ~np.isin(np.arange(bundle.poses.size), [one.pose for one in sights])
+        self._meant = sights[0].view.target.points
+        self._smooth = SMOOTH if smooth else 0
+        self._prior = _prior(self._meant) if prior and bundle.free else None
 
     def normal(self, bundle: Bundle) -> Normal:
         """Return the normal equations."""
-        columns, normal = bundle.lens_columns, Normal.nothing(bundle.shared, self._poses, 6)
-        normal.own[~self._seen] = np.eye(6)  # poses that nothing moves stay
-        cost = 0.0
+        shared = bundle.shared + self._smooth * len(bundle.cameras)
+        found, cost = Normal.nothing(shared, bundle.poses.size, 6), 0.0
+        found.own[self._unseen] = np.eye(6)  # poses that nothing moves stay
+        matrix, right = found.shared, found.shared_right
         for group in self._groups:
-            number = group.camera
-            turned = np.einsum("nij,nj->ni", bundle.poses.rotation[group.rows], group.points)
-            near = turned + bundle.poses.translation[group.rows]
-            rig = bundle.from_first(number)
-            there = near @ rig.rotation.T
-            seen = linearize(there + rig.translation, bundle.cameras[number])
-            # p = R_c (R m + t) + t_c moves with a pose' turn by R_c (w x R m), with the rig's by
-            # w x (R_c (R m + t)); see pose_changes.
-            own = np.arange(columns[number].start, columns[number].stop)
-            parts = [
-                pose_changes(seen.by_point @ rig.rotation, turned),
-                seen.by_lens @ bundle.basis[number],
-            ]
-            if number and not bundle.rigid:
-                start = columns[-1].stop + 6 * (number - 1)
-                own = np.concatenate([own, np.arange(start, start + 6)])
-                parts.append(pose_changes(seen.by_point, there))
-            parts.append((group.pixels - seen.pixels)[..., None])
-            jacobian = group.white @ np.concatenate(parts, axis=2)
+            own, jacobian, by_points = self._columns(bundle, group)
             for pose, some in zip(group.poses, group.bounds, strict=True):
-                rows = jacobian[some].reshape(-1, jacobian.shape[2])
-                product = rows.T @ rows  # of the pose', the shared columns and the residuals
-                normal.own[pose] += product[:6, :6]
-                normal.own_right[pose] += product[:6, -1]
-                normal.mixed[pose][:, own] += product[:6, 6:-1]
-                normal.shared[np.ix_(own, own)] += product[6:-1, 6:-1]
-                normal.shared_right[own] += product[6:-1, -1]
+                rows = jacobian[some]
+                flat = rows.reshape(-1, rows.shape[2])
+                product = flat.T @ flat  # of the pose', the shared columns and the residuals
+                found.own[pose] += product[:6, :6]
+                found.own_right[pose] += product[:6, -1]
+                found.mixed[pose][:, own] += product[:6, 6:-1]
+                matrix[np.ix_(own, own)] += product[6:-1, 6:-1]
+                right[own] += product[6:-1, -1]
                 cost += float(product[-1, -1])
-        return normal._replace(cost=cost if math.isfinite(cost) else math.inf)
+                if not bundle.free:
+                    continue
+                turned = by_points[some].swapaxes(1, 2)
+                places = bundle.of_cameras + 3 * group.ids[some, None] + np.arange(3)
+                between = (turned @ rows).reshape(places.size, -1)
+                matrix[places[:, :, None], places[:, None, :]] += turned @ by_points[some]
+                matrix[np.ix_(places.ravel(), own)] += between[:, 6:-1]
+                matrix[np.ix_(own, places.ravel())] += between[:, 6:-1].T
+                right[places.ravel()] += between[:, -1]
+                found.mixed[pose][:, places.ravel()] += between[:, :6].T
+        if bundle.points is not None and self._prior is not None:
+            # minimise also |p - meant|^2 / loose^2, and the same of them as a whole: see _prior
+            some, off = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
+            pull = self._prior @ off.ravel()
+            matrix[some, some] += self._prior
+            right[some] -= pull
+            cost += float(off.ravel() @ pull)
+        return found._replace(cost=cost if math.isfinite(cost) else math.inf)
 
-    def residuals(self, bundle: Bundle) -> list[Array]:
-        """Return them by view, in the order of the sights."""
-        found: dict[int, Array] = {}
-        for group in self._groups:
-            for number, pose, rows in zip(group.sights, group.poses, group.bounds, strict=True):
-                whole = bundle.from_first(group.camera) @ bundle.poses.taken(pose)
-                seen = bundle.cameras[group.camera].project(whole.apply(group.points[rows]))
-                found[number] = group.pixels[rows] - seen
-        return [found[number] for number in range(self._count)]
+    def _columns(self, bundle: Bundle, group: _Group) -> tuple[Indices, Array, Array]:
+        """Return which of the shared unknowns a camera has, and the derivatives of what it sees.
+
+        Whitened, (N, 2, ...): by the pose, by these unknowns, and the residuals in one; by the
+        points on the target (N, 2, 3).
+        """
+        # p = R_c (R m + t) + t_c moves with a pose' turn by R_c (w x R m), with the rig's by
+        # w x (R_c (R m + t)), with the point by R_c R; see pose_changes.
+        number, rig, pose = group.camera, bundle.from_first(group.camera), bundle.poses
+        points, rotation = self._meant if bundle.points is None else bundle.points, pose.rotation
+        turned = np.einsum("nij,nj->ni", rotation[group.pose], points[group.ids])
+        there = (turned + pose.translation[group.pose]) @ rig.rotation.T
+        seen = linearize(there + rig.translation, bundle.cameras[number])
+        by_near = seen.by_point @ rig.rotation
+        own = [np.arange(bundle.shared)[bundle.lens_columns[number]]]
+        parts = [pose_changes(by_near, turned), seen.by_lens @ bundle.basis[number]]
+        if number and not bundle.rigid:
+            own.append(bundle.lens_columns[-1].stop + 6 * (number - 1) + np.arange(6))
+            parts.append(pose_changes(seen.by_point, there))
+        if self._smooth:
+            own.append(bundle.shared + self._smooth * number + np.arange(self._smooth))
+            parts.append(smooth_changes(seen.pixels, bundle.cameras[number].size))
+        parts.append((group.pixels - seen.pixels)[..., None])
+        by_point = group.white @ (by_near @ rotation[group.pose]) if bundle.free else by_near
+        return np.concatenate(own), group.white @ np.concatenate(parts, axis=2), by_point
 
 
-def _group(
-    camera: int, sights: Sequence[Sight], numbers: list[int], more: float, points: Array | None
-) -> _Group:
-    views = [one.view for one in sights]
-    ends = np.cumsum([0, *(len(one.view.ids) for one in sights)]).tolist()
-    covariance = np.concatenate([one.view.covariance for one in sights])
-    return _Group(
-        camera=camera,
-        sights=numbers,
-        poses=[one.pose for one in sights],
-        bounds=[slice(first, last) for first, last in itertools.pairwise(ends)],
-        rows=np.repeat([one.pose for one in sights], np.diff(ends)),
-        points=np.concatenate(
-            [one.object_points if points is None else points[one.ids] for one in views]
-        ),
-        pixels=np.concatenate([one.view.points for one in sights]),
-        white=whitening(covariance, more),
-    )
+def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
+    """Return those of each view (N, 2), seen minus projected, pixels."""
+    found = []
+    for number, pose, view in sights:
+        points = view.object_points if bundle.points is None else bundle.points[view.ids]
+        near = (bundle.from_first(number) @ bundle.poses.taken(pose)).apply(points)
+        found.append(view.points - bundle.cameras[number].project(near))
+    return found
+
+
+def _prior(meant: Array) -> Array:
+    """Return the weights (3 T, 3 T) of how far a sheet's points are from where they were meant.
+
+    Each alone hardly, and all of them as a whole: shifts, turns and a scale move no pixel.
+    """
+    spacing = float(np.linalg.norm(meant[1:] - meant[0], axis=1).min())
+    near, axes = meant - meant.mean(axis=0), np.eye(3)
+    moves = [*(np.cross(axis, near) for axis in axes), *(0.0 * near + axis for axis in axes), near]
+    whole = np.linalg.qr(np.column_stack([one.ravel() for one in moves]))[0]
+    weights: Array = whole @ whole.T / (TIGHT * spacing) ** 2
+    return weights + np.eye(3 * len(meant)) / (LOOSE * spacing) ** 2

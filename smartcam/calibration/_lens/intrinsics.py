@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, get_args
@@ -17,8 +16,9 @@ from smartcam.calibration._files import storage
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._geometry.rotations import Array
-from smartcam.calibration._lens.bundle import Bundle, Sight
+from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, held_out
 from smartcam.calibration._lens.coverage import Coverage, coverage
+from smartcam.calibration._lens.field import SHAPE
 from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.poses import (
     CAMERA,
@@ -29,14 +29,10 @@ from smartcam.calibration._lens.poses import (
     view_rms,
 )
 from smartcam.calibration._lens.projection import whitening
-from smartcam.calibration._lens.sheet_shape import (
-    Sheet,
-    choose_shape,
-    held_out_residuals,
-    leave_out,
-)
+from smartcam.calibration._lens.sheet_shape import Sheet, choose_shape
 from smartcam.calibration._lens.start import fit_lens, parameter_names
 from smartcam.calibration._lens.suspicions import examined
+from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
 from smartcam.calibration._views import TargetView, as_list, as_views, check_choice, label
 from smartcam.exceptions import CalibrationError
 
@@ -102,7 +98,8 @@ class IntrinsicCalibration(storage.SavedCalibration):
     Attributes:
         camera: the lens.
         covariance: (4 + K, 4 + K), of fx, fy, cx, cy and the coefficients: as the points'
-            covariance and ``sigma`` lead to, the sheet taken as exact; 0 for what was not fitted.
+            covariance and ``sigma`` lead to, and the sheet's where its points were adjusted; 0 for
+            what was not fitted.
         views: one for each given view, in their order.
         rms: of the residuals of the used views, their freedom taken off: the standard deviation of
             a coordinate, pixels. It is no accuracy: see ``held_out``.
@@ -153,6 +150,35 @@ class IntrinsicCalibration(storage.SavedCalibration):
             label(one.view, number) for number, one in enumerate(self.views) if not one.used
         )
 
+    def uncertainty(
+        self, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
+    ) -> ProjectionUncertainty:
+        """Return how sure the lens is of where it projects, as a map over its field.
+
+        It is what ``covariance`` leads to for a point that does not move, without the small motion
+        of the camera that fits best to the target's points where they were seen: every pose that
+        is found with this lens has that motion in it. It is least at the distances at which the
+        target was. Where it never was, the map shows what the lens' model makes of that, and no
+        covariance knows whether a model fits there.
+
+        Args:
+            distance: of the points from the camera, metres; None: infinity.
+            shape: rows and columns of the map, 2 to 500 each, from corner to corner.
+
+        Raises:
+            CalibrationError: ``NOT_FINITE``: no such distance; ``SHAPE``: no such rows and columns.
+        """
+        return uncertainty(
+            self.camera, self.covariance, self.target_points, distance=distance, shape=shape
+        )
+
+    @property
+    def target_points(self) -> Array:
+        """(N, 3), where the target's points were before the camera, of all used views, metres."""
+        return np.concatenate(
+            [one.transform.apply(one.view.object_points) for one in self.views if one.used]
+        )
+
     def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
         """Return by how much the lens is off at any views.
 
@@ -184,8 +210,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
         near = Rigid.stacked([locate(view, self.camera).transform.rigid])
         points = None if self.sheet is None else meant.points + self.sheet
         bundle = Bundle.single(self.camera, near, points=points)
-        (residuals,) = held_out_residuals(bundle, [Sight(0, 0, view)], 0, self.sigma**2)
-        return residuals
+        return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
 
     def _check(self, found: Mapping[str, Any], called: str) -> None:
         count = 4 + len(self.camera.distortion)
@@ -221,9 +246,10 @@ def calibrate_intrinsics(
         fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
         sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
             adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
-            ``auto``: what has the smaller held-out error, where it is clearly smaller. One camera
-            alone tells a bent sheet from a bent lens less well than two: take it where residuals
-            are large and the sheet is to blame.
+            ``auto``: they are adjusted where the residuals show more than chance, or any smooth
+            error of the lens, can be, and the held-out error is not larger for it. Where they are
+            not adjusted although the residuals show it, ``SHEET_NOT_EXACT`` among the warnings
+            says so. Targets of more than 1000 points are taken as exact, untested.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named.
 
@@ -231,8 +257,9 @@ def calibrate_intrinsics(
         CalibrationError: ``TOO_FEW`` views or points; ``COLLINEAR`` points of a view;
             ``WRONG_SIZE``: images of several sizes; ``DIFFERENT_TARGETS``; ``POSES_TOO_SIMILAR``:
             the views are nearly the same; ``INSUFFICIENT_ROTATION``: the target was never tilted,
-            or so little that the focal length stays open; ``SHAPE``: no such coefficient, or no
-            such model; ``NOT_FINITE`` pixels; ``POOR_FIT``: no lens of this model shows them.
+            or so little that the focal length stays open; ``SHAPE``: no such coefficient, no such
+            model, or something else than views; ``NOT_FINITE`` pixels; ``MIRRORED``: pictures that
+            are flipped; ``POOR_FIT``: no lens of this model shows them.
     """
     given = as_views(views, "intrinsics")
     check_choice(sheet, get_args(Sheet), "sheet")
@@ -315,8 +342,8 @@ def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
     Raises ``INSUFFICIENT_ROTATION``; ``what`` is for the texts.
     """
     normals = adjusted.bundle.poses.rotation[:, :, 2]
-    sines = [np.linalg.norm(np.cross(a, b)) for a, b in itertools.combinations(normals, 2)]
-    tilt = math.asin(min(1.0, float(max(sines))))
+    sines = np.linalg.norm(np.cross(normals[:, None], normals), axis=2)
+    tilt = math.asin(min(1.0, float(sines.max())))
     if tilt < LEAST_TILT:
         raise CalibrationError(
             f"{what}: expected the target tilted by {math.degrees(LEAST_TILT):.0f} degrees or "
@@ -362,12 +389,9 @@ def _held_out(adjusted: AdjustedBundle, views: Sequence[TargetView]) -> list[flo
     """Return the rms of each view under a lens that was fitted to the others."""
     if len(views) <= LEAST_VIEWS:
         return [math.nan] * len(views)
-    sights, found = [Sight(0, number, view) for number, view in enumerate(views)], []
-    for number in range(len(views)):
-        lens = leave_out(adjusted, sights, number)
-        (residuals,) = held_out_residuals(lens, sights, number, adjusted.more)
-        found.append(view_rms(residuals))
-    return found
+    sights = [Sight(0, number, view) for number, view in enumerate(views)]
+    left_out = held_out(adjusted, sights, range(len(views)))
+    return [view_rms(residuals) for _, _, (residuals,) in left_out]
 
 
 def _together(errors: Sequence[float], views: Sequence[TargetView]) -> float:
@@ -383,35 +407,36 @@ def _summary(
     sheet: Sheet,
 ) -> IntrinsicCalibration:
     of_used = [views[number] for number in used]
-    adjusted, errors = choose_shape(
+    shape, errors = choose_shape(
         adjusted,
         [Sight(0, number, view) for number, view in enumerate(of_used)],
         sheet,
         lambda fitted: _held_out(fitted, of_used),
         lambda errors: _together(errors, of_used),
     )
-    bundle = adjusted.bundle
+    adjusted, bundle = shape.adjusted, shape.adjusted.bundle
     camera, basis = bundle.cameras[0], bundle.basis[0]
-    held_out = dict(zip(used, errors, strict=True))
+    without = dict(zip(used, errors, strict=True))
     fits = [
-        _view_fit(view, camera, adjusted, used.index(number), held_out[number])
-        if number in held_out
+        _view_fit(view, camera, adjusted, used.index(number), without[number])
+        if number in without
         else _view_fit(view, camera)
         for number, view in enumerate(views)
     ]
-    squares = sum(float((one**2).sum()) for one in adjusted.residuals)
     calibration = IntrinsicCalibration(
         camera=camera,
         covariance=basis @ adjusted.covariance @ basis.T,
         views=tuple(fits),
-        rms=math.sqrt(squares / adjusted.freedom),
+        rms=adjusted.rms,
         sigma=math.sqrt(adjusted.more),
         held_out=_together(errors, of_used),
-        sheet=None if bundle.points is None else bundle.points - of_used[0].target.points,
+        sheet=shape.off,
         coverage=coverage([_outline(fits[number], camera) for number in used], camera.size),
         warnings=(),
     )
-    return dataclasses.replace(calibration, warnings=tuple(_remarks(calibration, bad)))
+    return dataclasses.replace(
+        calibration, warnings=tuple(_remarks(calibration, bad, shape.remarks))
+    )
 
 
 def _view_fit(
@@ -448,19 +473,9 @@ def _outline(fit: ViewFit, camera: CameraModel) -> Array:
     return np.where(np.isfinite(seen), seen, fit.view.points.mean(axis=0))
 
 
-def remark_sheet(sheet: Array | None) -> Iterator[Remark]:
-    """Yield what is to be said of a sheet whose points are not where they were meant to be."""
-    if sheet is not None:
-        off = 1e3 * math.sqrt(float((sheet**2).sum(axis=1).mean()))
-        most = 1e3 * float(np.linalg.norm(sheet, axis=1).max())
-        yield Remark(
-            Code.SHEET_NOT_EXACT,
-            f"the sheet's points are {off:.2g} mm rms from where they were meant to be, "
-            f"{most:.2g} mm at most: the print or the board is not exact",
-        )
-
-
-def _remarks(calibration: IntrinsicCalibration, bad: list[int]) -> Iterator[Remark]:
+def _remarks(
+    calibration: IntrinsicCalibration, bad: list[int], of_sheet: list[Remark]
+) -> Iterator[Remark]:
     for number in bad:
         fit = calibration.views[number]
         done = "was not used" if not fit.used else "is used all the same"
@@ -476,7 +491,7 @@ def _remarks(calibration: IntrinsicCalibration, bad: list[int]) -> Iterator[Rema
             f"is not of the model {calibration.camera.distortion_model}, the sheet is not flat, or "
             "points were taken for others",
         )
-    yield from remark_sheet(calibration.sheet)
+    yield from of_sheet
     if lacking := calibration.coverage.lacking:
         bars = ", ".join(f"{name} {getattr(calibration.coverage, name):.0%}" for name in lacking)
         yield Remark(

@@ -20,6 +20,8 @@ from smartcam.calibration._views import TargetView, checked
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from smartcam.calibration._geometry.rotations import Array
 
 CAMERA: Final = "camera"
@@ -45,6 +47,9 @@ LEAST_AGREEMENT: Final = 0.5
 
 NUDGE: Final = 1e-9
 """Of rays, parts of the focal length, to keep a solver from rounding errors."""
+
+UNSURE: Final = 4.0
+"""Squares of residuals of one pose over those of the other, up to which both are refined first."""
 
 SAME: Final = 1e-3
 """Turn between two poses, rad, up to which both are the same minimum."""
@@ -221,6 +226,24 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     if not found:  # on exact rays OpenCV takes the root of a negative rounding error
         found = _ippe(view.object_points, rays + NUDGE * np.sin(np.arange(len(rays)))[:, None])
     return found
+
+
+def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
+    """Return of each view the pose that shows its points where they are, not yet refined.
+
+    Raises ``POOR_FIT``: there is none before the camera.
+    """
+    return Rigid.stacked(_likeliest(view, camera) for view in views)
+
+
+def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:
+    found = [one.taken(0) for one in plane_poses(view, camera)]
+    off = (camera.project(one.apply(view.object_points)) - view.points for one in found)
+    squares = [float(np.nan_to_num((one**2).sum(), nan=math.inf)) for one in off]
+    best, second, *_ = [*sorted(squares), math.inf, math.inf]
+    if math.isfinite(best) and second > UNSURE * best:
+        return found[squares.index(best)]
+    return locate(view, camera).transform.rigid
 
 
 def _ippe(points: Array, rays: Array) -> list[Rigid]:

@@ -25,6 +25,13 @@ LEVEL = 0.01
 """How seldom noise alone may pass for an error beside it."""
 
 
+DEGREE = 5
+"""Of the polynomials of a place in the image that stand for any smooth error of a lens."""
+
+SMOOTH = (DEGREE + 1) * (DEGREE + 2)
+"""Their number, for both coordinates."""
+
+
 class Projection(NamedTuple):
     """Points in an image and what moves them."""
 
@@ -67,6 +74,14 @@ def pose_changes(by_point: Array, turned_points: Array) -> Array:
     by_x, by_y, by_z = np.moveaxis(by_point, 2, 0)
     by_turn = (y * by_z - z * by_y, z * by_x - x * by_z, x * by_y - y * by_x)
     changes: Array = np.stack([*by_turn, by_x, by_y, by_z], axis=2)
+    return changes
+
+
+def smooth_changes(pixels: Array, size: tuple[int, int]) -> Array:
+    """Return the derivatives of pixels (N, 2) by smooth changes of their image (N, 2, SMOOTH)."""
+    x, y = (2.0 * pixels / max(size) - np.array(size) / max(size)).T
+    powers = [x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
+    changes: Array = np.kron(np.eye(2), np.stack(powers, axis=1)[:, None])
     return changes
 
 

@@ -1,18 +1,21 @@
-"""Unknowns of a lens, and a first guess of them from views of a target."""
+"""Unknowns of a lens, and a first fit of them to views of a target."""
 
 from __future__ import annotations
 
-import itertools
-import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.rigid import Rigid
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, adjust_weighted
+from smartcam.calibration._lens.bundle import (
+    Bundle,
+    Sight,
+    adjust_weighted,
+    lens_values,
+    with_lens,
+)
 from smartcam.calibration._lens.model import COEFFICIENTS, CameraModel, coefficient_names
-from smartcam.calibration._lens.poses import locate, plane_poses
+from smartcam.calibration._lens.poses import likeliest_poses
 from smartcam.calibration._optional_imports import load
 from smartcam.exceptions import CalibrationError
 
@@ -24,14 +27,15 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.model import DistortionModel
     from smartcam.calibration._views import TargetView
 
-FOCAL_LENGTHS: Final = (0.25, 0.4, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0)
-"""First guesses, in parts of the image's longer side: fields of view of 127 to 11 degrees."""
+FOCAL_LENGTHS: Final = (None, 1.0, 0.4, 2.0, 0.65, 4.0)
+"""Where OpenCV begins, in parts of the image's longer side: None where its own closed form says,
+then fields of view of 53, 103, 28, 75 and 14 degrees."""
 
-GUESSED: Final = 8
-"""Views that judge a first guess."""
+ENOUGH: Final = 20
+"""Views that OpenCV is given; all are adjusted afterwards."""
 
-BEST: Final = 2
-"""First guesses that must lead to their end; the best of these counts."""
+GOOD: Final = 0.5
+"""Pixels rms, up to which no other beginning is tried."""
 
 
 def parameter_names(model: DistortionModel) -> tuple[str, ...]:
@@ -71,86 +75,71 @@ def fit_lens(
 ) -> AdjustedBundle:
     """Return the lens and the poses that show the views' points where they are.
 
-    Several first guesses of the focal length are judged by a few of the views, the best ones are
-    adjusted: first the focal length alone, then what bends most, then the rest.
+    OpenCV finds what bends most; everything is adjusted from there, with weights.
 
-    Raises ``POOR_FIT``: no guess leads anywhere; and as :func:`lens_basis` says.
+    Raises ``POOR_FIT``: no beginning leads anywhere; and as :func:`lens_basis` says.
     """
     basis = lens_basis(model, fixed)
-    guesses = sorted(_guesses(views, model), key=lambda one: _misfit(one, views))
-    followed = (_follow(guess, views, basis) for guess in guesses)
-    found = list(itertools.islice((one for one in followed if one is not None), BEST))
+    found: list[AdjustedBundle] = []
+    for length in FOCAL_LENGTHS:
+        try:
+            found.append(_fit(views, model, basis, length))
+        except (CalibrationError, load("cv2").error):
+            continue
+        if found[-1].rms <= GOOD:
+            break
     if not found:
         raise CalibrationError(
             f"intrinsics: expected a lens that shows the {len(views)} views as they are, got none "
-            f"from focal lengths of {FOCAL_LENGTHS[0]} to {FOCAL_LENGTHS[-1]} image widths",
+            f"from focal lengths of {min(FOCAL_LENGTHS[1:])} to {max(FOCAL_LENGTHS[1:])} image "
+            "widths",
             code=Code.POOR_FIT,
         )
-    return min(found, key=lambda one: one.weighted / max(one.freedom, 1) + one.more)
+    return min(found, key=lambda one: one.rms)
 
 
-def _guesses(views: Sequence[TargetView], model: DistortionModel) -> list[CameraModel]:
-    width, height = views[0].size
-    centre = (width - 1) / 2, (height - 1) / 2
-    lengths = [max(width, height) * part for part in FOCAL_LENGTHS]
-    # A plane's homography H = K (r1 r2 t) gives, since r1 and r2 are orthogonal and of one
-    # length, h1^T K^-T K^-1 h2 = 0 and h1^T K^-T K^-1 h1 = h2^T K^-T K^-1 h2: linear equations of
-    # 1/f^2 for a principal point in the middle. Views that are head-on leave them singular, hence
-    # the others.
-    # Source: Zhang, A Flexible New Technique for Camera Calibration (2000), section 3.1.
-    with np.errstate(all="ignore"):
-        matrix = load("cv2").initCameraMatrix2D(
-            [view.object_points.astype(np.float32) for view in views],
-            [view.points.astype(np.float32) for view in views],
-            (width, height),
-            1.0,
-        )
-    closed_form = float(matrix[0, 0])
-    if math.isfinite(closed_form) and 0.1 * width < closed_form < 100 * width:
-        lengths.append(closed_form)
-    return [
-        CameraModel(
-            size=(width, height),
-            matrix=np.array([[length, 0.0, centre[0]], [0.0, length, centre[1]], [0.0, 0.0, 1.0]]),
-            distortion=np.zeros(COEFFICIENTS[model]),
-            distortion_model=model,
-        )
-        for length in lengths
-    ]
-
-
-def _misfit(camera: CameraModel, views: Sequence[TargetView]) -> float:
-    """Return the median over some views of how far the points are from where they would be."""
-    some = views[:: max(1, len(views) // GUESSED)]
-    return float(np.median([_distance(camera, view) for view in some]))
-
-
-def _distance(camera: CameraModel, view: TargetView) -> float:
-    found = [math.inf]
-    for pose in plane_poses(view, camera):
-        near = pose.taken(0).apply(view.object_points)
-        off = float(((camera.project(near) - view.points) ** 2).mean())
-        found.append(off if math.isfinite(off) else math.inf)
-    return min(found)
-
-
-def _follow(guess: CameraModel, views: Sequence[TargetView], basis: Array) -> AdjustedBundle | None:
-    """Return the fit from a guess; None where points come to lie behind the camera."""
+def _fit(
+    views: Sequence[TargetView], model: DistortionModel, basis: Array, length: float | None
+) -> AdjustedBundle:
+    guess = _first(views[:: -(-len(views) // ENOUGH)], model, length)
+    # what stays 0 is 0, and fx is fy where they are one
+    lens = with_lens(guess, basis @ np.linalg.pinv(basis) @ lens_values(guess))
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
-    columns = np.eye(len(basis))
-    most = basis[:, ~basis[6:].any(axis=0)]  # without what only bends the corners
-    stages = [columns[:, :1] + columns[:, 1:2], most, basis]
-    try:
-        lens, at = guess, _poses(views, guess)
-        for stage in stages:
-            bundle = adjust(Bundle.single(lens, at, stage), sights, 1.0).bundle
-            (lens,), at = bundle.cameras, bundle.poses
-        # of a plane's two poses the first guess may have taken the wrong one
-        adjusted = adjust_weighted(Bundle.single(lens, _poses(views, lens), basis), sights)
-    except CalibrationError:
-        return None
-    return adjusted if math.isfinite(adjusted.weighted) else None
+    adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), sights)
+    if not np.isfinite(adjusted.weighted):
+        raise CalibrationError("points behind the camera", code=Code.POOR_FIT)
+    return adjusted
 
 
-def _poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
-    return Rigid.stacked(locate(view, camera).transform.rigid for view in views)
+def _first(
+    views: Sequence[TargetView], model: DistortionModel, length: float | None
+) -> CameraModel:
+    """Return OpenCV's lens, with the two coefficients that bend most alone (and p1, p2)."""
+    cv2: Any = load("cv2")
+    (width, height), matrix = views[0].size, None
+    if length is not None:
+        focal = length * max(width, height)
+        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+    points = [view.object_points.astype(np.float32).reshape(-1, 1, 3) for view in views]
+    pixels = [view.points.astype(np.float32).reshape(-1, 1, 2) for view in views]
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-6)
+    if model == "equidistant":
+        names = ["RECOMPUTE_EXTRINSIC", "FIX_SKEW", "FIX_K3", "FIX_K4"]
+        calibrate, space = cv2.fisheye.calibrate, cv2.fisheye
+    else:
+        names, calibrate, space = ["FIX_K3"], cv2.calibrateCamera, cv2
+    names += [] if length is None else ["USE_INTRINSIC_GUESS"]
+    # OpenCV 5 has the fisheye's flags among the others
+    flags = sum(
+        getattr(space, f"CALIB_{name}", 0) or getattr(cv2, f"CALIB_{name}") for name in names
+    )
+    start = np.zeros(COEFFICIENTS["equidistant" if model == "equidistant" else "plumb_bob"])
+    _, found, bends, *_ = calibrate(
+        points, pixels, (width, height), matrix, start, flags=flags, criteria=stop
+    )
+    distortion = np.zeros(COEFFICIENTS[model])
+    distortion[: bends.size] = bends.ravel()
+    found[0, 1] = 0.0
+    return CameraModel(
+        size=(width, height), matrix=found, distortion=distortion, distortion_model=model
+    )

@@ -7,10 +7,11 @@ to be seen, so residuals and ellipses are drawn larger, by a factor that the pic
 from __future__ import annotations
 
 import math
-from html import escape
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+
+from smartcam.calibration._svg import line, polygon, rectangle, round_down, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -114,7 +115,7 @@ def draw(
     outlines = _outlines(calibration, both)
     sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
     largest = field.zoom * float(np.linalg.norm(sizes, axis=1).max())
-    larger = _round(0.06 * WIDTH / largest) if largest > TINY * WIDTH else 1.0
+    larger = round_down(0.06 * WIDTH / largest) if largest > TINY * WIDTH else 1.0
     width, height = f"{WIDTH + 2 * BORDER:.0f}", f"{field.foot + FOOT:.0f}"
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
@@ -123,19 +124,16 @@ def draw(
         f'<rect width="{width}" height="{height}" fill="#fff"/>',
         *_heat(calibration, field),
         *_axes(calibration, field),
-        *(_polygon(field.pixels(one)) for one in both[: len(outlines), None] + larger * outlines),
+        *(
+            polygon(field.pixels(one), "ellipse")
+            for one in both[: len(outlines), None] + larger * outlines
+        ),
         *_touches(calibration, field, points + larger * residuals),
         *(_part(part, place) for part, place in zip(found, field.pixels(places), strict=True)),
         *_legend(calibration, field, larger, title),
         "</svg>",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _round(wanted: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, as large as is wanted at most."""
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
 
 def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
@@ -179,18 +177,16 @@ def _heat(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
     yield "</g>"
     for step in range(11):
         yield _cell(BORDER + 20 * step, field.foot + 45, 20, 14, step / 10)
-    text = f"predicted error: {1e3 * low:.3f} mm to {1e3 * high:.3f} mm rms"
-    yield _text((BORDER + 232, field.foot + 57), text)
+    said = f"predicted error: {1e3 * low:.3f} mm to {1e3 * high:.3f} mm rms"
+    yield _text((BORDER + 232, field.foot + 57), said)
 
 
 def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
     """Return a cell with a colour between the two, in steps that rounding does not change."""
     level = round(20 * part) / 20
     channels = (round(a + level * (b - a)) for a, b in zip(LOW, HIGH, strict=True))
-    return (
-        f'<rect x="{x:.2f}" y="{y:.2f}" width="{wide:.2f}" height="{tall:.2f}" '
-        f'fill="#{"".join(f"{channel:02x}" for channel in channels)}"/>'
-    )
+    colour = "".join(f"{channel:02x}" for channel in channels)
+    return rectangle((x, y), (wide, tall), f'fill="#{colour}"')
 
 
 def _axes(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
@@ -213,7 +209,7 @@ def _axes(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
 
 def _axis(start: Array, along: Array, kind: str, name: str) -> Iterator[str]:
     end = start + along
-    yield _line(start, end, kind, f' marker-end="url(#{kind}-head)"')
+    yield line(start, end, kind, f' marker-end="url(#{kind}-head)"')
     yield _text(end + 8 * along / np.linalg.norm(along), name, f"{kind}-name", beside=(0, 4))
 
 
@@ -222,14 +218,14 @@ def _touches(calibration: PlaneCalibration, field: _View, ends: Array) -> Iterat
     places = field.pixels(calibration.camera_points)
     numbers = np.flatnonzero(counted)
     for number, place, end in zip(numbers, places[counted], field.pixels(ends), strict=True):
-        yield _line(place, end, "residual")
+        yield line(place, end, "residual")
         yield _dot(place, 4, "touch")
         yield _text(place, str(1 + number), beside=(7, -7))
     for index in calibration.outliers:
         point, place = calibration.camera_points[index], places[index]
         if (point > field.low).all() and (point < field.high).all():
             for stroke in (np.array([5.0, 5.0]), np.array([5.0, -5.0])):
-                yield _line(place - stroke, place + stroke, "left-out")
+                yield line(place - stroke, place + stroke, "left-out")
             yield _text(place, str(1 + index), beside=(7, -7))
 
 
@@ -237,7 +233,7 @@ def _part(part: Localization, place: Array) -> str:
     theta = part.pose.orientation.theta
     along = 18 * np.array([math.cos(theta), -math.sin(theta)])
     name = _text(place, part.feature_id, "part-name", beside=(10, 20))
-    return _dot(place, 7, "part") + _line(place, place + along, "part") + name
+    return _dot(place, 7, "part") + line(place, place + along, "part") + name
 
 
 def _legend(
@@ -258,10 +254,10 @@ def _legend(
         f"{'; crosses: left out' if left_out else ''}",
     )
     per_metre = field.zoom / calibration.scale
-    metres = _round(0.2 * WIDTH / per_metre)
+    metres = round_down(0.2 * WIDTH / per_metre)
     end = np.array([BORDER + WIDTH - 220, field.foot])
     start = end - [metres * per_metre, 0.0]
-    yield _line(start, end, "camera")
+    yield line(start, end, "camera")
     yield _text(start, f"{1e3 * metres:g} mm", beside=(0, 18))
 
 
@@ -269,25 +265,11 @@ def _dot(place: Array, radius: int, kind: str) -> str:
     return f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="{radius}" class="{kind}"/>'
 
 
-def _polygon(corners: Array) -> str:
-    text = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners)
-    return f'<polygon points="{text}" class="ellipse"/>'
-
-
-def _line(start: Array, end: Array, kind: str, more: str = "") -> str:
-    return (
-        f'<line x1="{start[0]:.2f}" y1="{start[1]:.2f}" x2="{end[0]:.2f}" y2="{end[1]:.2f}" '
-        f'class="{kind}"{more}/>'
-    )
-
-
 def _text(
     place: Array | tuple[float, float],
-    text: str,
+    said: str,
     kind: str = "",
     *,
     beside: tuple[float, float] = (0.0, 0.0),
 ) -> str:
-    of_kind = f' class="{kind}"' if kind else ""
-    x, y = place[0] + beside[0], place[1] + beside[1]
-    return f'<text x="{x:.2f}" y="{y:.2f}"{of_kind}>{escape(text)}</text>'
+    return text((place[0] + beside[0], place[1] + beside[1]), said, kind)

@@ -14,27 +14,17 @@ from smartcam.calibration._codes import Code, Remark
 from smartcam.calibration._files import storage
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._geometry.rotations import Array, as_points
-from smartcam.calibration._lens.bundle import (
-    Bundle,
-    Sight,
-    adjust_weighted,
-)
+from smartcam.calibration._lens.bundle import Bundle, Sight, adjust_weighted, held_out
 from smartcam.calibration._lens.intrinsics import (
     BAD,
     LEAST_VIEWS,
     MOST_BAD,
     POOR,
-    remark_sheet,
     worst_view,
 )
 from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.poses import TARGET, check_view
-from smartcam.calibration._lens.sheet_shape import (
-    Sheet,
-    choose_shape,
-    held_out_residuals,
-    leave_out,
-)
+from smartcam.calibration._lens.sheet_shape import Sheet, choose_shape
 from smartcam.calibration._stereo import triangulation
 from smartcam.calibration._stereo.checks import check_fit, check_pairs, examined, remark_sides
 from smartcam.calibration._stereo.errors import PairErrors, pair_errors
@@ -105,7 +95,7 @@ class StereoCalibration(storage.SavedCalibration):
         right: its lens.
         transform: ``T_right_left``.
         covariance: (6, 6), of a small turn (rad) and shift (m) of the left camera in the right
-            one's frame, the sheet taken as exact.
+            one's frame; the sheet's is in it where its points were adjusted.
         pairs: one for each given pair, in their order.
         rms: of the residuals of all used views, their freedom taken off: the standard deviation of
             a coordinate, pixels. It is no accuracy: see ``held_out``.
@@ -321,19 +311,19 @@ def calibrate_stereo(
         fixed: coefficients of those that stay 0, such as ``k3``; ``aspect``: fx and fy are one.
         sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
             adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
-            ``auto``: what has the smaller held-out reprojection error, where it is clearly smaller.
+            ``auto``: as :func:`~smartcam.calibration.calibrate_intrinsics` has it.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named. Of a pair whose views do not belong
             together it is the right one.
 
     Raises:
         CalibrationError: ``TOO_FEW``: less than 3 pairs, 2 where both lenses are known;
-            ``SHAPE``: lists of different lengths, or a coefficient that is none; ``WRONG_SIZE``,
-            ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``; ``POOR_FIT``: no lens or no
-            transform shows the views, as where those of many pairs are of different moments;
-            ``INSUFFICIENT_ROTATION``: the target was not tilted; ``MIRRORED`` pictures;
-            ``COINCIDENT``: both sides are of one camera; ``SWAPPED_LENSES``: ``left`` is the right
-            camera's, and ``right`` the left one's.
+            ``SHAPE``: lists of different lengths, a coefficient that is none, or too many points to
+            be free; ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``;
+            ``POOR_FIT``: no lens or no transform shows the views, as where those of many pairs are
+            of different moments; ``INSUFFICIENT_ROTATION``: the target was not tilted;
+            ``MIRRORED`` pictures; ``COINCIDENT``: both sides are of one camera;
+            ``SWAPPED_LENSES``: ``left`` is the right camera's, and ``right`` the left one's.
     """
     moments = as_moments(left_views, right_views)
     check_pairs(moments, (left, right))
@@ -423,16 +413,15 @@ class _HeldOut(NamedTuple):
 
 def _held_out(found: _Found) -> dict[int, _HeldOut]:
     pairs = _pairs(found.sights)
-    errors: dict[int, _HeldOut] = {}
     if len(pairs) <= found.least:
-        return errors
-    for number in pairs:
-        bundle = leave_out(found.adjusted, found.sights, number)
-        residuals = held_out_residuals(bundle, found.sights, number, found.adjusted.more)
-        errors[number] = _HeldOut(
-            pair_errors(_cameras(bundle), *found.pair(number)), np.concatenate(residuals)
+        return {}
+    return {
+        one.pose: _HeldOut(
+            pair_errors(_cameras(one.bundle), *found.pair(one.pose)),
+            np.concatenate(one.residuals),
         )
-    return errors
+        for one in held_out(found.adjusted, found.sights, pairs)
+    }
 
 
 def _cameras(bundle: Bundle) -> CameraPair:
@@ -441,32 +430,32 @@ def _cameras(bundle: Bundle) -> CameraPair:
 
 
 def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
-    adjusted, held_out = choose_shape(
+    shape, without = choose_shape(
         found.adjusted,
         found.sights,
         sheet,
         lambda fitted: _held_out(found._replace(adjusted=fitted)),
         lambda errors: _rms([one.residuals for one in errors.values()]),
     )
+    adjusted = shape.adjusted
     found = found._replace(adjusted=adjusted)
-    points = adjusted.bundle.points
     cameras = _cameras(adjusted.bundle)
     epipolar = [pair_errors(cameras, *found.pair(n)).epipolar for n in _pairs(found.sights)]
-    squares = sum(float((one**2).sum()) for one in adjusted.residuals)
     calibration = StereoCalibration(
         **cameras._asdict(),
         covariance=adjusted.covariance[-6:, -6:],
-        pairs=tuple(_pair(found, number, held_out) for number in range(len(found.moments))),
-        rms=math.sqrt(squares / adjusted.freedom),
+        pairs=tuple(_pair(found, number, without) for number in range(len(found.moments))),
+        rms=adjusted.rms,
         sigma=math.sqrt(adjusted.more),
         epipolar=_rms(epipolar),
-        held_out=_rms([one.errors.spacing for one in held_out.values()]),
-        held_out_epipolar=_rms([one.errors.epipolar for one in held_out.values()]),
-        sheet=None if points is None else points - found.sights[0].view.target.points,
+        held_out=_rms([one.errors.spacing for one in without.values()]),
+        held_out_epipolar=_rms([one.errors.epipolar for one in without.values()]),
+        sheet=shape.off,
         warnings=(),
     )
     check_fit(calibration.rms, found.sights, found.bad)
-    return dataclasses.replace(calibration, warnings=tuple(_remarks(calibration, found)))
+    remarks = _remarks(calibration, found, shape.remarks)
+    return dataclasses.replace(calibration, warnings=tuple(remarks))
 
 
 def _rms(parts: Sequence[Array]) -> float:
@@ -474,7 +463,7 @@ def _rms(parts: Sequence[Array]) -> float:
     return math.sqrt(float((values**2).mean())) if len(values) else math.nan
 
 
-def _pair(found: _Found, number: int, held_out: Mapping[int, _HeldOut]) -> PairFit:
+def _pair(found: _Found, number: int, without: Mapping[int, _HeldOut]) -> PairFit:
     rms = {
         one.camera: _rms([residuals])
         for one, residuals in zip(found.sights, found.adjusted.residuals, strict=True)
@@ -482,7 +471,7 @@ def _pair(found: _Found, number: int, held_out: Mapping[int, _HeldOut]) -> PairF
     }
     pose = Transform(LEFT, TARGET, *found.adjusted.bundle.poses.taken(number))
     left, right = found.moments[number]
-    held = held_out.get(number)
+    held = without.get(number)
     return PairFit(
         left=left,
         right=right,
@@ -494,7 +483,9 @@ def _pair(found: _Found, number: int, held_out: Mapping[int, _HeldOut]) -> PairF
     )
 
 
-def _remarks(calibration: StereoCalibration, found: _Found) -> Iterator[Remark]:
+def _remarks(
+    calibration: StereoCalibration, found: _Found, of_sheet: list[Remark]
+) -> Iterator[Remark]:
     for one in found.bad:
         used = any(one is sight for sight in found.sights)
         done = "is used all the same" if used else "was not used"
@@ -516,7 +507,7 @@ def _remarks(calibration: StereoCalibration, found: _Found) -> Iterator[Remark]:
             "moments",
         )
     yield from remark_sides(calibration.transform)
-    yield from remark_sheet(calibration.sheet)
+    yield from of_sheet
     if math.isnan(calibration.held_out):
         yield Remark(
             Code.NOT_HELD_OUT,

@@ -10,18 +10,16 @@ import numpy as np
 
 from smartcam.calibration._codes import Code
 from smartcam.calibration._geometry.rigid import IDENTITY, Rigid
-from smartcam.calibration._lens.bundle import Bundle, known_lens
+from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, known_lens
 from smartcam.calibration._lens.intrinsics import check_tilts, check_views
-from smartcam.calibration._lens.poses import locate
+from smartcam.calibration._lens.poses import likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
-from smartcam.calibration._targets import Charuco
 from smartcam.calibration._views import TargetView, as_list
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.frames import Transform
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.model import CameraModel, DistortionModel
 
@@ -116,45 +114,43 @@ def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
     Raises ``POOR_FIT``: no lens or no transform shows the views; ``INSUFFICIENT_ROTATION``;
     ``WRONG_SIZE``: views of another camera than the known one.
     """
-    cameras = _lens(moments, 0, lenses), _lens(moments, 1, lenses)
-    poses = [_poses(moment, cameras) for moment in moments]
-    views = [view for moment in moments for view in moment if view is not None]
-    if not isinstance(views[0].target, Charuco) and views[0].target.turned_alike:
+    (left, ones), (right, twos) = (_side(moments, side, lenses) for side in range(2))
+    poses: list[Poses] = list(zip(ones, twos, strict=True))
+    target = next(view.target for moment in moments for view in moment if view is not None)
+    if target.turned_alike:
+        around = Rigid(np.diag([-1.0, -1.0, 1.0]), target.points[0] + target.points[-1])
         for number, ((one, two), (first, second)) in enumerate(zip(poses, moments, strict=True)):
             if one is not None and two is not None and second is not None:
-                other = half_turned(second)
-                turned = locate(other, cameras[1]).transform
-                if one.rigid.angle_to(turned.rigid) < one.rigid.angle_to(two.rigid):
-                    moments[number], poses[number] = (first, other), (one, turned)
-    rig, apart = _rig(moments, poses, cameras[1])
-    firsts = Rigid.stacked(
-        one.rigid if one else rig.inverse() @ two.rigid if two else IDENTITY for one, two in poses
-    )
+                turned = two @ around
+                if one.angle_to(turned) < one.angle_to(two):
+                    moments[number], poses[number] = (first, half_turned(second)), (one, turned)
+    rig, apart = _rig(moments, poses, right)
+    firsts = Rigid.stacked(one or (rig.inverse() @ two if two else IDENTITY) for one, two in poses)
     basis = lenses.basis(0), lenses.basis(1)
-    return FirstGuess(moments, Bundle(cameras, Rigid.stacked([rig]), firsts, basis), apart)
+    return FirstGuess(moments, Bundle((left, right), Rigid.stacked([rig]), firsts, basis), apart)
 
 
-def _lens(moments: list[Moment], side: int, lenses: Lenses) -> CameraModel:
-    known = lenses.known[side]
-    views = [moment[side] for moment in moments]
-    seen = [view for view in views if view is not None]
+Poses: TypeAlias = tuple["Rigid | None", "Rigid | None"]
+
+
+def _side(
+    moments: list[Moment], side: int, lenses: Lenses
+) -> tuple[CameraModel, list[Rigid | None]]:
+    """Return one side's lens, and of each moment the pose that it sees."""
+    seen = [number for number, moment in enumerate(moments) if moment[side] is not None]
+    views = [view for moment in moments if (view := moment[side]) is not None]
+    known, what = lenses.known[side], f"{SIDES[side]} camera"
     if known is None:
-        found = fit_lens(seen, lenses.model, lenses.fixed)
-        check_tilts(found, f"{SIDES[side]} camera")
-        return found.bundle.cameras[0]
-    check_views(seen, f"{SIDES[side]} camera", 1, known.size)
-    return known
-
-
-Poses: TypeAlias = tuple["Transform | None", "Transform | None"]
-
-
-def _poses(moment: Moment, cameras: tuple[CameraModel, CameraModel]) -> Poses:
-    one, two = moment
-    return (
-        None if one is None else locate(one, cameras[0]).transform,
-        None if two is None else locate(two, cameras[1]).transform,
-    )
+        found = fit_lens(views, lenses.model, lenses.fixed)
+        check_tilts(found, what)
+    else:
+        check_views(views, what, 1, known.size)
+        sights = [Sight(0, number, view) for number, view in enumerate(views)]
+        found = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
+    poses: list[Rigid | None] = [None] * len(moments)
+    for place, number in enumerate(seen):
+        poses[number] = found.bundle.poses.taken(place)
+    return found.bundle.cameras[0], poses
 
 
 def half_turned(view: TargetView) -> TargetView:
@@ -181,10 +177,10 @@ def _rig(
     for _, one, two, _ in pairs[:: math.ceil(len(pairs) / GUESSES)]:
         # T_right_left = T_right_target T_target_left; that with the least median counts, which half
         # of the pairs may not spoil: Rousseeuw, Least Median of Squares Regression (1984).
-        guess = two.rigid @ one.rigid.inverse()
+        guess = two @ one.inverse()
         off = []
         for _, pose, _, view in pairs:
-            near = (guess @ pose.rigid).apply(view.object_points)
+            near = (guess @ pose).apply(view.object_points)
             distances = np.linalg.norm(right.project(near) - view.points, axis=1)
             off.append(float(np.nan_to_num(distances, nan=math.inf).mean()))
         middle = float(np.median(off))

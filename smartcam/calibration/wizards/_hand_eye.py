@@ -9,12 +9,13 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.find import find_target
+from smartcam.calibration._drawing.draw import draw_scene, draw_views
 from smartcam.calibration._files.storage import motion_from_data, motion_to_data
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
@@ -30,7 +31,7 @@ from smartcam.calibration.wizards._target_drawing import draw
 from smartcam.calibration.wizards._target_steps import ask_target
 from smartcam.calibration.wizards._usage import usage
 from smartcam.calibration.wizards._verdict import VIEW_CURES, Judgement, judge, refused
-from smartcam.calibration.wizards._view_suggestions import LOOKS, outline
+from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Pose
 
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
     from smartcam.calibration.wizards._pictures import TakePicture
     from smartcam.calibration.wizards._steps import Answers
+    from smartcam.calibration.wizards._view_suggestions import Suggestion
 
 ReadFlange = Callable[[], Awaitable[Transform | Pose]]
 """Returns ``T_base_flange``, the flange's pose in the robot's base."""
@@ -107,7 +109,8 @@ def hand_eye_wizard(
         views = _Views(there, setup, take_picture, read_robot or robot, camera, awaited)
         calibration = await views.run()
         name = str(parameters.get("name", KIND))
-        result = await ask_to_save(name, save_to, KIND, _outcome(calibration), views.preview())
+        preview = {"svg": draw_scene(calibration, title="Where camera and sheet were")}
+        result = await ask_to_save(name, save_to, KIND, _outcome(calibration), preview)
         return {**result, "use": usage(KIND, save_to(name))}
 
     return Wizard(name=KIND, version=1, script=script)
@@ -180,7 +183,8 @@ class _Views:
             }
             default = "view" if count < ADVISED_VIEWS else "calculate"
             inputs = (Option(name="next", label="What next", options=options, default=default),)
-        look = SUGGESTIONS[count % len(SUGGESTIONS)]
+        following = self._samples[-1].get("next", {}) if self._samples else {}
+        look = following.get("text") or SUGGESTIONS[count % len(SUGGESTIONS)]
         typed = ""
         if isinstance(self._robot, str):
             typed = " Then take the pose of the flange from the robot, in its base."
@@ -192,7 +196,7 @@ class _Views:
             f"the robot must stand still.{typed}{how_to_take(self._awaited)}",
             button="Take a picture" if count < LEAST_POSES else "Go on",
             inputs=inputs,
-            notes=(self._progress(count),),
+            notes=tuple(filter(None, (self._progress(count), following.get("gain")))),
             preview=self.preview(),
             waiting=f"Waiting: {self._awaited}" if self._awaited else "",
             timeout=PICTURE_TIMEOUT,
@@ -221,13 +225,14 @@ class _Views:
         image = await self._take_picture()
         flange = typed or await self._flange()
         name = f"view {len(self._samples) + 1}"
-        view, preview = await asyncio.to_thread(self._found, image, name)
+        view, preview, following = await asyncio.to_thread(self._found, image, name)
         frames = [flange.target, flange.source]
         return {
             "frames": frames,
             "pose": motion_to_data(flange),
             "view": view.to_data(),
             "preview": preview,
+            "next": {"text": following.text, "gain": following.gain},
         }
 
     async def _flange(self) -> Transform:
@@ -236,19 +241,26 @@ class _Views:
         pose = await self._robot()
         return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
 
-    def _found(self, image: Any, name: str) -> tuple[TargetView, str]:
-        """Return the view found in a picture and an SVG of it; a large SVG is left out."""
-        view = find_target(image, self._target, name=name)
-        earlier = [TargetView.from_data(one["view"], target=self._target) for one in self._samples]
-        following = LOOKS[(len(earlier) + 1) % len(LOOKS)]
+    def _found(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
+        """Return the view found in a picture, an SVG of it, and what comes next.
+
+        A large SVG is left out.
+        """
+        view, earlier = find_target(image, self._target, name=name), self._views()
+        following = suggestion([*earlier, view], lens_known=self._camera is not None)
         svg = draw(
             image,
             view=view,
             earlier=earlier,
-            suggested=outline(following, self._target, view.size),
+            suggested=following.outline,
             title=f"{name}; orange: the next one, about",
         )
-        return view, svg if len(svg) <= MAX_PREVIEW else ""
+        return view, svg if len(svg) <= MAX_PREVIEW else "", following
+
+    def _views(self) -> list[TargetView]:
+        """Return the views, named by their numbers."""
+        views = [TargetView.from_data(one["view"], target=self._target) for one in self._samples]
+        return [replace(view, name=f"view {number}") for number, view in enumerate(views, 1)]
 
     def preview(self) -> dict[str, Any] | None:
         """Return the picture of the last view; None where there is none."""
@@ -269,7 +281,7 @@ class _Views:
             worst, code = len(self._samples), Code(found["code"])
             judgement = refused(code, found["text"], worst=worst, cures=VIEW_CURES)
             return None, (f"{code}: {found['text']}",), judgement
-        views = [one["view"] for one in self._samples]
+        views = [one.to_data() for one in self._views()]
         calibration = HandEyeCalibration.from_data({**found, "views": views})
         _, _, notes, judgement = _outcome(calibration)
         return calibration, notes, judgement
@@ -277,8 +289,9 @@ class _Views:
     async def _solve(self, _answers: Answers) -> dict[str, Any]:
         """Return the calibration without the samples' views, or why there is none."""
         poses = [motion_from_data(one["pose"], *one["frames"]) for one in self._samples]
-        views = [TargetView.from_data(one["view"], target=self._target) for one in self._samples]
-        work = partial(calibrate_hand_eye, poses, views, setup=self._setup, camera=self._camera)
+        work = partial(
+            calibrate_hand_eye, poses, self._views(), setup=self._setup, camera=self._camera
+        )
         try:
             calibration = await asyncio.to_thread(work)
         except CalibrationError as exc:
@@ -303,7 +316,10 @@ class _Views:
             worst = 1 + calibration.worst
         label = "View to remove; the worst one stands there"
         view = pick("view", label, len(self._samples), worst)
-        return review_step(options, view, notes, judgement, self.preview())
+        preview = self.preview()
+        if calibration is not None:
+            preview = {"svg": draw_views(calibration, title="Error of each view on the sheet")}
+        return review_step(options, view, notes, judgement, preview)
 
 
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:

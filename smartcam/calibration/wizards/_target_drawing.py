@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import math
-from html import escape
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -16,6 +15,7 @@ from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.image import grey_image
 from smartcam.calibration._geometry.rotations import as_points
 from smartcam.calibration._optional_imports import load
+from smartcam.calibration._svg import line, polygon, round_down, text
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -116,16 +116,16 @@ def draw(
     if suggested is not None:
         lines.append(canvas.outline(as_points(suggested, 2, "suggested outline")))
     if view is not None and predicted is not None:
-        residuals, text = canvas.residuals(view, _shaped(predicted, len(view.points)))
+        residuals, said = canvas.residuals(view, _shaped(predicted, len(view.points)))
         lines += residuals
-        texts.append(text)
+        texts.append(said)
     if view is not None:
         lines += canvas.points(view)
     if axes is not None:
         lines += canvas.axes(_shaped(axes, 4))
     if title:
-        lines.append(_text((BORDER, 26), title, "title"))
-    lines.append(_text((BORDER, HEAD + canvas.height + 24), "; ".join(texts)))
+        lines.append(text((BORDER, 26), title, "title"))
+    lines.append(text((BORDER, HEAD + canvas.height + 24), "; ".join(texts)))
     return "\n".join([*lines, END]) + "\n"
 
 
@@ -142,7 +142,7 @@ def draw_sheet(image: Any, view: TargetView, plane: SheetPlane) -> str:
         if np.isfinite([*origin, u, v]).all():
             place = f'x="{u + 8:.2f}" y="{v - 8:.2f}"'
             parts += [
-                _line(origin, (u, v), kind),
+                line(origin, (u, v), kind),
                 f'<text {place} class="name" style="font-size:26px">{name}</text>',
             ]
     return _with(draw(image, view=view, title="The sheet, its origin and rays"), parts)
@@ -236,7 +236,7 @@ class _Canvas:
         larger = _enlargement(float(lengths.max(initial=0.0)) * self.zoom)
         ends = self.place(view.points + larger * apart)
         lines = [
-            _line(start, end, "residual")
+            line(start, end, "residual")
             for start, end in zip(self.place(view.points), ends, strict=True)
         ]
         rms = math.sqrt(float(np.mean(lengths**2))) if len(lengths) else 0.0
@@ -245,30 +245,15 @@ class _Canvas:
     def axes(self, axes: Array) -> Iterator[str]:
         origin, *ends = self.place(axes)
         for end, name in zip(ends, "xyz", strict=True):
-            yield _line(origin, end, name)
-            yield _text((end[0] + 6, end[1] + 4), name, "name")
+            yield line(origin, end, name)
+            yield text((end[0] + 6, end[1] + 4), name, "name")
 
     def outline(self, corners: Array) -> str:
-        text = " ".join(f"{x:.2f},{y:.2f}" for x, y in self.place(corners))
-        return f'<polygon points="{text}" class="suggested"/>'
+        return polygon(self.place(corners), "suggested")
 
 
 def _enlargement(longest: float) -> float:
     """Return 1, 2 or 5 times a power of ten, by which the longest residual becomes visible."""
     if not longest > 1e-6:
         return 1.0
-    wanted = LONGEST * WIDTH / longest
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
-
-
-def _line(start: Sequence[float] | Array, end: Sequence[float] | Array, kind: str) -> str:
-    return (
-        f'<line x1="{start[0]:.2f}" y1="{start[1]:.2f}" x2="{end[0]:.2f}" y2="{end[1]:.2f}" '
-        f'class="{kind}"/>'
-    )
-
-
-def _text(place: tuple[float, float], text: str, kind: str = "") -> str:
-    of_kind = f' class="{kind}"' if kind else ""
-    return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}>{escape(text)}</text>'
+    return round_down(LONGEST * WIDTH / longest)

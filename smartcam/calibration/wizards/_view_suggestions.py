@@ -1,16 +1,28 @@
-"""From where a camera is to look at a target, one view after the other, and how that looks."""
+"""From where a camera is to look at a target, one view after the other, and how that looks.
+
+The first views are always the same. As soon as they tell the lens, what they leave open says which
+view helps most.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from smartcam.calibration._lens.guide import suggest_views
+from smartcam.calibration._lens.intrinsics import LEAST_VIEWS, calibrate_intrinsics
 from smartcam.calibration.formats._robots import rotation_zyx
+from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.guide import NextView
     from smartcam.calibration._targets import Target
+    from smartcam.calibration._views import TargetView
 
 
 class Look(NamedTuple):
@@ -44,6 +56,49 @@ LOOKS: Final = (
     ),
 )
 """The views, in the order in which they are best taken."""
+
+ROLLS: Final = (0.0, math.pi / 2, -math.pi / 2)
+"""About the line of sight, one after the other: a robot's camera has need of it, a lens has not."""
+
+
+class Suggestion(NamedTuple):
+    """What is suggested after some views."""
+
+    text: str  # for people
+    outline: Array  # (4, 2), of the target in the image, pixels
+    gain: str = ""  # what the view is worth; empty where that is not known
+
+
+def suggestion(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
+    """Return what comes after views (one or more) of one target.
+
+    ``lens_known``: whether nothing of the lens is to be told from them.
+    """
+    guided = None if lens_known else _guided(views)
+    if guided is None:
+        look = LOOKS[len(views) % len(LOOKS)]
+        return Suggestion(look.text, outline(look, views[0].target, views[0].size))
+    return Suggestion(
+        f"with the sheet {guided.text}",
+        guided.outline,
+        f"the lens is sure to {guided.present:.2g} pixels over the image, with this view to "
+        f"{guided.mean:.2g}",
+    )
+
+
+def _guided(views: Sequence[TargetView]) -> NextView | None:
+    """Return the view that helps the lens most; None where the views do not tell it yet."""
+    if len(views) < LEAST_VIEWS:
+        return None
+    try:
+        lens = calibrate_intrinsics(views)
+    except CalibrationError:
+        return None
+    # where the target is, there the parts will be, about
+    distance = float(np.median(np.linalg.norm(lens.target_points, axis=1)))
+    found = suggest_views(lens, distance=distance, roll=ROLLS[len(views) % len(ROLLS)])
+    return found[0] if found else None
+
 
 FOCAL: Final = 1.2
 """Focal length of the camera that outlines are drawn for, image widths."""

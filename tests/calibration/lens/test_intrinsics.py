@@ -5,6 +5,7 @@ import functools
 import math
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,17 +19,14 @@ from smartcam.calibration._lens.bundle import (
     Sight,
     adjust,
     adjust_weighted,
+    held_out,
     lens_values,
+    residuals,
     with_lens,
 )
 from smartcam.calibration._lens.coverage import Coverage, coverage
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-from smartcam.calibration._lens.sheet_shape import (
-    adjust_shape,
-    as_meant,
-    held_out_residuals,
-    leave_out,
-)
+from smartcam.calibration._lens.sheet_shape import adjust_shape, as_meant, shape_doubt
 from smartcam.calibration._lens.start import fit_lens, lens_basis, parameter_names
 from smartcam.calibration._targets import Charuco, Checkerboard
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, RIG, RIGHT, WIDE, pairs, poses, seen
@@ -284,6 +282,46 @@ def test_fit_lens_of_views_without_noise_finds_the_lens(
     np.testing.assert_allclose(found.project(flat), camera.project(flat), atol=0.01)
 
 
+@pytest.mark.parametrize("fails", [1, 2])
+def test_fit_lens_begins_elsewhere_where_opencv_gives_up(
+    fails: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calibrate, calls = cv2.calibrateCamera, []
+
+    def failing(*given: object, **how: object) -> object:
+        calls.append(given)
+        if len(calls) <= fails:
+            raise cv2.error("no")
+        return calibrate(*given, **how)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(cv2, "calibrateCamera", failing)
+    found = fit_lens(seen(LEFT, poses(8)), "plumb_bob").bundle.cameras[0]
+    assert len(calls) == fails + 1
+    assert found.matrix[0, 0] == pytest.approx(530, abs=1.0)
+
+
+def test_fit_lens_that_nothing_leads_to_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_given: object, **_how: object) -> object:
+        raise cv2.error("no")
+
+    monkeypatch.setattr(cv2, "calibrateCamera", failing)
+    with pytest.raises(
+        CalibrationError, match=r"got none from focal lengths of 0\.4 to 4"
+    ) as caught:
+        fit_lens(seen(LEFT, poses(4)), "plumb_bob")
+    assert caught.value.code == Code.POOR_FIT
+
+
+def test_fit_lens_of_views_of_different_noise_trusts_the_sharp_ones() -> None:
+    around = poses(12)
+    views = [*seen(LEFT, around[:6], sigma=0.02), *seen(LEFT, around[6:], sigma=1.0, seed=3)]
+    sharp, all_of_them = fit_lens(views[:6], "plumb_bob"), fit_lens(views, "plumb_bob")
+    deviations = np.sqrt(np.diag(sharp.covariance))
+    off = lens_values(all_of_them.bundle.cameras[0]) - lens_values(sharp.bundle.cameras[0])
+    assert np.abs(off / deviations).max() < 0.5
+    assert (np.diag(all_of_them.covariance) < np.diag(sharp.covariance)).all()
+
+
 def test_fit_lens_with_fixed_coefficients_leaves_them_at_zero() -> None:
     views = seen(LEFT, poses(8))
     lens = fit_lens(views, "plumb_bob", ["k3", "p1", "aspect"]).bundle.cameras[0]
@@ -336,26 +374,116 @@ def test_adjust_shape_finds_where_the_points_are() -> None:
     assert found.freedom == before.freedom - 3 * 54 + 7
 
 
-@pytest.mark.parametrize("free", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_leave_out_gives_a_lens_that_did_not_see_the_view(free: bool) -> None:
-    views = seen(LEFT, poses(8), points=OFF if free else None)
-    spoiled = [*views[:3], seen(LEFT, poses(8, seed=9)[:1], sigma=2.0)[0], *views[4:]]
-    found = []
-    for some in (views, spoiled):
-        sights = [Sight(0, number, view) for number, view in enumerate(some)]
-        adjusted = fit_lens(views, "plumb_bob")
-        if free:
-            adjusted = adjust_shape(adjusted.bundle, sights, adjusted.more)
-        found.append(leave_out(adjusted, sights, 3).cameras[0].matrix)
-    np.testing.assert_allclose(found[0], found[1], atol=1.0 if free else 1e-3)
-
-
-def test_held_out_residuals_of_the_true_lens_are_the_noise() -> None:
-    views = seen(LEFT, poses(8), sigma=0.1)
+@pytest.mark.parametrize(
+    ("count", "free"), [(4, False), (7, False), pytest.param(9, True, marks=pytest.mark.long)]
+)
+def test_held_out_is_that_of_a_fit_without_the_views(count: int, *, free: bool) -> None:
+    views = seen(LEFT, poses(count), points=OFF if free else None)
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
-    bundle = fit_lens(views, "plumb_bob").bundle
-    (residuals,) = held_out_residuals(bundle, sights, 2, 0.0)
-    assert np.sqrt((residuals**2).mean()) == pytest.approx(0.1, rel=0.2)
+    whole = fit_lens(views, "plumb_bob")
+    if free:
+        whole = adjust_shape(whole.bundle, sights, whole.more)
+    for one in held_out(whole, sights, range(count)):
+        others = [sight for sight in sights if sight.pose != one.pose]
+        again = adjust(whole.bundle, others, whole.more).bundle
+        only = dataclasses.replace(again, poses=again.poses.taken([one.pose])).known()
+        (expected,) = adjust(only, [Sight(0, 0, views[one.pose])], whole.more).residuals
+        off, rms = (math.sqrt(float((r**2).mean())) for r in (one.residuals[0], expected))
+        assert off == pytest.approx(rms, rel=0.01)
+
+
+def test_held_out_of_a_view_does_not_know_it() -> None:
+    views = seen(LEFT, poses(8))
+    shaken = views[3].points + 2.0 * np.random.default_rng(4).normal(size=views[3].points.shape)
+    spoiled = [*views[:3], dataclasses.replace(views[3], points=shaken), *views[4:]]
+    (fitted, again) = ([Sight(0, n, view) for n, view in enumerate(s)] for s in (views, spoiled))
+    whole = fit_lens(views, "plumb_bob")
+    true = next(one for one in held_out(whole, fitted, range(8)) if one.pose == 3)
+    moved = adjust(whole.bundle, again, whole.more)
+    other = next(one for one in held_out(moved, again, range(8)) if one.pose == 3)
+    lenses = [lens_values(one.bundle.cameras[0]) for one in (true, other)]
+    deviations = np.sqrt(np.diag(whole.covariance))
+    assert np.abs((lenses[0] - lenses[1]) / deviations).max() < 1.0
+    assert np.abs((lens_values(moved.bundle.cameras[0]) - lenses[0]) / deviations).max() > 5.0
+
+
+STRETCHED = as_meant(BOARD.points * [1.008, 0.995, 1.0], BOARD.points)
+
+
+def test_calibrate_intrinsics_of_a_stretched_sheet_finds_by_how_much_both_ways() -> None:
+    found = calibrate_intrinsics(seen(LEFT, poses(10), points=STRETCHED), sheet="auto")
+    assert found.sheet is not None
+    off = found.sheet - (STRETCHED - BOARD.points)
+    assert np.sqrt((off**2).mean()) < 2.5e-5
+    error = lens_values(found.camera) - lens_values(LEFT)
+    assert error @ np.linalg.solve(found.covariance, error) < 27.9  # chi-square of 9, 1 in 1000
+
+
+def test_calibrate_intrinsics_of_a_stretched_sheet_taken_as_exact_says_so() -> None:
+    found = calibrate_intrinsics(seen(LEFT, poses(8), points=STRETCHED))
+    assert found.sheet is None
+    (remark,) = [one for one in found.warnings if one.code == Code.SHEET_NOT_EXACT]
+    assert remark.text.startswith("the sheet's points are 0.45 mm rms from")
+    assert remark.text.endswith("it is taken as exact all the same, which sheet='free' does not")
+
+
+@pytest.mark.parametrize(
+    "fixed", [(), pytest.param(("k2", "k3"), marks=pytest.mark.long), ("k1", "k2", "k3")]
+)
+def test_shape_doubt_of_an_exact_sheet_is_none_even_of_a_lens_that_is_not_of_its_model(
+    fixed: tuple[str, ...],
+) -> None:
+    for seed in range(2):
+        views = seen(LEFT, poses(8, seed=seed), seed=seed)
+        sights = [Sight(0, number, view) for number, view in enumerate(views)]
+        assert shape_doubt(fit_lens(views, "plumb_bob", fixed), sights) is None
+
+
+def test_shape_doubt_of_too_few_views_to_tell_is_none() -> None:
+    whole = seen(LEFT, poses(4, seed=3), points=STRETCHED)
+    views = [
+        dataclasses.replace(
+            one, ids=one.ids[::6], points=one.points[::6], covariance=one.covariance[::6]
+        )
+        for one in whole
+    ]
+    sights = [Sight(0, number, view) for number, view in enumerate(views)]
+    assert shape_doubt(fit_lens(views, "plumb_bob"), sights) is None
+
+
+def test_calibrate_intrinsics_with_more_points_free_than_fit_in_memory_is_refused() -> None:
+    fine = Checkerboard(columns=40, rows=30, square=0.005)
+    views = seen(LEFT, poses(4), target=fine)
+    with pytest.raises(
+        CalibrationError, match="1000 points at most that are free, got 12"
+    ) as caught:
+        calibrate_intrinsics(views, sheet="free")
+    assert caught.value.code == Code.SHAPE
+    assert calibrate_intrinsics(views, sheet="auto").sheet is None
+
+
+@pytest.mark.long
+def test_adjust_shape_errors_are_those_that_the_bound_allows() -> None:
+    squares = []
+    for seed in range(12):
+        views = seen(LEFT, poses(8, seed=seed), seed=seed, points=OFF)
+        sights = [Sight(0, number, view) for number, view in enumerate(views)]
+        fitted = fit_lens(views, "plumb_bob")
+        found = adjust_shape(fitted.bundle, sights, fitted.more)
+        off = lens_values(found.bundle.cameras[0]) - lens_values(LEFT)
+        squares.append(off @ np.linalg.solve(found.covariance, off))
+    assert np.mean(squares) == pytest.approx(9.0, abs=3.7)  # 3 sigma of the mean
+
+
+def test_adjust_shape_shows_the_same_with_place_direction_and_size_as_meant() -> None:
+    views = seen(LEFT, poses(8), points=OFF)
+    sights = [Sight(0, number, view) for number, view in enumerate(views)]
+    fitted = fit_lens(views, "plumb_bob")
+    found = adjust_shape(fitted.bundle, sights, fitted.more).bundle
+    assert found.points is not None
+    np.testing.assert_allclose(as_meant(found.points, BOARD.points), found.points, atol=1e-9)
+    together = np.concatenate(residuals(found, sights))
+    assert together.std() == pytest.approx(0.045, rel=0.1)
 
 
 # ---------------------------------------------------------------------- coverage

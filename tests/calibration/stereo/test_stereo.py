@@ -13,6 +13,7 @@ from smartcam import CalibrationError
 from smartcam.calibration._codes import Code
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._lens.bundle import Sight
+from smartcam.calibration._lens.sheet_shape import as_meant
 from smartcam.calibration._stereo.calibration import StereoCalibration, calibrate_stereo
 from smartcam.calibration._stereo.checks import check_fit, remark_sides
 from smartcam.calibration._stereo.errors import spacing_errors
@@ -185,6 +186,20 @@ def test_calibrate_stereo_of_a_bent_sheet_finds_its_shape() -> None:
     assert found.sheet is not None
     assert found.rms < 0.5 * exact.rms
     assert found.held_out_epipolar < exact.held_out_epipolar
+
+
+def test_calibrate_stereo_of_a_stretched_sheet_adjusts_it_or_says_so() -> None:
+    stretched = as_meant(BOARD.points * [1.01, 1.0, 1.0], BOARD.points)
+    left, right = pairs(8, points=stretched)
+    found, exact = (calibrate_stereo(left, right, sheet=one) for one in ("auto", "exact"))
+    assert found.sheet is not None
+    np.testing.assert_allclose(found.sheet, stretched - BOARD.points, atol=2e-4)
+    off = _off(found.transform)
+    assert off @ np.linalg.solve(found.covariance, off) < 22.5  # chi-square of 6, 1 in 1000
+    assert exact.sheet is None
+    for one, said in ((found, "the print or the board is not exact"), (exact, "sheet='free'")):
+        (remark,) = [other for other in one.warnings if other.code == Code.SHEET_NOT_EXACT]
+        assert said in remark.text
 
 
 def test_triangulate_finds_points_in_the_left_frame() -> None:

@@ -53,13 +53,18 @@ class Cell:
         return TRUTH.robot_poses[self.left[0]]
 
 
-def begin(folder: Path, cell: Cell, journal: Path | None = None) -> WizardSession:
+def begin(
+    folder: Path,
+    cell: Cell,
+    journal: Path | None = None,
+    camera: CameraModel | None = CAMERA,
+) -> WizardSession:
     wizard = hand_eye_wizard(
         target=SHEET,
         take_picture=cell.take_picture,
         read_robot=cell.read_robot,
         save_to=lambda name: folder / f"{name}.json",
-        camera=CAMERA,
+        camera=camera,
     )
     opened = None if journal is None else Journal(journal)
     return WizardSession(wizard, opened, parameters={"name": "gripper"})
@@ -81,11 +86,13 @@ async def test_views_taken_give_a_calibration_in_a_file(tmp_path: Path) -> None:
     assert (view["step"], view["defaults"]["next"]) == ("review", "accept")
     assert (view["verdict"]["level"], view["verdict"]["text"][:9]) == ("good", "Good for ")
     assert any("mm rms on the sheet, at views that were left out" in one for one in view["notes"])
+    assert "view 8: held out" in view["preview"]["svg"]
     view = await say(session)
     assert view["step"] == "save"
     view = await say(session)
     assert view["type"] == "result", view
     assert view["preview"]["svg"].startswith("<svg ")
+    assert view["preview"]["svg"].count('class="board"') == 1
     assert view["result"]["good_for_mm"] >= 2 * view["result"]["held_out_mm"]
     found = HandEyeCalibration.load(tmp_path / "gripper.json")
     assert TRUTH.errors(found.camera_pose)[1] < 2e-4
@@ -94,6 +101,17 @@ async def test_views_taken_give_a_calibration_in_a_file(tmp_path: Path) -> None:
     assert (row["kind"], row["held_out_mm"]) == ("hand-eye", view["result"]["held_out_mm"])
     printed = printed_by(view["result"]["use"]["python"])
     assert printed.startswith("Transform(")
+
+
+async def test_lens_that_is_not_known_says_which_view_helps_most(tmp_path: Path) -> None:
+    session = begin(tmp_path, Cell(), camera=None)
+    await say(session, {"setup": "eye-in-hand"})
+    for _ in range(3):
+        view = await say(session)
+    assert SUGGESTIONS[3] not in view["description"]
+    assert ": with the sheet " in view["description"]
+    assert view["notes"][1].startswith("the lens is sure to ")
+    assert "orange: the next one" in view["preview"]["svg"]
 
 
 async def test_view_without_a_sheet_is_taken_again(tmp_path: Path) -> None:

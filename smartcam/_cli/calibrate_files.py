@@ -1,0 +1,219 @@
+"""``smartcam calibrate compare`` and ``draw``: what is done with calibrations that are in files."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.options import OUTPUT, Options, naming, runs
+from smartcam._cli.texts import table_text
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.calibration._lens.comparison import LensComparison
+    from smartcam.calibration._lens.uncertainty import MapFigures
+    from smartcam.calibration.formats._lenses import StoredLenses
+
+DIFFERENT = 7
+"""Exit code after a comparison of calibrations that differ by more than their noise explains."""
+
+COLUMNS = ("centre", "corners", "worst", "mean")
+"""Names of a map's figures."""
+
+
+OWN = "wizard"
+"""Name below ``calibrate`` of what it does itself, which nobody needs to say."""
+
+
+class OwnContext(click.Context):
+    """That of what a command does itself: it is called as the command."""
+
+    @property
+    def command_path(self) -> str:
+        """What stands in its usage."""
+        return super().command_path.rstrip()
+
+
+class WithFiles(click.Group):
+    """A command with others below it: what names none of them is its own affair."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse."""
+        own = not args or args[0] not in self.commands
+        return super().parse_args(ctx, [OWN, *args] if own else args)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that is meant, and what is left for it."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return (None if name == OWN else name), command, rest
+
+
+def _svg(_context: object, _option: object, path: str | None) -> str | None:
+    if path is not None and Path(path).suffix.lower() != ".svg":
+        raise click.BadParameter(f"{path}: expected a name that ends with .svg")
+    return path
+
+
+def distance_option(function: Any) -> Any:
+    """Declare --distance."""
+    return click.option(
+        "--distance",
+        type=click.FloatRange(min=0, min_open=True, max=1e6),
+        metavar="M",
+        help="Of the points before the camera, metres.  [default: infinity]",
+    )(function)
+
+
+@click.command(
+    help="Compare two calibrations of one lens, or of one pair: by how much they differ in where "
+    "they project, after the small motion of the camera that makes up for most, beside what the "
+    "noise of both leads to. A and B are calibrations of smartcam (lens, pair, camera on a robot), "
+    "camera_info of ROS, camchains of Kalibr or files of OpenCV; what noise leads to is known of "
+    "calibrations of a lens alone. "
+    f"Exit code {DIFFERENT} if they differ by more than noise explains; 0 otherwise, also where "
+    "there is no verdict."
+)
+@click.argument("a", type=click.Path(dir_okay=False))
+@click.argument("b", type=click.Path(dir_okay=False))
+@distance_option
+@click.option(
+    "--svg",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    callback=_svg,
+    help="Draw the differences there, beside what noise leads to; of a pair two files, -left and "
+    "-right.",
+)
+@runs(*OUTPUT)
+async def compare(
+    a: str, b: str, distance: float | None, svg: str | None, options: Options
+) -> None:
+    """Compare two calibrations."""
+    from smartcam.calibration._lens.comparison import compare_lenses, rig_difference
+
+    first, second = _read(a), _read(b)
+    if len(first.lenses) != len(second.lenses):
+        raise ConfigurationError(
+            f"{a} and {b}: expected as many cameras in both, got {len(first.lenses)} and "
+            f"{len(second.lenses)}"
+        )
+    found = [
+        compare_lenses(one, other, distance=distance)
+        for one, other in zip(first.lenses, second.lenses, strict=True)
+    ]
+    for name, comparison in zip(first.names, found, strict=True):
+        options.show(_data(name, comparison), _text(name, comparison))
+    neighbours = zip(first.transforms, second.transforms, itertools.pairwise(found), strict=True)
+    for one, other, pair in neighbours:
+        turn, shift = rig_difference(one, other, *pair)
+        between = f"{one.target} to {one.source}"
+        value = {"between": between, "turn_deg": math.degrees(turn), "shift_mm": 1e3 * shift}
+        said = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
+        options.show(value, said)
+    if svg is not None:
+        _draw(svg, first.names, found, f"{a} and {b}")
+    if any(one.same is False for one in found):
+        raise SystemExit(DIFFERENT)
+
+
+@click.command(
+    help="Draw the calibration in a file as SVG: the errors of its views as bars (views), targets "
+    "and cameras in space (scene), how sure a lens is over its field (uncertainty), a plane with "
+    "its touches (plane)."
+)
+@click.argument("file", type=click.Path(dir_okay=False))
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    required=True,
+    callback=_svg,
+    help="Where the picture goes; .svg.",
+)
+@click.option(
+    "--what",
+    type=click.Choice(["views", "scene", "uncertainty", "plane"]),
+    help="What to draw.  [default: views; of a plane the plane]",
+)
+@distance_option
+@runs(*OUTPUT)
+async def draw(file: str, output: str, what: Any, distance: float | None, options: Options) -> None:
+    """Draw a calibration."""
+    from smartcam.calibration._drawing.files import draw_file
+
+    with naming(file):
+        drawn = draw_file(file, what, distance)
+    _write(output, drawn)
+    options.show({"file": output}, output)
+
+
+def _read(path: str) -> StoredLenses:
+    from smartcam.calibration.formats._lenses import read_lenses
+
+    with naming(path):
+        return read_lenses(path)
+
+
+def _data(name: str, one: LensComparison) -> dict[str, Any]:
+    turn, shift = _motion(one)
+    return {
+        "camera": name,
+        "same": one.same,
+        "ratio": one.ratio,
+        "chance": one.chance,
+        "distance_m": one.distance,
+        "difference_px": one.observed._asdict(),
+        "predicted_px": None if one.predicted is None else one.predicted._asdict(),
+        "turn_deg": turn,
+        "shift_mm": shift,
+    }
+
+
+def _text(name: str, one: LensComparison) -> str:
+    rows = [_row("difference", one.observed)]
+    if one.predicted is not None:
+        rows.append(_row("from noise", one.predicted))
+    turn, shift = _motion(one)
+    where = "at infinity" if one.distance is None else f"at {one.distance:g} m"
+    return "\n".join(
+        [
+            f"{name}: {one.verdict}",
+            table_text(("", *COLUMNS), rows),
+            f"  pixels, of a coordinate, {where}; after a turn of {turn:.3g} degrees and a shift "
+            f"of {shift:.3g} mm",
+        ]
+    )
+
+
+def _row(name: str, figures: MapFigures) -> list[object]:
+    return [name, *(round(float(f"{one:.3g}"), 6) for one in figures)]
+
+
+def _motion(one: LensComparison) -> tuple[float, float]:
+    cosine = (float(one.motion.rotation.trace()) - 1.0) / 2.0
+    turn = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+    return turn, 1e3 * math.hypot(*one.motion.translation)
+
+
+def _draw(path: str, names: Sequence[str], found: Sequence[LensComparison], title: str) -> None:
+    from smartcam.calibration._drawing.draw import draw_uncertainty
+
+    for name, one in zip(names, found, strict=True):
+        file = Path(path)
+        if len(found) > 1:
+            file = file.with_stem(f"{file.stem}-{name}")
+        _write(str(file), draw_uncertainty(one, title=f"{title}: {name}"))
+
+
+def _write(path: str, drawn: str) -> None:
+    with naming(path):
+        Path(path).write_text(drawn, encoding="utf-8", newline="\n")

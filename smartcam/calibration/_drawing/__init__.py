@@ -1,0 +1,1 @@
+"""Pictures of calibrations from images, as SVG."""

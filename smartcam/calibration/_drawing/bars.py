@@ -1,0 +1,154 @@
+"""A bar or two for each view, with the numbers that they are to be compared with."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam.calibration._svg import document, line, rectangle, round_down, text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+WIDTH, HEIGHT = 900.0, 260.0
+"""Of a chart, pixels."""
+
+LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
+"""Pixels beside a chart, above it, below it, and on the right."""
+
+ADVANCE: Final = 7.5
+"""Width of a letter, about, pixels."""
+
+CUT: Final = 3.0
+"""Bars that are higher than the highest of a used view by more are cut, with their number."""
+
+LINES: Final = 5
+"""Horizontal lines of a chart at most."""
+
+DIGITS: Final = "0123456789"
+
+FILLS: Final = ("first", "second")
+"""Classes of the series."""
+
+
+class Series(NamedTuple):
+    """One bar of each view."""
+
+    name: str
+    values: Sequence[float]  # NaN: none
+    level: float = math.nan  # of all views together; NaN: none
+
+
+class Chart(NamedTuple):
+    """Bars of each view, in one unit."""
+
+    unit: str
+    series: Sequence[Series]  # one or two
+    names: Sequence[str]  # of the views
+    off: Sequence[bool]  # whether each was left out
+
+
+def draw_bars(charts: Sequence[Chart], title: str) -> str:
+    """Return charts, one below the other."""
+    tall = HEAD + HEIGHT + FOOT
+    parts = itertools.chain.from_iterable(
+        _chart(chart, 30 + number * tall) for number, chart in enumerate(charts)
+    )
+    head = [text((LEFT, 26), title, "title")] if title else []
+    return document(LEFT + WIDTH + GAP, 30 + len(charts) * tall, [*head, *parts])
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Return names without what all of them begin and end with, digits apart."""
+    if len(set(names)) < 2:
+        return list(names)
+    begin = _common(names).rstrip(DIGITS)
+    rest = [one[len(begin) :] for one in names]
+    end = _common([one[::-1] for one in rest])[::-1].lstrip(DIGITS)
+    shorts = [one[: len(one) - len(end)] for one in rest]
+    return [short or name for short, name in zip(shorts, names, strict=True)]
+
+
+def _common(names: Sequence[str]) -> str:
+    """Return what all names begin with."""
+    same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    return "".join(letters[0] for letters in same)
+
+
+def _chart(chart: Chart, top: float) -> Iterator[str]:
+    largest = _largest(chart)
+    step = round_down(largest / 2)
+    step *= next(factor for factor in (1, 2, 5, 10) if largest / (step * factor) <= LINES - 1)
+    foot = top + HEAD + HEIGHT
+    zoom = HEIGHT / (1.08 * largest)
+    yield from _legend(chart, top + 24)
+    for number in range(math.floor(1.08 * largest / step) + 1):
+        y = foot - number * step * zoom
+        yield line((LEFT, y), (LEFT + WIDTH, y), "axis", ' stroke-opacity="0.35"')
+        yield text((LEFT - 8, y + 4), f"{number * step:.6g}", "", ' text-anchor="end"')
+    yield text((LEFT - 8, top + HEAD - 12), chart.unit, "", ' text-anchor="end"')
+    yield from _bars(chart, foot, zoom)
+    for one, kind in zip(chart.series, FILLS, strict=False):
+        if math.isfinite(one.level):
+            y = foot - one.level * zoom
+            yield line((LEFT, y), (LEFT + WIDTH, y), f"level {kind}-line")
+    yield line((LEFT, foot), (LEFT + WIDTH, foot), "axis")
+
+
+def _largest(chart: Chart) -> float:
+    """Return what a chart reaches to: those that were left out do not make the others small."""
+    used = [
+        value
+        for one in chart.series
+        for value, off in (*zip(one.values, chart.off, strict=True), (one.level, False))
+        if math.isfinite(value) and not off
+    ]
+    every = [value for one in chart.series for value in one.values if math.isfinite(value)]
+    most = max(used, default=0.0)
+    return max(most, min(max(every), CUT * most)) if most else max(every, default=1.0) or 1.0
+
+
+def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
+    count = max(len(chart.names), 1)
+    room = WIDTH / count
+    wide = min(0.8 * room / len(chart.series), 40.0)
+    shorts = short_names(chart.names)
+    longest = max((len(one) for one in shorts), default=1)
+    # a name at each bar where there is room, else at each second, fifth, tenth, ...
+    needed = math.ceil(ADVANCE * (min(longest, 12) + 1) / room)
+    each = next(n for n in (1, 2, 5, 10, 20, 50, 100, 10**9) if n >= needed)
+    for number, (name, short) in enumerate(zip(chart.names, shorts, strict=True)):
+        middle = LEFT + (number + 0.5) * room
+        left_out = ", left out" if chart.off[number] else ""
+        for place, (one, kind) in enumerate(zip(chart.series, FILLS, strict=False)):
+            value = one.values[number]
+            if math.isfinite(value):
+                x = middle + (place - len(chart.series) / 2) * wide
+                said = f"{name}{left_out}: {one.name} {value:.3g} {chart.unit}"
+                fill = "off" if chart.off[number] else kind
+                tall = min(value * zoom, HEIGHT)
+                yield rectangle((x, foot - tall), (wide, tall), f'class="{fill}"', said)
+                if tall < value * zoom and place == 0:
+                    at = (middle, foot - HEIGHT - 6)
+                    yield text(at, f"{value:.2g}", "small", ' text-anchor="middle"')
+        if number % each == 0:
+            yield text((middle, foot + 18), short[:12], "", ' text-anchor="middle"')
+
+
+def _legend(chart: Chart, y: float) -> Iterator[str]:
+    x = LEFT
+    entries = [
+        (
+            kind,
+            one.name
+            + (f" ({one.level:.3g} {chart.unit} in all)" if math.isfinite(one.level) else ""),
+        )
+        for one, kind in zip(chart.series, FILLS, strict=False)
+    ]
+    if any(chart.off):
+        entries.append(("off", "left out"))
+    for kind, said in entries:
+        yield rectangle((x, y - 10), (12, 12), f'class="{kind}"')
+        yield text((x + 18, y), said)
+        x += 18 + ADVANCE * len(said) + 20

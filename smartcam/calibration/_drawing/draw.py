@@ -1,0 +1,248 @@
+"""What a calibration from images looks like: its views, its scene, its uncertainty."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._drawing.bars import Chart, Series, draw_bars, short_names
+from smartcam.calibration._drawing.maps import Map, draw_maps
+from smartcam.calibration._drawing.scene import Axes, Board, DrawnCamera, DrawnScene
+from smartcam.calibration._drawing.scene import draw_scene as _draw_scene
+from smartcam.calibration._geometry.rigid import IDENTITY
+from smartcam.calibration._hand_eye.result import HandEyeCalibration
+from smartcam.calibration._lens.comparison import LensComparison
+from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
+from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
+from smartcam.calibration._stereo.calibration import StereoCalibration
+from smartcam.calibration._views import label
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.uncertainty import MapFigures
+    from smartcam.calibration._targets import Target
+
+FromImages = IntrinsicCalibration | StereoCalibration | HandEyeCalibration
+"""Calibrations from images."""
+
+MILLIMETRES: Final = 1e3
+
+
+def draw_views(calibration: FromImages, *, title: str = "") -> str:
+    """Return a picture of each view's errors as bars, SVG.
+
+    Of a lens the rms of its residuals and the held-out one, pixels; of a pair that of each side,
+    and the held-out one of lengths, millimetres; of a camera on a robot both on the target,
+    millimetres. Dashed lines are those of all together; grey bars were left out. ``title``: a line
+    on top. The document has a size of its own, no parts elsewhere, and follows a page that is dark.
+
+    Raises:
+        CalibrationError: ``WRONG_KIND``: no calibration from images.
+    """
+    return draw_bars(_of(calibration, _CHARTS, "draw_views")(calibration), title)
+
+
+def draw_scene(calibration: FromImages, *, title: str = "") -> str:
+    """Return a picture of targets and cameras in space, SVG; as :func:`draw_views` else.
+
+    Of a lens and of a pair the cameras stand and the targets are around them; of a robot the base
+    stands. Targets are blue and have the views' names, those that were left out are dashed; cameras
+    are orange.
+    """
+    return _draw_scene(_of(calibration, _SCENES, "draw_scene")(calibration), title)
+
+
+def draw_uncertainty(
+    shown: IntrinsicCalibration | ProjectionUncertainty | LensComparison,
+    *,
+    distance: float | None = None,
+    title: str = "",
+) -> str:
+    """Return the uncertainty of a lens as a map, SVG; as :func:`draw_views` else.
+
+    Of a comparison both maps: by how much the two lenses differ, and what noise leads to. Colours
+    go by the logarithm, from dark to light; numbers are of a coordinate, pixels. A white cross is
+    where it is largest. ``distance`` is that of
+    :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
+    """
+    if isinstance(shown, LensComparison):
+        observed = [Map("difference", _size(shown.pixels), shown.lengths, _said(shown.observed))]
+        if shown.expected is not None and shown.predicted is not None:
+            expected = np.sqrt(np.trace(shown.expected, axis1=2, axis2=3) / 2)
+            said = _said(shown.predicted)
+            observed.append(Map("what noise leads to", _size(shown.pixels), expected, said))
+        return draw_maps(observed, title, "px")
+    if isinstance(shown, IntrinsicCalibration):
+        shown = shown.uncertainty(distance=distance)
+    if not isinstance(shown, ProjectionUncertainty):
+        raise _wrong("draw_uncertainty", "a calibration of a lens, its map or a comparison", shown)
+    where = "infinity" if shown.distance is None else f"{shown.distance:g} m"
+    name = f"standard deviation of where a point at {where} is projected"
+    return draw_maps([Map(name, shown.size, shown.sigma, _said(shown.figures))], title, "px")
+
+
+def _of(calibration: object, table: Mapping[type, Any], what: str) -> Callable[[Any], Any]:
+    found = next((one for kind, one in table.items() if isinstance(calibration, kind)), None)
+    if found is None:
+        raise _wrong(what, "a calibration of a lens, a pair, or a camera on a robot", calibration)
+    chosen: Callable[[Any], Any] = found
+    return chosen
+
+
+def _wrong(what: str, expected: str, got: object) -> CalibrationError:
+    return CalibrationError(
+        f"{what}: expected {expected}, got {type(got).__name__}",
+        code=Code.WRONG_KIND,
+        expected=expected,
+        got=type(got).__name__,
+    )
+
+
+def _size(pixels: Array) -> tuple[int, int]:
+    width, height = (pixels[-1, -1] + 1).round().astype(int).tolist()
+    return width, height
+
+
+def _said(figures: MapFigures) -> str:
+    names = figures._fields
+    return ", ".join(f"{name} {value:.2g}" for name, value in zip(names, figures, strict=True))
+
+
+# ---------------------------------------------------------------------- bars
+
+
+def _lens_chart(one: IntrinsicCalibration) -> list[Chart]:
+    return [
+        Chart(
+            "px",
+            [
+                Series("residuals", [fit.rms for fit in one.views], one.rms),
+                Series("held out", [fit.held_out for fit in one.views], one.held_out),
+            ],
+            [label(fit.view, number) for number, fit in enumerate(one.views)],
+            [not fit.used for fit in one.views],
+        )
+    ]
+
+
+def _pair_charts(one: StereoCalibration) -> list[Chart]:
+    names = _pair_names(one)
+    off = [not any(fit.used) for fit in one.pairs]
+    sides = [
+        Series(f"residuals, {side}", [fit.rms[number] for fit in one.pairs])
+        for number, side in enumerate(("left", "right"))
+    ]
+    held_out = [MILLIMETRES * fit.held_out for fit in one.pairs]
+    return [
+        Chart("px", sides, names, off),
+        Chart(
+            "mm",
+            [Series("held out, lengths", held_out, MILLIMETRES * one.held_out)],
+            names,
+            off,
+        ),
+    ]
+
+
+def _robot_chart(one: HandEyeCalibration) -> list[Chart]:
+    together = math.nan if one.held_out_error is None else MILLIMETRES * one.held_out_error
+    return [
+        Chart(
+            "mm",
+            [
+                Series("on the target", (MILLIMETRES * one.errors).tolist()),
+                Series("held out", (MILLIMETRES * one.leave_one_out).tolist(), together),
+            ],
+            _robot_names(one),
+            [not used for used in one.used],
+        )
+    ]
+
+
+def _pair_names(one: StereoCalibration) -> list[str]:
+    views = [fit.left or fit.right for fit in one.pairs]
+    return [label(view, n) if view else f"pair {n}" for n, view in enumerate(views)]
+
+
+def _robot_names(one: HandEyeCalibration) -> list[str]:
+    if one.views:
+        return [label(view, number) for number, view in enumerate(one.views)]
+    return [f"pose {number}" for number in range(len(one.robot_poses))]
+
+
+# ---------------------------------------------------------------------- scenes
+
+
+def _corners(target: Target | None) -> Array:
+    """Return the corners of a target's points (4, 3); of a square of 100 mm where it is unknown."""
+    if target is None:
+        return 0.05 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    (left, low, _), (right, high, _) = target.points.min(axis=0), target.points.max(axis=0)
+    return np.array([[left, low, 0.0], [right, low, 0.0], [right, high, 0.0], [left, high, 0.0]])
+
+
+def _boards(
+    names: Iterable[str], poses: Iterable[Transform | None], off: Iterable[bool], target: Target
+) -> list[Board]:
+    return [
+        Board(name, pose.apply(_corners(target)), left_out)
+        for name, pose, left_out in zip(names, poses, off, strict=True)
+        if pose is not None
+    ]
+
+
+def _lens_scene(one: IntrinsicCalibration) -> DrawnScene:
+    names = short_names([label(fit.view, number) for number, fit in enumerate(one.views)])
+    poses, off = [fit.transform for fit in one.views], [not fit.used for fit in one.views]
+    boards = _boards(names, poses, off, one.views[0].view.target)
+    return DrawnScene(boards, [DrawnCamera("camera", IDENTITY, one.camera)])
+
+
+def _pair_scene(one: StereoCalibration) -> DrawnScene:
+    shown = next(view for fit in one.pairs for view in (fit.left, fit.right) if view is not None)
+    poses, off = [fit.transform for fit in one.pairs], [not any(fit.used) for fit in one.pairs]
+    boards = _boards(short_names(_pair_names(one)), poses, off, shown.target)
+    right = one.transform.rigid.inverse()
+    return DrawnScene(
+        boards, [DrawnCamera("left", IDENTITY, one.left), DrawnCamera("right", right, one.right)]
+    )
+
+
+def _robot_scene(one: HandEyeCalibration) -> DrawnScene:
+    names = short_names(_robot_names(one))
+    corners = _corners(one.target)
+    base = [Axes("base", IDENTITY)]
+    flanges = [pose.rigid for pose in one.robot_poses]
+    up = (0.0, 0.0, 1.0)
+    if one.setup == "eye-in-hand":
+        board = Board("target", one.target_pose.apply(corners))
+        cameras = [
+            DrawnCamera(name, flange @ one.camera_pose.rigid, one.camera)
+            for name, flange in zip(names, flanges, strict=True)
+        ]
+        return DrawnScene([board], cameras, base, up)
+    boards = [
+        Board(name, (flange @ one.target_pose.rigid).apply(corners), not used)
+        for name, flange, used in zip(names, flanges, one.used, strict=True)
+    ]
+    return DrawnScene(boards, [DrawnCamera("camera", one.camera_pose.rigid, one.camera)], base, up)
+
+
+_CHARTS: Final[Mapping[type, Callable[[Any], list[Chart]]]] = {
+    IntrinsicCalibration: _lens_chart,
+    StereoCalibration: _pair_charts,
+    HandEyeCalibration: _robot_chart,
+}
+
+_SCENES: Final[Mapping[type, Callable[[Any], DrawnScene]]] = {
+    IntrinsicCalibration: _lens_scene,
+    StereoCalibration: _pair_scene,
+    HandEyeCalibration: _robot_scene,
+}

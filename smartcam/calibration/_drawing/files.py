@@ -1,0 +1,59 @@
+"""Pictures of what a file holds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._drawing.draw import draw_scene, draw_uncertainty, draw_views
+from smartcam.calibration._files.store import read_document
+from smartcam.calibration._hand_eye.result import HandEyeCalibration
+from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
+from smartcam.calibration._plane.calibration import PlaneCalibration
+from smartcam.calibration._plane.drawing import draw as draw_plane
+from smartcam.calibration._stereo.calibration import StereoCalibration
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Mapping
+
+Picture: TypeAlias = Literal["views", "scene", "uncertainty", "plane"]
+
+PICTURES: Final[Mapping[str, tuple[Picture, ...]]] = {
+    IntrinsicCalibration.kind: ("views", "scene", "uncertainty"),
+    StereoCalibration.kind: ("views", "scene"),
+    HandEyeCalibration.kind: ("views", "scene"),
+    PlaneCalibration.kind: ("plane",),
+}
+"""By the kind of a file what may be drawn of it, the first where nothing is asked for."""
+
+
+def draw_file(
+    path: str | os.PathLike[str], picture: Picture | None = None, distance: float | None = None
+) -> str:
+    """Return a picture of the calibration in a file, SVG; its name is the title.
+
+    Raises ``WRONG_KIND``: there is no such picture of it, or none at all; and what ``load`` of the
+    calibrations says.
+    """
+    document = read_document(path)
+    known = PICTURES.get(document.kind, ())
+    if not known or picture not in {None, *known}:
+        wanted = picture or " or ".join(PICTURES)
+        raise CalibrationError(
+            f"{path}: holds {document.kind!r}, of which there is "
+            f"{' and '.join(known) or 'no picture'}; expected {wanted}",
+            code=Code.WRONG_KIND,
+            expected=wanted,
+            got=document.kind,
+        )
+    title, data = str(path), document.data
+    chosen = picture or known[0]
+    if document.kind == PlaneCalibration.kind:
+        return draw_plane(PlaneCalibration.from_data(data), title=title)
+    kinds = (IntrinsicCalibration, StereoCalibration, HandEyeCalibration)
+    one = next(kind for kind in kinds if kind.kind == document.kind).from_data(data)
+    if isinstance(one, IntrinsicCalibration) and chosen == "uncertainty":
+        return draw_uncertainty(one, distance=distance, title=title)
+    return draw_scene(one, title=title) if chosen == "scene" else draw_views(one, title=title)

@@ -1,0 +1,136 @@
+"""Maps over a camera's field, as coloured cells with a legend."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._svg import document, line, rectangle, text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from smartcam.calibration._geometry.rotations import Array
+
+WIDTH: Final = 640.0
+"""Of a map, pixels."""
+
+BORDER, HEAD, FOOT = 30.0, 70.0, 84.0
+"""Pixels beside, above and below a map."""
+
+COLOURS: Final = (
+    *((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132)),
+    *((122, 209, 81), (253, 231, 37)),
+)
+"""From small to large: each is lighter than the one before it, for whoever sees no colours, too.
+
+Source: S. van der Walt and N. Smith, viridis (public domain).
+"""
+
+STEPS: Final = 24
+"""Colours of a map: neighbours in one merge into one rectangle."""
+
+DECADES: Final = 3.0
+"""Of a map's colours at most; what is smaller has the first one."""
+
+TICKS: Final = 5
+
+
+class Map(NamedTuple):
+    """What is drawn."""
+
+    title: str
+    size: tuple[int, int]  # of the image, pixels
+    values: Array  # (h, w), from corner to corner; NaN: none
+    said: str = ""  # below it
+
+
+def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
+    """Return maps side by side, with one legend: their colours mean the same."""
+    known = np.concatenate([one.values[np.isfinite(one.values)] for one in maps])
+    positive = known[known > 0.0]
+    most = float(positive.max()) if len(positive) else 1.0
+    least = float(positive.min()) if len(positive) else 0.1
+    least = max(min(least, 0.999 * most), most / 10.0**DECADES)
+    tall = max(WIDTH * one.size[1] / one.size[0] for one in maps)
+    parts = [text((BORDER, 28), title, "title")] if title else []
+    for number, one in enumerate(maps):
+        parts += _map(one, BORDER + number * (WIDTH + BORDER), least, most)
+    parts += _legend(HEAD + tall + 44, least, most, unit)
+    return document(len(maps) * (WIDTH + BORDER) + BORDER, HEAD + tall + FOOT, parts)
+
+
+def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
+    tall = WIDTH * one.size[1] / one.size[0]
+    rows, columns = one.values.shape
+    cell = np.array([WIDTH / columns, tall / rows])
+    yield text((left, HEAD - 12), one.title)
+    levels = _levels(one.values, least, most)
+    yield '<g shape-rendering="crispEdges">'
+    for row in range(rows):
+        # one rectangle for each run of one colour
+        starts = np.flatnonzero(np.diff(levels[row], prepend=-2))
+        for start, end in zip(starts, [*starts[1:], columns], strict=True):
+            level = int(levels[row, start])
+            fill = 'fill="none"' if level < 0 else f'fill="{_colour(level / (STEPS - 1))}"'
+            place = (left + start * cell[0], HEAD + row * cell[1])
+            yield rectangle(place, ((end - start) * cell[0], cell[1]), fill)
+    yield "</g>"
+    yield rectangle((left, HEAD), (WIDTH, tall), 'class="axis"')
+    yield from _numbers(one.values, left, tall)
+    if one.said:
+        yield text((left, HEAD + tall + 20), one.said)
+
+
+def _numbers(values: Array, left: float, tall: float) -> Iterator[str]:
+    """Yield the values in the corners and the middle, and a cross where the map is largest."""
+    rows, columns = values.shape
+    for row, y in ((0, 20.0), (rows // 2, tall / 2 + 5), (rows - 1, tall - 10)):
+        ends = [(0, 8.0, "start"), (columns - 1, WIDTH - 8, "end")]
+        for column, x, anchor in (
+            ends if row != rows // 2 else [(columns // 2, WIDTH / 2, "middle")]
+        ):
+            value = values[row, column]
+            said = f"{value:.2g}" if math.isfinite(value) else "beyond the model"
+            yield text((left + x, HEAD + y), said, "on-map", f' text-anchor="{anchor}"')
+    if np.isfinite(values).any():
+        row, column = np.unravel_index(np.nanargmax(values), values.shape)
+        at = np.array([left + (column + 0.5) * WIDTH / columns, HEAD + (row + 0.5) * tall / rows])
+        if row not in {0, rows - 1} or column not in {0, columns - 1}:  # not on a number
+            for kind in ("mark-rim", "mark"):
+                for arm in np.array([[6.0, 0.0], [0.0, 6.0]]):
+                    yield line(at - arm, at + arm, kind)
+
+
+def _levels(values: Array, least: float, most: float) -> Array:
+    """Return the number of each value's colour, by its logarithm; -1 for none."""
+    safe = np.where(np.isfinite(values), np.clip(values, least, most), least)
+    parts = np.log(safe / least) / math.log(most / least)
+    levels = np.clip(np.round(parts * (STEPS - 1)), 0, STEPS - 1)
+    found: Array = np.where(np.isfinite(values), levels, -1)
+    return found
+
+
+def _colour(part: float) -> str:
+    at = part * (len(COLOURS) - 1)
+    low = min(math.floor(at), len(COLOURS) - 2)
+    pairs = zip(COLOURS[low], COLOURS[low + 1], strict=True)
+    channels = (round(a + (at - low) * (b - a)) for a, b in pairs)
+    return "#" + "".join(f"{channel:02x}" for channel in channels)
+
+
+def _legend(y: float, least: float, most: float, unit: str) -> Iterator[str]:
+    wide = WIDTH / STEPS
+    yield '<g shape-rendering="crispEdges">'
+    for step in range(STEPS):
+        fill = f'fill="{_colour(step / (STEPS - 1))}"'
+        yield rectangle((BORDER + step * wide, y - 12), (wide, 12), fill)
+    yield "</g>"
+    for tick in range(TICKS):
+        part = tick / (TICKS - 1)
+        value = least * (most / least) ** part
+        anchor = "start" if tick == 0 else "end" if tick == TICKS - 1 else "middle"
+        said = f"{value:.2g}{f' {unit}' if tick == TICKS - 1 else ''}"
+        yield text((BORDER + part * WIDTH, y + 16), said, "", f' text-anchor="{anchor}"')

@@ -1,0 +1,206 @@
+"""Boards and cameras in space, seen from a corner of the room.
+
+Far things are as large as near ones, so one scale holds for all of the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._svg import document, line, polygon, round_down, text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from smartcam.calibration._geometry.rigid import Rigid
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel
+
+WIDTH, HEIGHT = 900.0, 560.0
+"""Of the scene, pixels."""
+
+BORDER, HEAD, FOOT = 40.0, 56.0, 50.0
+"""Pixels beside, above and below it."""
+
+AZIMUTH, ELEVATION = math.radians(-38.0), math.radians(24.0)
+"""From where it is looked at: turned about the vertical, and from above."""
+
+FRUSTUM: Final = 0.16
+"""Length of a camera's frustum, parts of the scene's extent; of many cameras it is shorter."""
+
+ARROW: Final = 0.12
+"""Length of a frame's axes, likewise."""
+
+LETTER: Final = (7.5, 15.0)
+"""Width and height of a letter, about, pixels."""
+
+BELOW: Final = np.array([0.0, 14.0])
+"""From a thing's place to its label, pixels."""
+
+OFFSETS: Final = [(0.0, 0.0)] + [
+    (reach * math.cos(angle), 0.7 * reach * math.sin(angle))
+    for reach in (18, 30, 44, 60, 80, 105)
+    for angle in np.linspace(0.0, math.tau, 12, endpoint=False).tolist()
+]
+"""Where a label may be beside its place, pixels; the first that is free is taken."""
+
+
+class Board(NamedTuple):
+    """A target in the scene."""
+
+    name: str
+    corners: Array  # (4, 3)
+    off: bool = False  # left out of the calibration
+
+
+class DrawnCamera(NamedTuple):
+    """A camera in the scene."""
+
+    name: str
+    pose: Rigid  # from the camera's frame into the scene's
+    model: CameraModel | None = None
+
+
+class Axes(NamedTuple):
+    """A frame in the scene."""
+
+    name: str
+    pose: Rigid
+
+
+class DrawnScene(NamedTuple):
+    """What is drawn, in a frame of its own."""
+
+    boards: Sequence[Board]
+    cameras: Sequence[DrawnCamera]
+    axes: Sequence[Axes] = ()
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # of a camera's frame; a robot's is z
+
+
+class _Drawn(NamedTuple):
+    depth: float
+    drawn: str
+    label: str
+    at: Array  # (2,)
+
+
+class _Outlook:
+    """How points of a scene become pixels."""
+
+    def __init__(self, scene: DrawnScene, points: Array) -> None:
+        # upright first, z up; then turned about the vertical and looked at from above
+        up = np.array(scene.up)
+        ahead = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.5 else np.array([0.0, 1.0, 0.0])
+        side = np.cross(ahead, up)
+        room = np.array([side, ahead, up])
+        turn, rise = (
+            (math.cos(AZIMUTH), math.sin(AZIMUTH)),
+            (math.cos(ELEVATION), math.sin(ELEVATION)),
+        )
+        around = np.array([[turn[0], -turn[1], 0.0], [turn[1], turn[0], 0.0], [0.0, 0.0, 1.0]])
+        tilted = np.array([[1.0, 0.0, 0.0], [0.0, rise[0], -rise[1]], [0.0, rise[1], rise[0]]])
+        self.axes: Array = tilted @ around @ room  # right, away, up
+        seen = points @ self.axes.T
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        span = np.maximum(high - low, 1e-9)
+        self.zoom = float(min(WIDTH / span[0], HEIGHT / span[2]))
+        self.middle: Array = (low + high) / 2
+
+    def pixels(self, points: Array) -> Array:
+        """Return points (..., 3) in pixels (..., 2)."""
+        seen = points @ self.axes.T - self.middle
+        centre = np.array([BORDER + WIDTH / 2, HEAD + HEIGHT / 2])
+        places: Array = centre + seen[..., [0, 2]] * [self.zoom, -self.zoom]
+        return places
+
+    def depth(self, points: Array) -> float:
+        """Return how far away the middle of points is."""
+        return float((points @ self.axes[1]).mean())
+
+
+def draw_scene(scene: DrawnScene, title: str) -> str:
+    """Return a scene: boards in blue, those that were left out dashed; cameras in orange."""
+    places = np.concatenate(
+        [
+            *(one.corners for one in scene.boards),
+            *(np.atleast_2d(one.pose.translation) for one in scene.cameras),
+            *(np.atleast_2d(one.pose.translation) for one in scene.axes),
+        ]
+    )
+    extent = float(np.ptp(places, axis=0).max()) or 1.0
+    long = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
+    shapes = [_frustum(one, long) for one in scene.cameras]
+    ends = [one.pose.apply(ARROW * extent * np.eye(3)) for one in scene.axes]
+    sight = _Outlook(scene, np.concatenate([places, *shapes, *ends]))
+    items = [
+        _Drawn(
+            sight.depth(one.corners),
+            polygon(sight.pixels(one.corners), "board-off" if one.off else "board", one.name),
+            one.name,
+            sight.pixels(one.corners.mean(axis=0)),
+        )
+        for one in scene.boards
+    ]
+    items += [_camera(sight, one, shape) for one, shape in zip(scene.cameras, shapes, strict=True)]
+    items.sort(key=lambda one: -one.depth)  # far ones first
+    parts = [text((BORDER, 28), title, "title")] if title else []
+    parts += [one.drawn for one in items]
+    for one, tips in zip(scene.axes, ends, strict=True):
+        start = sight.pixels(one.pose.translation)
+        for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
+            parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
+            items.append(_Drawn(0.0, "", axis, tip))
+        items.append(_Drawn(0.0, "", one.name, start + BELOW))
+    parts += _labels([(one.label, one.at) for one in items[::-1] if one.label])
+    parts += _scale(sight)
+    return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
+
+
+def _frustum(camera: DrawnCamera, long: float) -> Array:
+    """Return a camera's centre and the corners of what it sees at a distance (5, 3)."""
+    wide, high = 0.5, 0.375
+    if camera.model is not None:
+        wide, high = (math.tan(min(one, 2.0) / 2) for one in camera.model.field_of_view)
+    rim = [[-wide, -high, 1], [wide, -high, 1], [wide, high, 1], [-wide, high, 1]]
+    return camera.pose.apply(long * np.array([[0.0, 0.0, 0.0], *rim]))
+
+
+def _camera(sight: _Outlook, camera: DrawnCamera, shape: Array) -> _Drawn:
+    centre, *rim = sight.pixels(shape)
+    sides = [line(centre, one, "camera") for one in rim]
+    drawn = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
+    return _Drawn(sight.depth(shape), drawn, camera.name, centre + BELOW)
+
+
+def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
+    """Yield labels, each where it is on none of the others; one without room is left out."""
+    taken: list[tuple[float, float, float, float]] = []
+    low = np.array([BORDER / 2, HEAD - 10])
+    high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
+    for label, at in wanted:
+        wide, tall = LETTER[0] * len(label) + 6.0, LETTER[1]
+        for offset in OFFSETS:
+            x, y = at + offset
+            box = (x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2)
+            outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
+            if not outside and not any(_overlap(box, one) for one in taken):
+                taken.append(box)
+                if math.hypot(*offset) > 25:
+                    yield line(at, (x, y), "axis", ' stroke-opacity="0.6"')
+                yield text((x, y + 5), label, "halo", ' text-anchor="middle"')
+                break
+
+
+def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _scale(sight: _Outlook) -> Iterator[str]:
+    metres = round_down(0.2 * WIDTH / sight.zoom)
+    start = np.array([BORDER, HEAD + HEIGHT + 30])
+    end = start + np.array([metres * sight.zoom, 0.0])
+    yield line(start, end, "axis", ' stroke-width="2"')
+    yield text((end[0] + 10, end[1] + 5), f"{1e3 * metres:g} mm")

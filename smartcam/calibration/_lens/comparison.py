@@ -1,0 +1,359 @@
+"""Two calibrations of one lens: by how much they differ, and whether noise explains it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rigid import IDENTITY
+from smartcam.calibration._lens.field import (
+    LEAST,
+    SHAPE,
+    check_distance,
+    known_points,
+    places,
+    points_at,
+    sensitivity,
+)
+from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.uncertainty import MapFigures, figures
+from smartcam.calibration._optional_imports import load
+from smartcam.calibration._statistics import Noise
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.rigid import Rigid
+    from smartcam.calibration._geometry.rotations import Array
+
+CELLS: Final = (6, 8)
+"""Rows and columns of an image's cells, by which is told where both have seen the target."""
+
+LEVEL: Final = 0.01
+"""How seldom noise alone may make two calibrations differ as much."""
+
+SMALLEST: Final = 1e-9
+"""A chance that is less is not told: the noise is not as normal as that."""
+
+STEPS: Final = 50
+"""Of the motion's fit; it takes five."""
+
+SETTLED: Final = 1e-9
+"""Pixels: a step that moves nothing by more is the last."""
+
+TINY: Final = 1e-3
+"""Pixels: what moves places by less does not count as a difference."""
+
+
+class Lens(NamedTuple):
+    """What is known of a lens, where one calibration is compared with another.
+
+    Attributes:
+        camera: the lens.
+        covariance: (4 + K, 4 + K), of its values; None: not known.
+        points: (N, 3), where the target was seen before the camera, metres; None: not known.
+    """
+
+    camera: CameraModel
+    covariance: Array | None = None
+    points: Array | None = None
+
+    @classmethod
+    def of(cls, one: IntrinsicCalibration | CameraModel) -> Lens:
+        """Return that of a calibration, or of a bare lens; ``SHAPE``: neither."""
+        if isinstance(one, IntrinsicCalibration):
+            return cls(one.camera, one.covariance, one.target_points)
+        if isinstance(one, CameraModel):
+            return cls(one)
+        raise CalibrationError(
+            f"compare: expected calibrations of lenses, or camera models, got {type(one).__name__}",
+            code=Code.SHAPE,
+            expected="IntrinsicCalibration or CameraModel",
+            got=type(one).__name__,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LensComparison:
+    """What :func:`compare` finds.
+
+    Attributes:
+        distance: of the points from the camera, metres; None: infinity.
+        pixels: (h, w, 2), where the first lens sees a point.
+        difference: (h, w, 2), where the second one sees it, less that, after the motion; pixels;
+            NaN where one of them sees none.
+        expected: (h, w, 2, 2), covariance of ``difference`` that both calibrations' noise leads to;
+            None where it is not known of both.
+        motion: ``T_b_a``, the small motion of the camera that was taken off.
+        ratio: of the differences in units of what noise leads to, root of the mean square: about 1
+            where noise alone is at work; None without ``expected``.
+        chance: how likely noise alone makes the calibrations differ as much, 0 to 1; None without
+            ``expected``.
+    """
+
+    distance: float | None
+    pixels: Array
+    difference: Array
+    expected: Array | None
+    motion: Transform
+    ratio: float | None
+    chance: float | None
+
+    @property
+    def lengths(self) -> Array:
+        """(h, w), the differences' lengths over sqrt(2): rms of a coordinate, pixels."""
+        lengths: Array = np.linalg.norm(self.difference, axis=2) / math.sqrt(2)
+        return lengths
+
+    @property
+    def observed(self) -> MapFigures:
+        """The differences in four numbers, of a coordinate, pixels."""
+        return figures(self.lengths)
+
+    @property
+    def predicted(self) -> MapFigures | None:
+        """What noise leads to, in the same four numbers; None where it is not known."""
+        if self.expected is None:
+            return None
+        return figures(np.sqrt(np.trace(self.expected, axis1=2, axis2=3) / 2))
+
+    @property
+    def same(self) -> bool | None:
+        """Whether noise explains the difference; None where the noise is not known."""
+        return None if self.chance is None else self.chance >= LEVEL
+
+    @property
+    def verdict(self) -> str:
+        """The same in words."""
+        if self.chance is None or self.ratio is None:
+            return "no verdict: it takes the noise of both, as two calibrations with views have it"
+        chance = f"{self.chance:.2g}" if self.chance > SMALLEST else f"below {SMALLEST:g}"
+        noise = f"{self.ratio:.2f} times what noise leads to, chance {chance}"
+        if self.same:
+            return f"the same within their noise: {noise}"
+        return f"they differ by more than their noise explains: {noise}"
+
+
+def compare(
+    a: IntrinsicCalibration | CameraModel,
+    b: IntrinsicCalibration | CameraModel,
+    *,
+    distance: float | None = None,
+    shape: tuple[int, int] = SHAPE,
+) -> LensComparison:
+    """Return by how much two calibrations of one lens differ in where they project.
+
+    What a small motion of the camera makes up for is taken off: the one that fits best to the
+    target's points before the camera, where both calibrations have seen it; of lenses without views
+    to points at the distance, in the largest circle about the image's middle. The noise of both is
+    taken as independent; of calibrations from the same images the difference is smaller.
+
+    Args:
+        a: the one that the differences begin at; bare lenses are compared without a prediction.
+        b: the other one, for images of the same size.
+        distance: of the points, metres; None: infinity.
+        shape: rows and columns of the map, 2 to 500 each, from corner to corner.
+
+    Raises:
+        CalibrationError: ``SHAPE``: neither calibrations nor lenses, or no such rows and columns;
+            ``WRONG_SIZE``: images of two sizes; ``NOT_FINITE``: no such distance; ``OUT_OF_FIELD``:
+            the lenses have hardly anything of the image in common; ``POOR_FIT``: no motion brings
+            the one to the other.
+    """
+    return compare_lenses(Lens.of(a), Lens.of(b), distance=distance, shape=shape)
+
+
+def compare_lenses(
+    a: Lens, b: Lens, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
+) -> LensComparison:
+    """Return the comparison of lenses, as :func:`compare`."""
+    check_distance(distance)
+    first, second, far = a.camera, b.camera, distance is None
+    if tuple(first.size) != tuple(second.size):
+        raise CalibrationError(
+            f"compare: expected lenses of images of one size, got {first.size[0]} x "
+            f"{first.size[1]} and {second.size[0]} x {second.size[1]} pixels",
+            code=Code.WRONG_SIZE,
+            expected=first.size,
+            got=second.size,
+        )
+    pixels = places(first.size, shape)
+    gauge, bare = _gauge(a, b, distance)
+    motion = _align(first, second, gauge, far=far and bare)
+    points = points_at(first, pixels.reshape(-1, 2), distance)
+    moved = points @ motion.rotation.T + (0.0 if far else motion.translation)
+    difference = _project(second, moved) - pixels.reshape(-1, 2)
+    expected, ratio, chance = None, None, None
+    if a.covariance is not None and b.covariance is not None:
+        there = gauge @ motion.rotation.T + motion.translation
+        of_a = sensitivity(first, points, far=far).freed(sensitivity(first, gauge))
+        of_b = sensitivity(second, moved, far=far).freed(sensitivity(second, there))
+        spread = np.concatenate([of_a @ _root(a.covariance), of_b @ _root(b.covariance)], axis=2)
+        difference[~np.isfinite(spread).all(axis=(1, 2))] = np.nan
+        ratio, chance = _judged(difference, spread)
+        expected = (spread @ spread.swapaxes(1, 2)).reshape(*shape, 2, 2)
+    return LensComparison(
+        distance=distance,
+        pixels=pixels,
+        difference=difference.reshape(*shape, 2),
+        expected=expected,
+        motion=Transform("b", "a", *motion),
+        ratio=ratio,
+        chance=chance,
+    )
+
+
+def rig_difference(
+    a: Transform, b: Transform, first: LensComparison, second: LensComparison
+) -> tuple[float, float]:
+    """Return by how much two calibrations of one pair differ in where the cameras stand.
+
+    What was taken off of either camera belongs to it, so it is put in again.
+
+    Args:
+        a: ``T_second_first`` of the one calibration.
+        b: that of the other.
+        first: of the lenses of the first camera.
+        second: of those of the second.
+
+    Returns:
+        The turn between both, radians, and the shift, metres.
+    """
+    moved = second.motion.rigid @ a.rigid @ first.motion.rigid.inverse()
+    shift = float(np.linalg.norm(moved.translation - b.translation))
+    return float(moved.angle_to(b.rigid)), shift
+
+
+def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
+    """Return the points that the motion is fitted to, and whether they are mere directions.
+
+    They are the target's, in those cells of the image in which both have seen it, or in all where
+    those are too few. Of lenses without views they are in the largest circle about the middle of
+    the image: what lenses make of corners in which no view was would turn the camera.
+    """
+    known = [(one.camera, one.points) for one in (a, b) if one.points is not None]
+    if not known:
+        size = np.array(a.camera.size, dtype=np.float64)
+        pixels = places(a.camera.size, SHAPE).reshape(-1, 2)
+        inside = np.linalg.norm(pixels - (size - 1) / 2, axis=1) <= size.min() / 2
+        return known_points(points_at(a.camera, pixels[inside], distance)), True
+    cells = [_cells(camera, points) for camera, points in known]
+    common = set(cells[0]).intersection(*cells)
+    both = np.concatenate([points for _, points in known])
+    shared = both[np.isin(np.concatenate(cells), list(common))]
+    return known_points(shared if len(common) >= LEAST else both), False
+
+
+def _cells(camera: CameraModel, points: Array) -> list[int]:
+    """Return the number of the cell in which each point is seen."""
+    part = (camera.project(points) + 0.5) / camera.size * CELLS[::-1]
+    columns, rows = np.clip(np.floor(part), 0, np.array(CELLS[::-1]) - 1).astype(int).T
+    found: list[int] = (rows * CELLS[1] + columns).tolist()
+    return found
+
+
+def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) -> Rigid:
+    """Return the motion with which the second lens sees the gauge's points as the first does.
+
+    ``far``: they are directions, so it is a turn. Gauss and Newton.
+    """
+    seen, motion = first.project(gauge), IDENTITY
+    for _ in range(STEPS):
+        moved = gauge @ motion.rotation.T + motion.translation
+        by_motion = sensitivity(second, moved, far=far).by_motion.reshape(-1, 6)
+        off = (seen - _project(second, moved)).reshape(-1)
+        known = np.isfinite(off)
+        if np.count_nonzero(known) < len(known) / 2:
+            break
+        step = np.asarray(np.linalg.lstsq(by_motion[known], off[known])[0], dtype=np.float64)
+        motion = motion.turned_after(step)
+        if np.abs(by_motion[known] @ step).max() < SETTLED:
+            return motion
+    raise CalibrationError(
+        "compare: expected two calibrations of one lens, got lenses of which no motion of the "
+        "camera brings the one near the other",
+        code=Code.POOR_FIT,
+        expected="two calibrations of one lens",
+    )
+
+
+def _project(camera: CameraModel, points: Array) -> Array:
+    """Return pixels (N, 2); NaN where points are, too."""
+    known = np.isfinite(points).all(axis=1, keepdims=True)
+    return np.where(known, camera.project(np.where(known, points, [0.0, 0.0, 1.0])), np.nan)
+
+
+def _root(covariance: Array) -> Array:
+    """Return S with S S^T the covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
+
+
+class _Judged(NamedTuple):
+    ratio: float
+    chance: float
+
+
+def _judged(difference: Array, spread: Array) -> _Judged:
+    """Return the ratio of differences (N, 2) to what noise leads to, and its chance.
+
+    Two tests, of which the more surprised one counts: whether the lenses' values differ, each
+    combination of them by its own noise, and whether the places do, whatever moved them.
+    """
+    known = np.isfinite(difference).all(axis=1)
+    if not known.any():
+        raise CalibrationError(
+            "compare: expected lenses that reach the same places of the image, got none",
+            code=Code.OUT_OF_FIELD,
+            got=0,
+        )
+    off, moves = difference[known], spread[known]
+    tests = (_by_values(off, moves), _by_places(off, moves))
+    likelier, least = max(tests, key=lambda one: one.chance), min(tests, key=lambda one: one.chance)
+    # the least of two chances is below c with a chance of 2 c at most (Bonferroni)
+    return _Judged(
+        (least if 2 * least.chance < 1.0 else likelier).ratio, min(1.0, 2 * least.chance)
+    )
+
+
+def _by_values(off: Array, moves: Array) -> _Judged:
+    """Test along the directions in which values of the lenses move the places together."""
+    # With C = S S^T = U L U^T the components U^T e have the variances l, and the sum of
+    # (u^T e)^2 / l is distributed as chi^2. Directions that move the places by less than TINY rms
+    # are not told from what the linearization leaves.
+    flat = moves.reshape(-1, moves.shape[2])
+    values, vectors = np.linalg.eigh(flat.T @ flat)
+    floor = TINY**2 * len(flat)
+    counted = values > floor
+    if not counted.any():
+        return _Judged(0.0, 1.0)
+    along = (flat @ vectors[:, counted]).T @ off.reshape(-1) / np.sqrt(values[counted])
+    squares = float((along**2 / (values[counted] + floor)).sum())
+    count = int(np.count_nonzero(counted))
+    return _Judged(math.sqrt(squares / count), Noise(1.0).chance(squares, count))
+
+
+def _by_places(off: Array, moves: Array) -> _Judged:
+    """Test the sum of the squares of all places, each by its own covariance."""
+    # With D the covariances of the places by themselves, Q = sum of e^T D^-1 e has the mean 2 N and
+    # is distributed as the sum of l times chi^2 of 1, l the eigenvalues of D^-1/2 S S^T D^-1/2,
+    # which are those of S^T D^-1 S: places move together, since a lens has some ten values. What
+    # no values of the lenses explain is in Q, too. Its distribution by three moments: Imhof,
+    # Computing the distribution of quadratic forms in normal variables (1961), after Pearson.
+    back = np.linalg.inv(moves @ moves.swapaxes(1, 2) + TINY**2 * np.eye(2))
+    squares = float(np.einsum("ni,nij,nj->", off, back, off))
+    ratio = math.sqrt(squares / (2 * len(off)))
+    gram = np.einsum("nip,nij,njq->pq", moves, back, moves)
+    values = np.maximum(np.linalg.eigvalsh(gram), 0.0)
+    first, second, third = (float((values**power).sum()) for power in (1, 2, 3))
+    if third <= 0.0:  # nothing of either lens was fitted
+        return _Judged(ratio, float(ratio <= 1.0))
+    freedom = second**3 / third**2
+    reached = (squares - first) * math.sqrt(freedom / second) + freedom
+    return _Judged(ratio, float(load("scipy.special").chdtrc(freedom, max(reached, 0.0))))

@@ -1,0 +1,128 @@
+"""Points over a camera's field, and how a lens' error moves them that no pose makes up for.
+
+Two calibrations of one lens differ in more than they disagree about: a principal point that is off
+turns the camera by as much, and every pose that is found with that lens turns along. So what is
+said of an error over the field leaves out the small motion of the camera that fits it best. Where
+it fits is a choice, the gauge: points before the camera, best those of the target where the
+calibration saw it. Points far nearer or farther are then less sure, as they are for whoever finds
+the camera's pose with targets at one distance and uses it at another.
+
+Source: the idea is mrcal's (D. Kogan), which calls that motion the implied transformation; the
+formulas here are written anew.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._lens.projection import linearize, pose_changes
+from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.model import CameraModel
+
+SHAPE: Final = (25, 33)
+"""Rows and columns of a map: odd numbers, so that the middle is one of its places."""
+
+MOST: Final = 500
+"""Rows, and columns, of a map at most."""
+
+SAME: Final = 1e-3
+"""Pixels by which a pixel may be off when its direction is projected again."""
+
+LEAST: Final = 6
+"""Places that a motion is fitted to at least: three tell it."""
+
+
+class Sensitivity(NamedTuple):
+    """How pixels of points (N) move with a lens' values, and with the camera."""
+
+    by_lens: Array  # (N, 2, 4 + K)
+    by_motion: Array  # (N, 2, 6), a turn and a shift; the latter is 0 for points at infinity
+    by_point: Array  # (N, 2, 3), pixels for each metre; of directions for each radian
+
+    def freed(self, gauge: Sensitivity) -> Array:
+        """Return ``by_lens`` without the motion that fits best at a gauge's points."""
+        # Pixels move by B d with the lens and by A m with the motion: at the gauge m = -A_g^+ B_g d
+        # leaves the least squares, so B d + A m = (B - A A_g^+ B_g) d.
+        count = self.by_lens.shape[2]
+        motion = np.linalg.lstsq(gauge.by_motion.reshape(-1, 6), gauge.by_lens.reshape(-1, count))
+        freed: Array = self.by_lens - self.by_motion @ motion[0]
+        return freed
+
+
+def check_distance(distance: float | None) -> None:
+    """Refuse a distance that is none; None means infinity. Raises ``NOT_FINITE``."""
+    if distance is not None and not (math.isfinite(distance) and distance > 0.0):
+        raise CalibrationError(
+            f"distance: expected a positive number of metres, or None for infinity, got {distance}",
+            code=Code.NOT_FINITE,
+            expected="a positive number",
+            got=distance,
+        )
+
+
+def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
+    """Return pixels from corner to corner (rows, columns, 2).
+
+    Raises ``SHAPE``: fewer than 2 rows or columns, or more than 500.
+    """
+    if len(shape) != 2 or not all(2 <= one <= MOST for one in shape):
+        raise CalibrationError(
+            f"shape of a map: expected rows and columns, each from 2 to {MOST}, got {shape}",
+            code=Code.SHAPE,
+            expected=(2, MOST),
+            got=shape,
+        )
+    rows, columns = (
+        np.linspace(0.0, side - 1.0, count) for side, count in zip(size[::-1], shape, strict=True)
+    )
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
+def points_at(camera: CameraModel, pixels: Array, distance: float | None) -> Array:
+    """Return what a lens sees at pixels (N, 2) at a distance, (N, 3); at infinity directions.
+
+    NaN where no direction leads to a pixel: a lens' model may end before the image does, and the
+    iteration that inverts it then ends elsewhere.
+    """
+    ahead = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
+    ahead[~np.isfinite(ahead).all(axis=1)] = [0.0, 0.0, 1.0]
+    off = np.linalg.norm(camera.project(ahead) - pixels, axis=1)
+    points: Array = ahead / np.linalg.norm(ahead, axis=1, keepdims=True) * (distance or 1.0)
+    points[~(off < SAME)] = np.nan
+    return points
+
+
+def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sensitivity:
+    """Return how points (N, 3) of the camera's frame move in the image; NaN where they are NaN.
+
+    ``far``: they are directions to points at infinity.
+    """
+    known = np.isfinite(points).all(axis=1, keepdims=True)
+    there = np.where(known, points, [0.0, 0.0, 1.0])
+    at = linearize(there, camera)
+    motion = pose_changes(at.by_point, there)
+    if far:
+        motion[:, :, 3:] = 0.0
+    missing = np.where(known, 0.0, np.nan)[:, :, None]
+    return Sensitivity(at.by_lens + missing, motion + missing, at.by_point + missing)
+
+
+def known_points(points: Array) -> Array:
+    """Return those of points (N, 3) that a motion may be fitted to; ``OUT_OF_FIELD``: too few."""
+    known = points[np.isfinite(points).all(axis=1)]
+    if len(known) < LEAST:
+        raise CalibrationError(
+            f"field of the lens: expected {LEAST} places or more that its model reaches, "
+            f"got {len(known)} of {len(points)}",
+            code=Code.OUT_OF_FIELD,
+            expected=LEAST,
+            got=len(known),
+        )
+    return known

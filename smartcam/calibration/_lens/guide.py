@@ -1,0 +1,259 @@
+"""Which view of the target comes next: the one after which the lens is surest over its field.
+
+Of many views that could be taken it is worked out how sure the lens would be with each, from what
+the calibration's covariance says and what the view would add, which takes no image.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
+from smartcam.calibration._lens.field import (
+    check_distance,
+    known_points,
+    places,
+    points_at,
+    sensitivity,
+)
+from smartcam.calibration._lens.poses import CAMERA, TARGET
+from smartcam.calibration._lens.projection import NEGLIGIBLE, pose_changes
+
+if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._targets import Target
+
+    Mask: TypeAlias = NDArray[np.bool_]
+
+COLUMNS: Final = {0.0: "left", 0.5: "middle", 1.0: "right"}
+ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
+"""Where the target goes, in parts of the way that it has in the image."""
+
+FILLS: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
+"""How much of the image's width or height the target takes."""
+
+TILT: Final = 35.0
+"""Degrees: more tells little more, and is hard to see."""
+
+SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
+"""The target's side that is farther away, and about which axis of the camera it is tilted."""
+
+MARGIN: Final = 0.02
+"""Of the image, that stays free beside the target."""
+
+TURNS: Final = 12
+"""In which a target is brought to its place; most are there after five."""
+
+MAP: Final = (9, 12)
+"""Rows and columns of the field over which the uncertainty is counted."""
+
+DETERMINED: Final = 1e-12
+"""Part of the largest variance, in comparable units, below which a value counts as held fixed."""
+
+
+SAME_RAY: Final = 1e-3
+"""Between a point's direction and that of its pixel, radians: else the lens' model folds."""
+
+
+class NextView(NamedTuple):
+    """A view that may be taken.
+
+    Attributes:
+        text: where and how the target is to be held, for people.
+        transform: ``T_camera_target``.
+        outline: (4, 2), the target's corners as they would be seen, pixels.
+        mean: uncertainty over the field with this view taken, of a coordinate, root of the mean
+            square, pixels.
+        present: the same without it.
+    """
+
+    text: str
+    transform: Transform
+    outline: Array
+    mean: float
+    present: float
+
+
+class CandidateViews(NamedTuple):
+    """Views that could be taken (C), all of whose points are in the image."""
+
+    texts: list[str]
+    poses: Rigid  # T_camera_target
+    outlines: Array  # (C, 4, 2), pixels
+
+
+def suggest_views(
+    calibration: IntrinsicCalibration,
+    *,
+    distance: float | None = None,
+    roll: float = 0.0,
+    target: Target | None = None,
+) -> list[NextView]:
+    """Return views that could come next, the one that helps most first.
+
+    Each is one of some hundred: nine places in the image, three distances, head-on and tilted to
+    four sides. It is taken to have the noise that the calibration's views have had, and all of the
+    target's points. What counts is :meth:`IntrinsicCalibration.uncertainty`, its mean.
+
+    Args:
+        calibration: from the views so far.
+        distance: at which the lens is to be sure, metres; None: infinity.
+        roll: of the target about the line of sight, radians; 0: upright.
+        target: which is held; None: that of the views.
+
+    Raises:
+        CalibrationError: ``NOT_FINITE``: no such distance.
+    """
+    check_distance(distance)
+    camera = calibration.camera
+    shown = target or calibration.views[0].view.target
+    found = candidates(camera, shown, roll)
+    basis, start = _determined(calibration.covariance)
+    weight = basis.T @ _criterion(calibration, distance) @ basis
+    added = _informations(camera, found.poses, shown.points, basis) / _variance(calibration)
+    after = np.linalg.inv(np.linalg.inv(start) + added)
+    means = np.sqrt(np.maximum(np.einsum("cij,ji->c", after, weight), 0.0) / 2)
+    present = math.sqrt(max(float(np.einsum("ij,ji->", start, weight)), 0.0) / 2)
+    return [
+        NextView(
+            found.texts[number],
+            Transform(CAMERA, TARGET, *found.poses.taken(number)),
+            found.outlines[number],
+            float(means[number]),
+            present,
+        )
+        for number in np.argsort(means, kind="stable").tolist()
+    ]
+
+
+def _variance(calibration: IntrinsicCalibration) -> float:
+    """Return the variance of a coordinate that the views so far have had, pixels^2."""
+    sigmas = np.concatenate([one.view.sigmas for one in calibration.views if one.used])
+    return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, NEGLIGIBLE**2)
+
+
+def _determined(covariance: Array) -> tuple[Array, Array]:
+    """Return the basis (4 + K, F) of the values that were fitted, and its covariance (F, F).
+
+    Values that were held, or tied to others, are not in it.
+    """
+    scales = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(scales > 0.0, scales, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    fitted = values > DETERMINED * max(float(values.max(initial=0.0)), 1.0)
+    return safe[:, None] * vectors[:, fitted], np.diag(values[fitted])
+
+
+def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Array:
+    """Return M with which ``trace(C M)`` is the mean of both coordinates' variances, of C."""
+    camera = calibration.camera
+    points = points_at(camera, places(camera.size, MAP).reshape(-1, 2), distance)
+    field = sensitivity(camera, known_points(points), far=distance is None)
+    freed = field.freed(sensitivity(camera, known_points(calibration.target_points)))
+    found: Array = np.einsum("nip,niq->pq", freed, freed) / len(freed)
+    return found
+
+
+def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array) -> Array:
+    """Return what each view tells of the fitted values (C, F, F), at a variance of 1 pixel^2."""
+    # The pose is unknown, too: what is left of B^T B is B^T B - B^T A (A^T A)^-1 A^T B.
+    shape = (poses.size, 2 * len(points), -1)
+    turned = points @ poses.rotation.swapaxes(1, 2)
+    there = (turned + poses.translation[:, None]).reshape(-1, 3)
+    at = sensitivity(camera, there)
+    by_lens = (at.by_lens @ basis).reshape(shape)
+    by_pose = pose_changes(at.by_point, turned.reshape(-1, 3)).reshape(shape)
+    both = by_pose.swapaxes(1, 2) @ by_lens
+    inner = by_pose.swapaxes(1, 2) @ by_pose
+    left: Array = by_lens.swapaxes(1, 2) @ by_lens - both.swapaxes(1, 2) @ np.linalg.solve(
+        inner, both
+    )
+    return left
+
+
+def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> CandidateViews:
+    """Return views that a camera could have of a target, ``roll`` about the line of sight."""
+    low, high = target.points[:, :2].min(axis=0), target.points[:, :2].max(axis=0)
+    centre = np.append((low + high) / 2, 0.0)
+    half = (high - low) / 2
+    rim = np.array(
+        [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0]], dtype=np.float64
+    )
+    around = np.column_stack([rim * half, np.zeros(len(rim))])
+    tilts = {"": (0.0, 0.0), **SIDES}
+    ways = list(itertools.product(FILLS, ROWS, COLUMNS, tilts))
+    turns = np.array([[*tilts[side], 0.0] for *_, side in ways]) * math.radians(TILT)
+    upright = exp_rotation(np.array([0.0, 0.0, roll])) @ np.diag([1.0, -1.0, -1.0])
+    rotations = exp_rotation(turns) @ upright
+    turned = around @ rotations.swapaxes(1, 2)
+    fills, parts = np.array([way[0] for way in ways]), np.array([way[2:0:-1] for way in ways])
+    shifts = _placed(camera, turned, fills, parts)
+    poses = Rigid(rotations, shifts - rotations @ centre)
+    good = _visible(camera, turned + shifts[:, None])
+    chosen = np.flatnonzero(good).tolist()
+    corners = (turned[good, :4] + shifts[good, None]).reshape(-1, 3)
+    return CandidateViews(
+        [_words(*ways[number], roll) for number in chosen],
+        poses.taken(chosen),
+        camera.project(corners).reshape(-1, 4, 2),
+    )
+
+
+def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> Array:
+    """Return where targets' middles are (C, 3) so that they are seen where they are to be.
+
+    ``turned`` (C, 8, 3): their rims about their middles, in the camera's axes. ``fills`` (C,) and
+    ``parts`` (C, 2): how large, and where of the way that is left beside them.
+    """
+    size = np.array(camera.size, dtype=np.float64)
+    extent = float(np.linalg.norm(turned, axis=2).max())
+    depth = 2 * extent * camera.matrix[0, 0] / (fills * size[0])
+    at = np.broadcast_to((size - 1) / 2, (len(turned), 2)).copy()
+    shifts = np.zeros((len(turned), 3))
+    for _ in range(TURNS):
+        ahead = np.column_stack([camera.directions(at), np.ones(len(at))])
+        shifts = ahead * depth[:, None]
+        seen = camera.project((turned + shifts[:, None]).reshape(-1, 3)).reshape(len(at), -1, 2)
+        first, last = seen.min(axis=1), seen.max(axis=1)
+        wide = last - first
+        lowest, room = MARGIN * size + wide / 2, np.maximum((1 - 2 * MARGIN) * size - wide, 0.0)
+        step = lowest + room * parts - (first + last) / 2
+        at = np.clip(at + np.nan_to_num(step), 0.0, size - 1)
+        depth = depth * np.nan_to_num(np.clip((wide / size).max(axis=1) / fills, 0.7, 1.5), nan=1.5)
+    return shifts
+
+
+def _visible(camera: CameraModel, points: Array) -> Mask:
+    """Return whether all points (C, N, 3) are in the image, and where the lens' model leads."""
+    flat = points.reshape(-1, 3)
+    seen = camera.project(flat)
+    inside = ((seen >= 0.0) & (seen <= np.array(camera.size) - 1.0)).all(axis=1, keepdims=True)
+    back = points_at(camera, np.where(inside, seen, 0.0), None)
+    ahead = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    off = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
+    good: Mask = off.max(axis=1) < SAME_RAY
+    return good
+
+
+def _words(fill: float, row: float, column: float, side: str, roll: float) -> str:
+    across, down = COLUMNS[column], ROWS[row]
+    place = {
+        (True, True): "in the middle of the image",
+        (True, False): f"at the {across} edge of the image",
+        (False, True): f"at the {down} edge of the image",
+        (False, False): f"in the {down} {across} corner of the image",
+    }[row == 0.5, column == 0.5]
+    tilt = f"tilted by {TILT:.0f} degrees, its {side} side farther away" if side else "not tilted"
+    turned = f", turned by {abs(math.degrees(roll)):.0f} degrees" if roll else ""
+    return f"{place}, {FILLS[fill]}, {tilt}{turned}"

@@ -1,0 +1,90 @@
+"""Elements of the pictures, as SVG: lines of text, written the same way on every machine."""
+
+from __future__ import annotations
+
+import math
+from html import escape
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from smartcam.calibration._geometry.rotations import Array
+
+    Place = Array | Sequence[float]
+
+STYLE: Final = """\
+text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px } .small { font-size: 11px }
+.paper { fill: #fff } .first { fill: #0072b2 } .second { fill: #d55e00 } .off { fill: #999 }
+.axis { stroke: #777; fill: none } .level { fill: none; stroke-width: 1.5; stroke-dasharray: 6 4 }
+.first-line { stroke: #0072b2 } .second-line { stroke: #d55e00 }
+.board { fill: #0072b2; fill-opacity: 0.12; stroke: #0072b2 }
+.board-off { fill: #999; fill-opacity: 0.12; stroke: #999; stroke-dasharray: 5 3 }
+.camera { fill: #d55e00; fill-opacity: 0.15; stroke: #d55e00; stroke-width: 1.2 }
+.halo { paint-order: stroke; stroke: #fff; stroke-width: 3 }
+.on-map { fill: #fff; paint-order: stroke; stroke: #222; stroke-width: 3 }
+.mark { fill: none; stroke: #fff; stroke-width: 2 } .mark-rim { fill: none; stroke: #222; \
+stroke-width: 4 }
+@media (prefers-color-scheme: dark) {
+text { fill: #ddd } .paper { fill: #181818 } .first { fill: #56b4e9 } .second { fill: #f0a040 }
+.off { fill: #777 } .axis { stroke: #999 } .first-line { stroke: #56b4e9 }
+.second-line { stroke: #f0a040 } .board { fill: #56b4e9; stroke: #56b4e9 }
+.camera { fill: #f0a040; stroke: #f0a040 } .halo { stroke: #181818 } .on-map { fill: #fff } }"""
+"""Of pictures that follow a page that is light or dark; colours that colour-blind people tell
+apart.
+
+Source of the colours: Okabe and Ito, Color Universal Design (2008).
+"""
+
+
+def document(width: float, height: float, parts: Iterable[str], style: str = STYLE) -> str:
+    """Return a whole picture with a size of its own; lines end with a line feed."""
+    size = f"{width:.0f}", f"{height:.0f}"
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{size[0]}" height="{size[1]}" '
+            f'viewBox="0 0 {size[0]} {size[1]}">',
+            f"<style>{style}</style>",
+            f'<rect width="{size[0]}" height="{size[1]}" class="paper"/>',
+            *parts,
+            "</svg>\n",
+        ]
+    )
+
+
+def line(start: Place, end: Place, kind: str, more: str = "") -> str:
+    """Return a line; ``more``: further attributes, a space before them."""
+    return (
+        f'<line x1="{start[0]:.2f}" y1="{start[1]:.2f}" x2="{end[0]:.2f}" y2="{end[1]:.2f}" '
+        f'class="{kind}"{more}/>'
+    )
+
+
+def text(place: Place, said: str, kind: str = "", more: str = "") -> str:
+    """Return a text that begins at a place; ``more``: further attributes, a space before them."""
+    of_kind = f' class="{kind}"' if kind else ""
+    return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}{more}>{escape(said)}</text>'
+
+
+def polygon(corners: Array, kind: str, title: str = "") -> str:
+    """Return a polygon of corners (N, 2); ``title`` is shown where the pointer is on it."""
+    places = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners.tolist())
+    return f'<polygon points="{places}" class="{kind}"' + _titled("polygon", title)
+
+
+def rectangle(place: Place, size: Place, paint: str, title: str = "") -> str:
+    """Return a rectangle; ``paint``: its class or fill, as an attribute."""
+    return (
+        f'<rect x="{place[0]:.2f}" y="{place[1]:.2f}" width="{size[0]:.2f}" '
+        f'height="{size[1]:.2f}" {paint}' + _titled("rect", title)
+    )
+
+
+def _titled(element: str, title: str) -> str:
+    return f"><title>{escape(title)}</title></{element}>" if title else "/>"
+
+
+def round_down(wanted: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, as large as is wanted at most."""
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))

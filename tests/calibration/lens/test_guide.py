@@ -1,0 +1,126 @@
+"""Which view comes next: by what it tells, and how it is said."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._geometry.rigid import exp_rotation
+from smartcam.calibration._lens.guide import NextView, candidates, suggest_views
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._targets import Charuco, Target
+from smartcam.exceptions import CalibrationError
+from tests.calibration import lenskit
+from tests.calibration.lens.estimates import Bench, spread_poses
+
+LENS = lenskit.LEFT
+CENTRE = Bench(LENS, lenskit.poses(4, seed=3))
+CHARUCO = Charuco(columns=7, rows=5, square=0.03, marker=0.0225)
+
+
+def test_best_view_comes_first_and_each_says_what_it_is_worth() -> None:
+    found = suggest_views(CENTRE.calibration())
+    means = [one.mean for one in found]
+    assert len(found) > 60
+    assert means == sorted(means)
+    assert means[-1] < found[0].present
+    assert found[0].mean < 0.1 * found[0].present
+
+
+def test_worth_of_a_view_is_the_uncertainty_once_it_is_taken() -> None:
+    best = suggest_views(CENTRE.calibration(), distance=0.4)[0]
+    taken = Bench(LENS, [*CENTRE.poses, best.transform])
+    before = CENTRE.calibration().uncertainty(distance=0.4, shape=(9, 12))
+    assert best.present == pytest.approx(before.figures.mean, rel=1e-6)
+    # the gauge takes the new view in, too, so they are not quite the same
+    after = taken.calibration().uncertainty(distance=0.4, shape=(9, 12))
+    assert best.mean == pytest.approx(after.figures.mean, rel=0.3)
+
+
+def test_view_where_the_target_never_was_helps_more() -> None:
+    best = suggest_views(CENTRE.calibration())[0]
+    corners = np.array([[0, 0], [639, 0], [639, 479], [0, 479]])
+    near = np.linalg.norm(best.outline[:, None] - corners, axis=2).min()
+    was = min(np.linalg.norm(view.points[:, None] - corners, axis=2).min() for view in CENTRE.views)
+    assert near < was
+
+
+@pytest.mark.parametrize("camera", [lenskit.LEFT, lenskit.WIDE, lenskit.FISHEYE])
+@pytest.mark.parametrize("target", [lenskit.BOARD, CHARUCO])
+def test_all_points_of_a_candidate_are_in_the_image(camera: CameraModel, target: Target) -> None:
+    found = candidates(camera, target, roll=math.pi / 2)
+    assert len(found.texts) >= 50
+    for pose in map(found.poses.taken, range(found.poses.size)):
+        seen = camera.project(pose.apply(target.points))
+        assert ((seen >= 0) & (seen <= np.array(camera.size) - 1)).all()
+
+
+def test_words_say_where_the_target_is_and_which_side_is_away() -> None:
+    straight = CameraModel(size=(640, 480), matrix=LENS.matrix)
+    found = candidates(straight, lenskit.BOARD)
+    poses = dict(zip(found.texts, map(found.poses.taken, range(found.poses.size)), strict=True))
+    where = {
+        "in the upper left corner of the image": (0, 0),
+        "in the lower right corner of the image": (1, 1),
+        "at the left edge of the image": (0, None),
+        "at the lower edge of the image": (None, 1),
+        "in the middle of the image": (None, None),
+    }
+    for place, (right, lower) in where.items():
+        pose = poses[f"{place}, far, not tilted"]
+        middle = straight.project(pose.apply(lenskit.BOARD.points)).mean(axis=0) / [640, 480]
+        for part, beyond in zip(middle, (right, lower), strict=True):
+            if beyond is None:
+                assert part == pytest.approx(0.5, abs=0.03)
+            else:
+                assert (part > 0.55) == beyond
+    for side, axis, sign in (("right", 0, 1), ("left", 0, -1), ("lower", 1, 1), ("upper", 1, -1)):
+        text = f"in the middle of the image, near, tilted by 35 degrees, its {side} side farther"
+        pose = poses[f"{text} away"]
+        points = pose.apply(lenskit.BOARD.points)
+        farthest = points[points[:, 2].argmax()] - points.mean(axis=0)
+        assert sign * farthest[axis] > 0.04
+
+
+def test_values_that_were_held_stay_so() -> None:
+    held = CENTRE.calibration()
+    held.covariance[8] = held.covariance[:, 8] = 0.0  # k3
+    found = suggest_views(held)
+    assert all(math.isfinite(one.mean) and one.mean < one.present for one in found)
+
+
+def test_distance_that_is_none_is_refused() -> None:
+    with pytest.raises(CalibrationError) as caught:
+        suggest_views(CENTRE.calibration(), distance=-1.0)
+    assert caught.value.code == Code.NOT_FINITE
+
+
+def held(best: NextView, random: np.random.Generator) -> Transform:
+    """Return a pose as people hold what they were told: by 3 degrees and 10 mm off."""
+    turn = exp_rotation(random.normal(0, math.radians(3), 3)) @ best.transform.rotation
+    shift = best.transform.translation + random.normal(0, 0.01, 3)
+    return Transform("camera", "target", turn, shift)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("camera", [lenskit.LEFT, lenskit.FISHEYE])
+def test_ten_views_as_suggested_tell_a_lens_better_than_ten_at_random(camera: CameraModel) -> None:
+    ratios = []
+    for seed in range(3):
+        random = np.random.default_rng(seed)
+        first = spread_poses(camera, 3, seed=seed)
+        guided, anyhow = list(first), [*first, *spread_poses(camera, 10, seed=100 + seed)]
+        for number in range(10):
+            found = suggest_views(Bench(camera, guided).calibration(number))
+            guided.append(held(found[0], random))
+        means = [
+            Bench(camera, poses).calibration().uncertainty().figures.mean
+            for poses in (guided, anyhow)
+        ]
+        ratios.append(means[1] / means[0])
+    assert min(ratios) > 1.2
+    assert float(np.median(ratios)) > 1.5

@@ -1,0 +1,108 @@
+"""How sure a lens is of where it projects: against simulated calibrations."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._lens.comparison import Lens, compare_lenses
+from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.uncertainty import uncertainty
+from smartcam.exceptions import CalibrationError
+from tests.calibration import lenskit
+from tests.calibration.lens.estimates import Bench, spread_poses
+
+BENCH = Bench(lenskit.LEFT, spread_poses(lenskit.LEFT, 12))
+CALIBRATION = BENCH.calibration()
+
+
+def test_map_reaches_from_corner_to_corner_and_has_its_figures() -> None:
+    found = CALIBRATION.uncertainty(distance=0.5, shape=(5, 7))
+    assert found.pixels.shape == (5, 7, 2)
+    assert found.pixels[0, 0].tolist() == [0.0, 0.0]
+    assert found.pixels[-1, -1].tolist() == [639.0, 479.0]
+    assert found.sigma.shape == found.across.shape == (5, 7)
+    assert found.figures.centre == found.sigma[2, 3]
+    assert found.figures.worst == found.sigma.max()
+    assert found.figures.mean == pytest.approx(math.sqrt((found.sigma**2).mean()))
+    assert 3 * found.figures.centre < found.figures.corners < found.figures.worst * 1.0001
+
+
+def test_uncertainty_is_least_where_the_target_was_and_ends_at_infinity() -> None:
+    means = [CALIBRATION.uncertainty(distance=one).figures.mean for one in (0.4, 1.0, 3.0, 1e6)]
+    assert means == sorted(means)
+    assert CALIBRATION.uncertainty().figures.mean == pytest.approx(means[-1], rel=1e-4)
+
+
+def test_across_is_what_pixels_are_at_the_distance() -> None:
+    found = CALIBRATION.uncertainty(distance=2.0)
+    focal = lenskit.LEFT.matrix[0, 0]
+    assert found.across[12, 16] == pytest.approx(found.sigma[12, 16] * 2.0 / focal, rel=0.02)
+    angle = CALIBRATION.uncertainty()
+    assert angle.across[12, 16] == pytest.approx(angle.sigma[12, 16] / focal, rel=0.02)
+
+
+def test_principal_point_that_turns_the_camera_is_taken_off() -> None:
+    straight = CameraModel(size=(640, 480), matrix=lenskit.LEFT.matrix)
+    only_cx = np.zeros((9, 9))
+    only_cx[2, 2] = 1.0  # pixel^2
+    found = uncertainty(straight, only_cx, BENCH.gauge).figures
+    # a coordinate's share of 1 pixel is 0.71; a turn makes up for all but the perspective's part
+    assert found.worst < 0.25
+
+
+def test_values_that_are_known_leave_nothing_open() -> None:
+    known = dataclasses.replace(CALIBRATION, covariance=np.zeros((9, 9)))
+    assert known.uncertainty().figures.worst == 0.0
+
+
+def test_corner_that_the_model_does_not_reach_has_no_number() -> None:
+    folding = CameraModel(
+        size=(640, 480), matrix=lenskit.LEFT.matrix, distortion=np.array([-0.5, 0, 0, 0, 0])
+    )
+    found = uncertainty(folding, BENCH.covariance, BENCH.gauge)
+    assert np.isnan(found.sigma[0, 0])
+    assert np.isnan(found.figures.corners)
+    assert np.isfinite(found.sigma[12, 16])
+    assert np.isfinite(found.figures.mean)
+
+
+@pytest.mark.parametrize("distance", [0.0, -1.0, math.nan, math.inf])
+def test_distance_that_is_none_is_refused(distance: float) -> None:
+    with pytest.raises(CalibrationError, match="distance: expected a positive number") as caught:
+        CALIBRATION.uncertainty(distance=distance)
+    assert caught.value.code == Code.NOT_FINITE
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (9, 501), (9,), (0, 0)])
+def test_shape_that_is_none_is_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(CalibrationError, match="shape of a map: expected rows") as caught:
+        CALIBRATION.uncertainty(shape=shape)
+    assert caught.value.code == Code.SHAPE
+
+
+def test_map_of_a_calibration_is_that_of_its_bound() -> None:
+    poses = spread_poses(lenskit.LEFT, 5)
+    found = calibrate_intrinsics(lenskit.seen(lenskit.LEFT, poses)).uncertainty(distance=0.5)
+    bound = Bench(lenskit.LEFT, poses).calibration().uncertainty(distance=0.5)
+    assert found.figures.mean == pytest.approx(bound.figures.mean, rel=0.1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("distance", [None, 0.4])
+def test_predicted_uncertainty_is_observed(distance: float | None) -> None:
+    truth = Lens(lenskit.LEFT, points=BENCH.gauge)
+    squares = [
+        compare_lenses(truth, Lens(BENCH.lens(seed)), distance=distance, shape=(7, 9)).lengths ** 2
+        for seed in range(300)
+    ]
+    observed = np.sqrt(np.mean(squares, axis=0))
+    ratio = CALIBRATION.uncertainty(distance=distance, shape=(7, 9)).sigma / observed
+    assert 0.95 < ratio.mean() < 1.05
+    assert ratio.min() > 0.85
+    assert ratio.max() < 1.15
