@@ -131,6 +131,8 @@ class Code(enum.StrEnum):
     """Matrices that are no covariances: not symmetric, or with a negative variance."""
     SWAPPED_LENSES = "SWAPPED_LENSES"
     """The known lens of each camera is the other one's."""
+    WRONG_LENS = "WRONG_LENS"
+    """A known lens shows the views worse than one that is fitted to them."""
 
 
 class Remark(NamedTuple):

@@ -82,6 +82,15 @@ GAIN_OF_POOR: Final = 2.0
 POOR: Final = 1.0
 """This pixel."""
 
+LONGEST: Final = 20.0
+"""Metres that no target is long: a board in millimetres is 200."""
+
+OFF_MIDDLE: Final = 0.2
+"""Of the image's sides by which the principal point is off where the image is another one."""
+
+SURE: Final = 5.0
+"""Standard deviations by which it is so."""
+
 TURNS: Final = 20
 """In which lens and flips are chosen in turn, at most."""
 
@@ -224,7 +233,8 @@ def without_strays(
     ]
     found = strays(fitted, more, [True] * len(fitted))
     names = [label(view, number) for number, view in enumerate(views)]
-    return without(views, found), list(stray_remarks(found, names, "was not used"))
+    remarks = [*stray_remarks(found, names, "was not used"), *view_remarks(views, names)]
+    return without(views, found), remarks
 
 
 def examined(
@@ -243,6 +253,7 @@ def examined(
     fitted = [Fitted(one.view, found.camera, one.transform.rigid, points) for one in found.views]
     names = [label(view, number) for number, view in enumerate(views)]
     check_rms("intrinsics", found.rms, views)
+    said = [*view_remarks(views, names), *_remarks_on_middle(found)]
     check_flips(
         list(itertools.compress(fitted, used)),
         found.sigma**2,
@@ -250,13 +261,57 @@ def examined(
         list(itertools.compress(names, used)),
     )
     off = strays(fitted, found.sigma**2, used)
-    if not off:
-        return found
+    if off and drop:
+        found, said = again(without(views, off)), []  # which says it of them
     done = "was not used" if drop else "is used all the same"
-    remarks = tuple(stray_remarks(off, names, done))
-    if drop:
-        found = again(without(views, off))
-    return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
+    remarks = stray_remarks(off, names, done)
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *said))
+
+
+def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[Remark]:
+    """Yield what is to be said of views that are copies, or show a target as large as a house."""
+    groups = collections.defaultdict[tuple[bytes, bytes], list[str]](list)
+    for view, name in zip(views, names, strict=True):
+        groups[view.ids.tobytes(), view.points.tobytes()].append(name)
+    copies = [", ".join(one) for one in groups.values() if len(one) > 1]
+    if copies:
+        more = f", and {len(copies) - NAMED} more" if len(copies) > NAMED else ""
+        yield Remark(
+            Code.COINCIDENT,
+            f"views that are the same to the last digit: {'; '.join(copies[:NAMED])}{more}: they "
+            "count as often as they are there, and errors come out too small",
+        )
+    length = float(np.ptp(views[0].target.points, axis=0).max())
+    if length > LONGEST:
+        yield Remark(
+            Code.SCALE_MISMATCH,
+            f"expected a target of {LONGEST:g} m at most, got one of {length:g} m: are its lengths "
+            "in metres? All lengths that are found are in proportion",
+        )
+
+
+def _remarks_on_middle(found: IntrinsicCalibration) -> Iterator[Remark]:
+    size = np.array(found.camera.size)
+    middle, sigmas = found.camera.matrix[:2, 2], np.sqrt(np.diag(found.covariance)[2:4])
+    off = np.abs(middle - (size - 1) / 2)
+    if ((off > OFF_MIDDLE * size) & (off > SURE * sigmas)).any():
+        yield Remark(
+            Code.WRONG_SIZE,
+            f"expected the principal point near the middle of an image of {size[0]} x {size[1]} "
+            f"pixels, got ({middle[0]:.0f}, {middle[1]:.0f}): were points taken from an image of "
+            "another size? Where images are cut to a part of the sensor's, all is well",
+        )
+
+
+def lens_gain(fitted: Sequence[Fitted], more: float) -> float:
+    """Return the weighted squares of views over those with a lens of the same model fitted to them.
+
+    1 where the lens that they have is theirs. ``more``: variance beside the points' own, pixels^2.
+    """
+    reduced = _Reduced.of([one.equations(more) for one in fitted])
+    free = np.arange(reduced.right.shape[1]) < reduced.right.shape[1] - DEFORMATIONS
+    before, after = float(reduced.squares.sum()), reduced.own([], free)
+    return before / after if after > 0 else 1.0
 
 
 def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
@@ -392,8 +447,8 @@ def check_flips(fitted: Sequence[Fitted], more: float, free: Mask, names: Sequen
         which = [name for name, one in zip(names, fewer.tolist(), strict=True) if one]
         raise CalibrationError(
             f"intrinsics: expected pictures as the camera takes them, got some that are flipped "
-            f"{how} against the others ({', '.join(which)}): the squares of all are "
-            f"{before / after:.3g} times smaller when those are flipped back",
+            f"{how} against the others ({', '.join(which)}), or those of another camera: the "
+            f"squares of all are {before / after:.3g} times smaller when they are flipped back",
             code=Code.MIRRORED,
             expected="pictures as the camera takes them",
             got=which,

@@ -377,7 +377,7 @@ def calibrate_stereo(
         drop_bad=drop_bad,
     )
     found = _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
-    return examined(found, again, drop=drop_bad)
+    return examined(found, again, known=(left, right), drop=drop_bad)
 
 
 def _pairs(sights: Sequence[Sight]) -> list[int]:
@@ -430,6 +430,7 @@ def _cameras(bundle: Bundle) -> CameraPair:
 
 
 def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
+    check_fit(found.adjusted.rms, found.sights, found.bad)
     shape, without = choose_shape(
         found.adjusted,
         found.sights,
@@ -453,7 +454,6 @@ def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
         sheet=shape.off,
         warnings=(),
     )
-    check_fit(calibration.rms, found.sights, found.bad)
     remarks = _remarks(calibration, found, shape.remarks)
     return dataclasses.replace(calibration, warnings=tuple(remarks))
 

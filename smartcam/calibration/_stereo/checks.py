@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from smartcam.calibration._codes import Code, Remark
 from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.poses import locate
-from smartcam.calibration._lens.suspicions import Fitted, stray_remarks, strays, without
+from smartcam.calibration._lens.suspicions import (
+    Fitted,
+    lens_gain,
+    stray_remarks,
+    strays,
+    view_remarks,
+    without,
+)
 from smartcam.calibration._stereo.start import SIDES
 from smartcam.calibration._views import checked, label
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from smartcam.calibration._geometry.frames import Transform
     from smartcam.calibration._geometry.rotations import Array
@@ -41,6 +48,13 @@ differ by 1.7 and more where they are not (measured on recorded pairs)."""
 
 MOST_PAIRS: Final = 0.75
 """Of the pairs that must say so."""
+
+FITTED: Final = 1.2
+"""Squares of the residuals over those with a lens that is fitted to the views: lenses from other
+views reach 1.04 on recorded pairs, a focal length that is 1 % off 2 where noise is 0.05 pixels."""
+
+LEAST_FITTED: Final = 3
+"""Views that such a lens is fitted to at least."""
 
 APART: Final = 30.0
 """Squared standard deviations by which the right camera's place is no chance from the left one's:
@@ -115,41 +129,70 @@ def examined(
     found: StereoCalibration,
     again: Callable[..., StereoCalibration],
     *,
+    known: tuple[CameraModel | None, CameraModel | None],
     drop: bool,
 ) -> StereoCalibration:
     """Return a calibration without points that are far off in their views, and remarks on them.
 
-    ``again`` calibrates from other views of both sides. ``drop``: whether the points are left out.
+    ``again`` calibrates from other views of both sides. ``known``: lenses. ``drop``: whether the
+    points are left out.
     Raises ``COINCIDENT``: the cameras do not stand apart.
     """
     check_apart(found.transform, found.covariance)
     sides = [[one.left for one in found.pairs], [one.right for one in found.pairs]]
-    cameras, rigs = (found.left, found.right), (None, found.transform)
-    fitted, places, used = [], [], []
-    for side, (camera, rig) in enumerate(zip(cameras, rigs, strict=True)):
-        for number, pair in enumerate(found.pairs):
-            view = sides[side][number]
-            if view is not None and pair.transform is not None:
-                pose = pair.transform if rig is None else rig @ pair.transform
-                points = view.target.points + (0.0 if found.sheet is None else found.sheet)
-                fitted.append(Fitted(view, camera, pose.rigid, points))
-                places.append((side, number))
-                used.append(pair.used[side])
+    seen = list(_seen(found))
+    fitted, used = [one.fitted for one in seen], [one.used for one in seen]
+    names = [f"{label(one.fitted.view, one.pair)}, {SIDES[one.side]}" for one in seen]
+    said = list(view_remarks([one.view for one in fitted], names))
+    for side, name in enumerate(SIDES):
+        if known[side] is not None:
+            own = [one.fitted for one in seen if one.used and one.side == side]
+            said += _remarks_on_lens(own, name, found.sigma**2)
     off = strays(fitted, found.sigma**2, used)
-    if not off:
-        return found
-    names = [
-        f"{label(one.view, number)}, {SIDES[side]}"
-        for one, (side, number) in zip(fitted, places, strict=True)
-    ]
+    if off and drop:
+        for one, view in zip(seen, without([one.view for one in fitted], off), strict=True):
+            sides[one.side][one.pair] = view
+        found, said = again(*sides), []  # which says it of them
     done = "was not used" if drop else "is used all the same"
-    remarks = tuple(stray_remarks(off, names, done))
-    if drop:
-        kept = without([one.view for one in fitted], off)
-        for (side, number), view in zip(places, kept, strict=True):
-            sides[side][number] = view
-        found = again(*sides)
-    return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
+    remarks = stray_remarks(off, names, done)
+    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *said))
+
+
+class _Seen(NamedTuple):
+    """One view of a calibration."""
+
+    side: int
+    pair: int
+    used: bool
+    fitted: Fitted
+
+
+def _seen(found: StereoCalibration) -> Iterator[_Seen]:
+    for number, pair in enumerate(found.pairs):
+        if pair.transform is None:
+            continue
+        poses = pair.transform, found.transform @ pair.transform
+        for side, view in enumerate((pair.left, pair.right)):
+            if view is not None:
+                points = view.target.points + (0.0 if found.sheet is None else found.sheet)
+                camera = (found.left, found.right)[side]
+                yield _Seen(
+                    side, number, pair.used[side], Fitted(view, camera, poses[side].rigid, points)
+                )
+
+
+def _remarks_on_lens(fitted: Sequence[Fitted], side: str, more: float) -> Iterator[Remark]:
+    """Yield whether a known lens is not the camera's (``WRONG_LENS``).
+
+    ``fitted``: the views that it shows; ``more``: variance beside their points' own, pixels^2.
+    """
+    gain = lens_gain(fitted, more) if len(fitted) >= LEAST_FITTED else 1.0
+    if gain > FITTED:
+        yield Remark(
+            Code.WRONG_LENS,
+            f"the {side} lens that was given leaves {math.sqrt(gain):.3g} times the residuals of "
+            f"one that is fitted to the {side} views: is it this camera's, at this focus?",
+        )
 
 
 def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None:

@@ -103,7 +103,7 @@ def test_hand_eye_of_no_poses_of_the_target_is_refused(seen: Any, code: str, tex
     ("options", "code"),
     [
         ({"setup": np.zeros(3)}, "SHAPE"),
-        ({"method": []}, "SHAPE"),
+        pytest.param({"method": []}, "SHAPE", marks=pytest.mark.long),
         ({"adjust": np.eye(2)}, "SHAPE"),
         ({"robot_sigmas": 1e-3}, "SHAPE"),
         ({"robot_sigmas": (1e-3, 1e-3, 1e-3)}, "SHAPE"),

@@ -218,6 +218,14 @@ def test_calibrate_intrinsics_uses_a_view_without_the_point_that_is_off() -> Non
     assert len(found.views[2].view.ids) == len(views[2].ids) - 1
 
 
+def test_calibrate_intrinsics_of_points_of_a_smaller_image_says_so() -> None:
+    views = [changed(one, one.points / 2) for one in seen(LEFT, poses(5))]
+    found = calibrate_intrinsics([*views, dataclasses.replace(views[0], name="copy")])
+    texts = {one.code: one.text for one in found.warnings}
+    assert "near the middle of an image of 640 x 480 pixels, got (16" in texts[Code.WRONG_SIZE]
+    assert "the same to the last digit: 00, copy" in texts[Code.COINCIDENT]
+
+
 def test_strays_are_told_from_their_neighbours() -> None:
     random = np.random.default_rng(1)
     residuals = random.normal(size=(40, 2))

@@ -15,7 +15,7 @@ from smartcam.calibration._stereo.calibration import StereoCalibration, calibrat
 from smartcam.calibration._stereo.checks import check_apart
 from smartcam.calibration._views import TargetView
 from tests.calibration.lens.test_wrong_views import flipped, mirrored
-from tests.calibration.lenskit import LEFT, RIG, RIGHT, pairs, poses, seen
+from tests.calibration.lenskit import BOARD, LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused
 
 IMAGE = np.zeros((480, 640), dtype=np.uint8)
@@ -115,3 +115,20 @@ def test_calibrate_stereo_names_points_that_are_off_and_leaves_them_out(side: in
 def _points(found: StereoCalibration, side: int) -> list[int]:
     views: list[TargetView | None] = [(one.left, one.right)[side] for one in found.pairs]
     return [len(one.ids) for one in views if one is not None]
+
+
+def test_calibrate_stereo_with_a_lens_of_another_camera_says_so() -> None:
+    left, right = pairs(4)
+    found = known(left, right, left=LEFT, right=LEFT)
+    (remark,) = [one for one in found.warnings if one.code == Code.WRONG_LENS]
+    assert remark.text.startswith("the right lens that was given leaves 4.")
+
+
+def test_calibrate_stereo_of_what_cannot_be_says_so() -> None:
+    left, right = pairs(3)
+    large = dataclasses.replace(BOARD, square=25.0)
+    twice = [*left, left[0]], [*right, right[0]]
+    found = known(*([dataclasses.replace(one, target=large) for one in some] for some in twice))
+    texts = {one.code: one.text for one in found.warnings}
+    assert "got one of 200 m: are its lengths in metres?" in texts[Code.SCALE_MISMATCH]
+    assert texts[Code.COINCIDENT].startswith("views that are the same to the last digit: 00, left")
