@@ -16,7 +16,7 @@ import numpy as np
 from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.blobs import dark_spots
 from smartcam.calibration._detection.dots import GridMap, refine_dots
-from smartcam.calibration._detection.grid_growing import lattices
+from smartcam.calibration._detection.grid_growing import alike_areas, lattices
 from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, scaled
 from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
 from smartcam.calibration._detection.sampling import mean_level
@@ -102,7 +102,12 @@ def _laid_out(
     """Yield as many dots (N, 2) in rows and columns as the target has, and their places (N, 2)."""
     count = target.columns * target.rows
     larger = ((target.origin_diameter or target.diameter) / target.diameter) ** 2
-    for grid in lattices(spots.points, spots.areas, least=LEAST_TOLD, most=count, larger=larger):
+    like, larger_like = alike_areas(spots.areas), alike_areas(spots.areas, larger)
+
+    def follows(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
+        return like(one, other) | larger_like(one, other)
+
+    for grid in lattices(spots.points, like, follows=follows, least=LEAST_TOLD, most=count):
         seen.largest = max(seen.largest, len(grid))
         if len(grid) == count:
             yield spots.points[list(grid.values())], np.array(list(grid), dtype=np.intp)

@@ -7,18 +7,19 @@ steps change from dot to dot, which is why the last two of a row predict the thi
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._geometry.homography import apply_homography, fit_homography, local_steps
+from smartcam.calibration._detection.dots import GridMap
+from smartcam.calibration._geometry.homography import local_steps
 from smartcam.calibration._optional_imports import load
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
 
     from smartcam.calibration._geometry.rotations import Array
 
@@ -41,7 +42,7 @@ ALIKE = 1.8
 
 REGULAR = 0.08
 """Of a step, from where a flat grid has its dots to where they are, in the median at most: lenses
-bend less."""
+bend one of less than 20 dots less."""
 
 MOST_TRIES = 50
 """Dots from which a grid is grown."""
@@ -53,21 +54,29 @@ _AROUND: Final[list[Place]] = [(1, 0), (0, 1), (-1, 0), (0, -1)]
 Lattice = dict[Place, int]
 """The dot at a column and a row, counted from anywhere in any direction."""
 
+Alike: TypeAlias = "Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]"
+"""Whether dots, by their indices, may be neighbours of others."""
+
 
 def lattices(
-    points: Array, areas: Array, *, least: int, most: int, larger: float = 1.0
+    points: Array,
+    alike: Alike,
+    *,
+    least: int,
+    most: int,
+    follows: Alike | None = None,
+    tries: int = MOST_TRIES,
 ) -> Iterator[Lattice]:
     """Yield grids, each of dots that hang together.
 
-    ``points`` (N, 2), pixels, have ``areas`` (N,), pixels^2; a dot's area may be that of its
-    neighbours, or ``larger`` times as much. A grid has at least ``least`` dots, four or more; of
-    one with more than ``most``, a few more than these are returned.
+    ``alike`` tells which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
+    else may come after one. A grid has at least ``least`` dots, four or more; of one with more than
+    ``most``, a few more than these are returned. It is grown from ``tries`` dots at most.
     """
     if len(points) < 5:
         return
-    grown = _Grown(points, areas, larger)
+    grown = _Grown(points, alike, follows or alike)
     seen = np.zeros(len(points), dtype=np.bool_)
-    tries = MOST_TRIES
     for start, steps in grown.starts():
         if seen[start]:
             continue
@@ -80,13 +89,23 @@ def lattices(
             return
 
 
+def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
+    """Return whether dots are alike by their ``areas`` (N,), or one is ``larger`` times another."""
+
+    def alike(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
+        part = areas[one] / (larger * areas[other])
+        return np.asarray((part < ALIKE) & (part > 1 / ALIKE))
+
+    return alike
+
+
 @dataclass(eq=False)
 class _Grown:
     """Dots by their places, and grids that are grown from one of them."""
 
     _points: Array
-    _areas: Array
-    _larger: float
+    _alike: Alike
+    _follows: Alike
 
     def __post_init__(self) -> None:
         self._tree = load("scipy.spatial").cKDTree(self._points)
@@ -99,8 +118,7 @@ class _Grown:
         points = self._points
         _, near = self._tree.query(points, min(NEIGHBOURS + 1, len(points)))
         near = near[:, 1:]
-        part = self._areas[near] / self._areas[:, None]
-        alike = (part < ALIKE) & (part > 1 / ALIKE)
+        alike = self._alike(near, np.arange(len(points))[:, None])
         ways = points[near] - points[:, None]
         lengths = np.maximum(np.linalg.norm(ways, axis=2), 1e-9)
         apart = np.linalg.norm(ways[:, :, None] + ways[:, None], axis=3)
@@ -119,47 +137,50 @@ class _Grown:
                     break
 
     def grow(self, start: int, steps: Array, most: int) -> Lattice:
-        """Return all dots that are reached from one step by step, or a few more than ``most``."""
+        """Return all dots that are reached from one step by step, or some more than ``most``."""
         places: Lattice = {(0, 0): start}
         taken = {start}
-        reached = deque([((0, 0), steps, float(self._areas[start]))])
+        # each with the steps from it, and the one that those after it are like
+        reached = [((0, 0), start, steps, start)]
         while reached and len(places) <= most:
-            here, steps, area = reached.popleft()
-            ways = np.concatenate([steps, -steps])
-            ahead = self._points[places[here]] + ways
-            off, near = self._tree.query(ahead, min(3, len(self._points)))
-            longest = NEAR * np.linalg.norm(ways, axis=1)
-            for side, (column, row) in enumerate(_AROUND):
-                there = (here[0] + column, here[1] + row)
-                dots = near[side, off[side] < longest[side]].tolist()
-                fits = [dot for dot in dots if dot not in taken and self._follows(dot, area)]
-                if there in places or not fits:
-                    continue
-                dot = places[there] = fits[0]
-                taken.add(dot)
-                step = steps.copy()
-                step[side % 2] = (column + row) * (self._points[dot] - self._points[places[here]])
-                own = float(self._areas[dot])
-                reached.append((there, step, own if _alike(own, area) else area))
+            around = self._around(reached)
+            wave, reached = reached, []
+            for (here, dot, steps, like), sides in zip(wave, around, strict=True):
+                for side, fits in enumerate(sides):
+                    column, row = _AROUND[side]
+                    there = (here[0] + column, here[1] + row)
+                    free = next((one for one in fits if one not in taken), None)
+                    if free is None or there in places:
+                        continue
+                    places[there] = free
+                    taken.add(free)
+                    step = steps.copy()
+                    step[side % 2] = (column + row) * (self._points[free] - self._points[dot])
+                    own = bool(self._alike(np.array(free), np.array(like)))
+                    reached.append((there, free, step, free if own else like))
         return places
 
-    def _follows(self, dot: int, area: float) -> bool:
-        mine = float(self._areas[dot])
-        return _alike(mine, area) or _alike(mine, self._larger * area)
+    def _around(self, reached: list[tuple[Place, int, Array, int]]) -> list[list[list[int]]]:
+        """Return for each dot and each of its four sides the dots that may be next there."""
+        dots = np.array([dot for _, dot, _, _ in reached])
+        like = np.array([like for _, _, _, like in reached])
+        steps = np.stack([steps for _, _, steps, _ in reached])
+        ways = np.concatenate([steps, -steps], axis=1)
+        ahead = self._points[dots][:, None] + ways
+        off, near = self._tree.query(ahead, min(3, len(self._points)))
+        fits = off < NEAR * np.linalg.norm(ways, axis=2)[:, :, None]
+        fits &= self._follows(near, like[:, None, None])
+        return [
+            [[dot for dot, fit in zip(*side, strict=True) if fit] for side in zip(*one, strict=True)]
+            for one in zip(near.tolist(), fits.tolist(), strict=True)
+        ]
 
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
     """Return whether a flat sheet's grid may be seen so: among many dots, chance finds others."""
     places = np.array(list(grid), dtype=np.float64)
     found = points[list(grid.values())]
-    matrix = fit_homography(places, found)
-    if matrix is None:
-        return False
-    seen = partial(apply_homography, matrix)
+    seen = GridMap(places, found)
     off = np.linalg.norm(seen(places) - found, axis=1)
     steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
     return bool(np.median(off / steps) < REGULAR)
-
-
-def _alike(area: float, other: float) -> bool:
-    return other / ALIKE < area < other * ALIKE

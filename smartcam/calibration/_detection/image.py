@@ -83,3 +83,17 @@ def scaled(image: GreyImage, scale: float) -> NDArray[np.uint8]:
         image.bytes, None, fx=scale, fy=scale, interpolation=kind
     )
     return bytes_
+
+
+def reduced(image: GreyImage, times: int) -> NDArray[np.uint8]:
+    """Return an image's bytes whose pixels are the means of ``times`` by ``times`` of them.
+
+    A place ``p`` of it is ``(p + 0.5) * times - 0.5`` in the image.
+    """
+    if times == 1:
+        return image.bytes
+    cv2 = load("cv2")
+    width, height = (side // times for side in image.size)
+    cut = image.bytes[: height * times, : width * times]
+    bytes_: NDArray[np.uint8] = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
+    return bytes_
