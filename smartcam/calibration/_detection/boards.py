@@ -34,6 +34,9 @@ USUAL_SIDE = 800
 MOST_TRIES = 16
 """Saddles of an image from which a board is grown."""
 
+NEIGHBOURS = 8
+"""Saddles around one among which a board's next ones are: four and what else is near."""
+
 PART = 0.45
 """Of a square around a corner that is fitted: its own edges, not the next ones and their blur."""
 
@@ -102,7 +105,14 @@ def boards(image: GreyImage, *, most: int) -> Iterator[Board]:
     usual = math.ceil(max(image.size) / USUAL_SIDE)
     for times in dict.fromkeys((usual, 2 * usual, (usual + 1) // 2)):
         seen = find_saddles(reduced(image, times))
-        grown = lattices(seen.points, seen.alike, least=4, most=most, tries=MOST_TRIES)
+        grown = lattices(
+            seen.points,
+            seen.alike,
+            least=4,
+            most=most,
+            tries=MOST_TRIES,
+            neighbours=NEIGHBOURS,
+        )
         found = max(grown, key=len, default=None)
         if found:
             points = (seen.points[list(found.values())] + 0.5) * times - 0.5

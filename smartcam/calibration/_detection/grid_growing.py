@@ -66,18 +66,20 @@ def lattices(
     most: int,
     follows: Alike | None = None,
     tries: int = MOST_TRIES,
+    neighbours: int = NEIGHBOURS,
 ) -> Iterator[Lattice]:
     """Yield grids, each of dots that hang together.
 
     ``alike`` tells which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
     else may come after one. A grid has at least ``least`` dots, four or more; of one with more than
-    ``most``, a few more than these are returned. It is grown from ``tries`` dots at most.
+    ``most``, a few more than these are returned. It is grown from ``tries`` dots at most, with two
+    pairs of ``neighbours`` opposite each other.
     """
     if len(points) < 5:
         return
     grown = _Grown(points, alike, follows or alike)
     seen = np.zeros(len(points), dtype=np.bool_)
-    for start, steps in grown.starts():
+    for start, steps in grown.starts(neighbours):
         if seen[start]:
             continue
         found = grown.grow(start, steps, most)
@@ -110,13 +112,13 @@ class _Grown:
     def __post_init__(self) -> None:
         self._tree = load("scipy.spatial").cKDTree(self._points)
 
-    def starts(self) -> Iterator[tuple[int, Array]]:
+    def starts(self, neighbours: int) -> Iterator[tuple[int, Array]]:
         """Yield dots with neighbours on four sides, and the steps (2, 2) to two of them.
 
         Those that have two exactly opposite each other come first.
         """
         points = self._points
-        _, near = self._tree.query(points, min(NEIGHBOURS + 1, len(points)))
+        _, near = self._tree.query(points, min(neighbours + 1, len(points)))
         near = near[:, 1:]
         alike = self._alike(near, np.arange(len(points))[:, None])
         ways = points[near] - points[:, None]

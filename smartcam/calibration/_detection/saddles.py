@@ -36,6 +36,9 @@ LEAST_STEP = 1.0
 MOST_UNLIKE = 0.35
 """Of what a circle's levels have in common with those opposite, what they differ by at most."""
 
+MOST_KEPT = 600
+"""Of those that look like a corner, the strongest ones."""
+
 MOST_LOOKED_AT = 1500
 """Saddles of an image, the strongest ones; so that noise and leaves take no more than others."""
 
@@ -82,6 +85,8 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
     turns = levels @ _TWICE
     swing = np.linalg.norm(turns, axis=1)
     good = _comes_twice(levels) & (swing > LEAST_STEP)
+    if good.sum() > MOST_KEPT:
+        good &= swing >= np.partition(swing[good], -MOST_KEPT)[-MOST_KEPT]
     at = at[good]
     bends = np.stack([part[at[:, 1], at[:, 0]] for part in (xx, xy, xy, yy)], axis=1)
     return Saddles(at + _way(smooth, at, bends), turns[good] / swing[good, None])

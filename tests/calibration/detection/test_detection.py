@@ -12,7 +12,7 @@ import pytest
 
 from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._detection.grid_growing import lattices
+from smartcam.calibration._detection.grid_growing import alike_areas, lattices
 from smartcam.calibration._detection.image import grey_image, scaled
 from smartcam.calibration._detection.ordering import (
     Arrangement,
@@ -315,7 +315,7 @@ GRIDS = [
 
 def laid_out(points: Array) -> NDArray[np.intp]:
     """Return the places (N, 2) of points that are a grid."""
-    (grid,) = lattices(points, np.ones(len(points)), least=len(points), most=len(points))
+    (grid,) = lattices(points, alike_areas(np.ones(len(points))), least=len(points), most=len(points))
     places = np.zeros((len(points), 2), dtype=np.intp)
     places[list(grid.values())] = list(grid)
     return places
