@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.corners import refine_corners
-from smartcam.calibration._detection.image import GreyImage, scaled
+from smartcam.calibration._detection.grid_growing import alike_areas, lattices
+from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
 from smartcam.calibration._geometry.homography import apply_homography, fit_homography, local_steps
 from smartcam.calibration._optional_imports import load
 from smartcam.calibration._views import TargetView
@@ -26,6 +28,12 @@ FEWEST = 4
 
 LARGEST_DOUBLED = 2600
 """Longest side, pixels, of an image that is looked at in double size, too, for small markers."""
+
+LEAST_IN_ROWS = 5
+"""Dark quadrangles in rows and columns that may be a board's markers, at least."""
+
+MOST_TRIES = 16
+"""Of them, from which rows and columns are grown."""
 
 PART = 0.45
 """Of a square around a corner that is fitted."""
@@ -91,16 +99,15 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
 def _numbered(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Array]:
     """Return numbers (N,), ascending, and corners (N, 2).
 
-    Where few are found, the mirror image is looked at as well: a marker's mirror image can be
-    another one of its dictionary, and such neighbours give corners with wrong numbers.
+    Where few are found beside what may be markers, the mirror image is looked at as well: a
+    marker's mirror image can be another one of its dictionary, and such neighbours give corners
+    with wrong numbers.
     """
-    ids, found, markers = _detect(image, target)
-    if 2 * len(ids) > max(len(target.points), 4 * FEWEST):
-        return ids, found
-    flipped = GreyImage(
-        np.ascontiguousarray(image.levels[:, ::-1]), np.ascontiguousarray(image.bytes[:, ::-1])
-    )
-    if len(_detect(flipped, target)[0]) >= max(FEWEST, 2 * len(ids)):
+    seen = _detect(image, target)
+    count = len(seen.ids)
+    if 2 * count > max(len(target.points), 4 * FEWEST):
+        return seen.ids, seen.points
+    if seen.has_markers and len(_detect(_flipped(image), target).ids) >= max(FEWEST, 2 * count):
         raise CalibrationError(
             f"charuco of {target.columns} x {target.rows} squares: expected an image of the sheet "
             "as one reads it, got one that is mirrored",
@@ -108,33 +115,94 @@ def _numbered(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Arra
             expected="the sheet as one reads it",
             got="its mirror image",
         )
-    if len(ids) < FEWEST:
-        doubt = markers and not len(ids) and target.rows % 2 == 0
+    if count < FEWEST:
+        doubt = seen.markers and not count and target.rows % 2 == 0
         legacy = ": is its legacy_pattern right?" if doubt else ""
-        raise _not_found(target, f"beside {markers} of its markers{legacy}", len(ids))
-    return ids, found
+        raise _not_found(target, f"beside {seen.markers} of its markers{legacy}", count)
+    return seen.ids, seen.points
 
 
-def _detect(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Array, int]:
-    """Return numbers (N,), ascending, corners (N, 2), and how many markers were seen."""
+def _flipped(image: GreyImage) -> GreyImage:
+    levels, bytes_ = (np.ascontiguousarray(part[:, ::-1]) for part in image)
+    return GreyImage(levels, bytes_)
+
+
+class _Seen(NamedTuple):
+    """What was found of a board."""
+
+    ids: NDArray[np.intp]  # (N,), ascending
+    points: Array  # (N, 2), pixels
+    markers: int  # how many were read
+    has_markers: bool  # whether some were read, or stand in rows and columns
+
+
+def _detect(image: GreyImage, target: Charuco) -> _Seen:
+    """Find a board in a reduced image, in the given one, and in one that is twice as large.
+
+    The next one is looked at where the one before does not show enough; the last one only where
+    there may be markers that are too small to be read.
+    """
+    best = _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, has_markers=False)
+    times = math.ceil(max(image.size) / USUAL_SIZE)
+    if times > 1:
+        best = _look(reduced(image, times), 1 / times, target, best)
+        if _is_all(best, target, image):
+            return best
+    best = _look(image.bytes, 1.0, target, best)
+    small = max(image.size) <= LARGEST_DOUBLED and 2 * len(best.ids) <= len(target.points)
+    if small and best.has_markers:
+        best = _look(scaled(image, 2.0), 2.0, target, best)
+    return best
+
+
+def _is_all(seen: _Seen, target: Charuco, image: GreyImage) -> bool:
+    """Return whether all corners were found that should be in the image."""
+    if len(seen.ids) < FEWEST:
+        return False
+    matrix = fit_homography(target.points[seen.ids, :2], seen.points)
+    if matrix is None:
+        return False
+    expected = apply_homography(matrix, target.points[:, :2])
+    inside = ((expected >= 0) & (expected <= np.array(image.size) - 1)).all(axis=1)
+    inside[seen.ids] = False
+    return not inside.any()
+
+
+def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Seen) -> _Seen:
+    """Return what an image shows that is ``scale`` times as large, or the best before it."""
     cv2 = load("cv2")
+    board = charuco_board(target)
     given = cv2.aruco.CharucoParameters()
-    given.minMarkers, given.tryRefineMarkers = 1, True
-    detector = cv2.aruco.CharucoDetector(charuco_board(target), given)
-    numbers, found, markers = np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0
-    for scale in (1.0, 2.0):
-        corners, ids, _, seen = detector.detectBoard(scaled(image, scale))
-        markers = max(markers, 0 if seen is None else len(seen))
-        if ids is not None and len(ids) > len(numbers):
-            numbers = np.array(ids, dtype=np.intp).ravel()
-            found = (np.array(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
-        if 2 * len(numbers) > len(target.points) or max(image.size) > LARGEST_DOUBLED:
-            break
+    given.minMarkers = 1
+    finder = cv2.aruco.ArucoDetector(board.getDictionary())
+    quads, numbers, others = finder.detectMarkers(bytes_)
+    has_markers = best.has_markers or numbers is not None or _in_rows([*quads, *others], board)
+    if numbers is None:
+        return best._replace(has_markers=has_markers)
+    quads, numbers, _, _ = finder.refineDetectedMarkers(bytes_, board, quads, numbers, others)
+    detector = cv2.aruco.CharucoDetector(board, given)
+    corners, found, *_ = detector.detectBoard(bytes_, markerCorners=quads, markerIds=numbers)
+    markers = max(best.markers, len(numbers))
+    if found is None or len(found) <= len(best.ids):
+        return best._replace(markers=markers, has_markers=has_markers)
     # OpenCV counts rows from the top
-    row, column = np.divmod(numbers, target.columns - 1)
+    row, column = np.divmod(np.array(found, dtype=np.intp).ravel(), target.columns - 1)
     ids = (target.rows - 2 - row) * (target.columns - 1) + column
+    points = (np.array(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     order = np.argsort(ids)
-    return ids[order], found[order], markers
+    return _Seen(ids[order], points[order], markers, has_markers)
+
+
+def _in_rows(quads: list[Array], board: Any) -> bool:
+    """Return whether dark quadrangles (1, 4, 2) stand in rows and columns as markers do."""
+    if len(quads) < LEAST_IN_ROWS:
+        return False
+    corners = np.array(quads, dtype=np.float64).reshape(-1, 4, 2)
+    diagonals = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    areas = np.abs(diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0])
+    alike = alike_areas(np.maximum(areas / 2, 1.0))
+    most = len(board.getIds())
+    return any(lattices(corners.mean(axis=1), alike, least=LEAST_IN_ROWS, most=most, tries=MOST_TRIES))
 
 
 def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:
