@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 USUAL_SIDE = 800
 """Longest side, pixels, of the image that is looked at first; then at half and at double of it."""
 
-MOST_TRIES = 16
-"""Saddles of an image from which a board is grown."""
-
 NEIGHBOURS = 8
 """Saddles around one among which a board's next ones are: four and what else is near."""
 
@@ -104,13 +101,12 @@ def boards(image: GreyImage, *, most: int) -> Iterator[Board]:
     """Yield the largest board in each size of an image, with ``most`` corners or a few more."""
     usual = math.ceil(max(image.size) / USUAL_SIDE)
     for times in dict.fromkeys((usual, 2 * usual, (usual + 1) // 2)):
-        seen = find_saddles(reduced(image, times))
+        seen = find_saddles(reduced(image.bytes, times))
         grown = lattices(
             seen.points,
             seen.alike,
             least=4,
             most=most,
-            tries=MOST_TRIES,
             neighbours=NEIGHBOURS,
         )
         found = max(grown, key=len, default=None)

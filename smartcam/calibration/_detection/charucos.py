@@ -32,9 +32,6 @@ LARGEST_DOUBLED = 2600
 LEAST_IN_ROWS = 5
 """Dark quadrangles in rows and columns that may be a board's markers, at least."""
 
-MOST_TRIES = 16
-"""Of them, from which rows and columns are grown."""
-
 PART = 0.45
 """Of a square around a corner that is fitted."""
 
@@ -145,7 +142,7 @@ def _detect(image: GreyImage, target: Charuco) -> _Seen:
     best = _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, has_markers=False)
     times = math.ceil(max(image.size) / USUAL_SIZE)
     if times > 1:
-        best = _look(reduced(image, times), 1 / times, target, best)
+        best = _look(reduced(image.bytes, times), 1 / times, target, best)
         if _is_all(best, target, image):
             return best
     best = _look(image.bytes, 1.0, target, best)
@@ -202,7 +199,7 @@ def _in_rows(quads: list[Array], board: Any) -> bool:
     areas = np.abs(diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0])
     alike = alike_areas(np.maximum(areas / 2, 1.0))
     most = len(board.getIds())
-    return any(lattices(corners.mean(axis=1), alike, least=LEAST_IN_ROWS, most=most, tries=MOST_TRIES))
+    return any(lattices(corners.mean(axis=1), alike, least=LEAST_IN_ROWS, most=most))
 
 
 def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:

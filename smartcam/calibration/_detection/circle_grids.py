@@ -9,15 +9,15 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from smartcam.calibration._codes import Code
-from smartcam.calibration._detection.blobs import dark_spots
+from smartcam.calibration._detection.blobs import dark_pieces
 from smartcam.calibration._detection.dots import GridMap, refine_dots
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, scaled
+from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
 from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._geometry.homography import local_steps
@@ -29,15 +29,25 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._detection.blobs import Spots
+    from smartcam.calibration._detection.blobs import Pieces, Spots
     from smartcam.calibration._detection.dots import Dots
     from smartcam.calibration._detection.ordering import Arrangement
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import CircleGrid
 
-LOOKS: Final = ((1, 1.0), (1, 0.3), (2, 0.3))
-"""How an image is looked at: its size in parts of the usual one, and the side of the square that a
-pixel is compared with, in distances between dots of a grid that fills the image."""
+WIDE, NARROW = 1.0, 0.3
+"""Side of the square that a pixel is compared with, in distances between dots of a grid that fills
+the image."""
+
+SMALL_SIDE = 800
+"""Longest side of the image in which a grid is looked for first, pixels."""
+
+LEAST_PART = 0.4
+"""Of the dots of a grid that stand in rows and columns among those of a few pixels, at least. So
+many of them are still told apart where all of them are in an image twice as large."""
+
+NEIGHBOURS = 8
+"""Of a dot of a few pixels, among which a grid's next ones are."""
 
 MORE_SPOTS = 1000
 """Beside twice the dots of the target: of an image with more, the largest are looked at."""
@@ -81,19 +91,45 @@ def _grids(
 
     They are dark in the image that comes with them, which is the given one or its negative.
     """
-    usual = min(1.0, USUAL_SIZE / max(image.size))
-    negative = GreyImage(255 - image.levels, 255 - image.bytes)
-    for (times, part), inked in itertools.product(LOOKS, (image, negative)):
-        looked_at = scaled(inked, times * usual)
-        around = round(part * max(looked_at.shape) / _longest(target))
-        spots = dark_spots(looked_at, around, most=MORE_SPOTS + 2 * len(target.points))
-        if seen.spots is None:
-            seen.spots = len(spots.areas)
+    for inked, scale, spots in _looks(image, target):
         for points, places in _laid_out(spots, target, seen):
-            found = (points + 0.5) / (times * usual) - 0.5
+            found = (points + 0.5) / scale - 0.5
             ways = arrangements(found, places, target)
             if ways and _is_flat(target, found[ways[0].order.ravel()]):
                 yield inked, found, ways
+
+
+def _looks(image: GreyImage, target: CircleGrid) -> Iterator[tuple[GreyImage, float, Spots]]:
+    """Yield the dark spots of an image and of its negative, and how large these were looked at.
+
+    A large image is looked at in a small size first, and any one in double size where there may be
+    dots of a few pixels.
+    """
+    both = image, GreyImage(255 - image.levels, 255 - image.bytes)
+    times, usual = math.ceil(max(image.size) / SMALL_SIDE), min(1.0, USUAL_SIZE / max(image.size))
+    most = MORE_SPOTS + 2 * len(target.points)
+    if times > 1:
+        for inked in both:
+            yield inked, 1 / times, _pieces(reduced(inked.bytes, times), WIDE, target).spots(most)
+    fine = [False, False]
+    for part, (number, inked) in itertools.product((WIDE, NARROW), enumerate(both)):
+        pieces = _pieces(scaled(inked, usual), part, target)
+        yield inked, usual, pieces.spots(most)
+        fine[number] = part == NARROW and _may_be_dots(pieces.specks(), target)
+    for inked in itertools.compress(both, fine):
+        pieces = _pieces(scaled(inked, 2 * usual), NARROW, target)
+        yield inked, 2 * usual, pieces.spots(most)
+
+
+def _pieces(bytes_: NDArray[np.uint8], part: float, target: CircleGrid) -> Pieces:
+    return dark_pieces(bytes_, round(part * max(bytes_.shape) / _longest(target)))
+
+
+def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:
+    """Return whether a good part of a grid may be among dots of a few pixels."""
+    least = max(4, round(LEAST_PART * len(target.points)))
+    alike = alike_areas(specks.areas)
+    return any(lattices(specks.points, alike, least=least, most=least, neighbours=NEIGHBOURS))
 
 
 def _laid_out(
@@ -101,6 +137,10 @@ def _laid_out(
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
     """Yield as many dots (N, 2) in rows and columns as the target has, and their places (N, 2)."""
     count = target.columns * target.rows
+    if seen.spots is None:
+        seen.spots = len(spots.areas)
+    elif len(spots.areas) < count:
+        return
     larger = ((target.origin_diameter or target.diameter) / target.diameter) ** 2
     like, larger_like = alike_areas(spots.areas), alike_areas(spots.areas, larger)
 

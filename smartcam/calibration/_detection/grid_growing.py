@@ -44,8 +44,9 @@ REGULAR = 0.08
 """Of a step, from where a flat grid has its dots to where they are, in the median at most: lenses
 bend one of less than 20 dots less."""
 
-MOST_TRIES = 50
-"""Dots from which a grid is grown."""
+MOST_TRIES = 16
+"""Dots from which a grid is grown. Those of a grid stand opposite each other more exactly than what
+stands so by chance, so the first one is one of them as a rule."""
 
 Place = tuple[int, int]
 
@@ -65,18 +66,18 @@ def lattices(
     least: int,
     most: int,
     follows: Alike | None = None,
-    tries: int = MOST_TRIES,
     neighbours: int = NEIGHBOURS,
 ) -> Iterator[Lattice]:
     """Yield grids, each of dots that hang together.
 
     ``alike`` tells which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
     else may come after one. A grid has at least ``least`` dots, four or more; of one with more than
-    ``most``, a few more than these are returned. It is grown from ``tries`` dots at most, with two
-    pairs of ``neighbours`` opposite each other.
+    ``most``, a few more than these are returned. It is grown from dots that have two pairs of their
+    next ``neighbours`` opposite each other, of which no more than MOST_TRIES are tried.
     """
     if len(points) < 5:
         return
+    tries = MOST_TRIES
     grown = _Grown(points, alike, follows or alike)
     seen = np.zeros(len(points), dtype=np.bool_)
     for start, steps in grown.starts(neighbours):
@@ -122,9 +123,13 @@ class _Grown:
         near = near[:, 1:]
         alike = self._alike(near, np.arange(len(points))[:, None])
         ways = points[near] - points[:, None]
-        lengths = np.maximum(np.linalg.norm(ways, axis=2), 1e-9)
-        apart = np.linalg.norm(ways[:, :, None] + ways[:, None], axis=3)
-        apart /= np.minimum(lengths[:, :, None], lengths[:, None])
+        # |a + b|^2 = |a|^2 + |b|^2 + 2 a b, all pairs by one product
+        products = ways @ ways.transpose(0, 2, 1)
+        squares = np.maximum(np.einsum("nii->ni", products), 1e-18)
+        apart = squares[:, :, None] + squares[:, None] + 2 * products
+        apart = np.sqrt(
+            np.maximum(apart, 0) / np.minimum(squares[:, :, None], squares[:, None])
+        )
         apart[~(alike[:, :, None] & alike[:, None])] = np.inf
         best = apart.min(axis=(1, 2))
         for index in np.argsort(best)[: int((best < OPPOSITE).sum())].tolist():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,9 @@ USUAL_SIZE = 1600
 
 In a larger one it takes seconds and finds less.
 """
+
+
+Level = TypeVar("Level", np.uint8, np.float32)
 
 
 class GreyImage(NamedTuple):
@@ -85,15 +88,15 @@ def scaled(image: GreyImage, scale: float) -> NDArray[np.uint8]:
     return bytes_
 
 
-def reduced(image: GreyImage, times: int) -> NDArray[np.uint8]:
-    """Return an image's bytes whose pixels are the means of ``times`` by ``times`` of them.
+def reduced(levels: NDArray[Level], times: int) -> NDArray[Level]:
+    """Return levels (H, W) each of which is the mean of ``times`` by ``times`` of the given ones.
 
-    A place ``p`` of it is ``(p + 0.5) * times - 0.5`` in the image.
+    A place ``p`` among them is ``(p + 0.5) * times - 0.5`` in the image.
     """
     if times == 1:
-        return image.bytes
+        return levels
     cv2 = load("cv2")
-    width, height = (side // times for side in image.size)
-    cut = image.bytes[: height * times, : width * times]
-    bytes_: NDArray[np.uint8] = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
-    return bytes_
+    height, width = (side // times for side in levels.shape)
+    cut = levels[: height * times, : width * times]
+    smaller: NDArray[Level] = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
+    return smaller
