@@ -44,9 +44,15 @@ REGULAR = 0.08
 """Of a step, from where a flat grid has its dots to where they are, in the median at most: lenses
 bend one of less than 20 dots less."""
 
-MOST_TRIES = 16
-"""Dots from which a grid is grown. Those of a grid stand opposite each other more exactly than what
-stands so by chance, so the first one is one of them as a rule."""
+MOST_RANKED = 128
+"""Dots with the best two opposite each other, among which those are chosen that have four."""
+
+MOST_TRIES = 8
+"""Of these, from which a grid is grown. A grid's dots stand opposite each other more exactly than
+what stands so by chance, so the first one is one of them as a rule."""
+
+LEAST_AROUND = 8
+"""Dots within two steps of one, itself among them, or it is no grid's: within one there are nine."""
 
 Place = tuple[int, int]
 
@@ -86,6 +92,7 @@ def lattices(
         found = grown.grow(start, steps, most)
         seen[list(found.values())] = True
         if len(found) >= least and _is_regular(points, found):
+            grown.complete(found, most)
             yield found
         tries -= 1
         if tries == 0:
@@ -116,7 +123,7 @@ class _Grown:
     def starts(self, neighbours: int) -> Iterator[tuple[int, Array]]:
         """Yield dots with neighbours on four sides, and the steps (2, 2) to two of them.
 
-        Those that have two exactly opposite each other come first.
+        Those whose neighbours are exactly opposite each other come first.
         """
         points = self._points
         _, near = self._tree.query(points, min(neighbours + 1, len(points)))
@@ -132,7 +139,9 @@ class _Grown:
         )
         apart[~(alike[:, :, None] & alike[:, None])] = np.inf
         best = apart.min(axis=(1, 2))
-        for index in np.argsort(best)[: int((best < OPPOSITE).sum())].tolist():
+        ranked = np.argsort(best)[: min(MOST_RANKED, int((best < OPPOSITE).sum()))]
+        worse = _across(ways[ranked], apart[ranked])
+        for index in ranked[np.argsort(worse)][: int((worse < OPPOSITE).sum())].tolist():
             ahead, behind = np.nonzero(np.triu(apart[index] < OPPOSITE))
             steps = (ways[index, ahead] - ways[index, behind]) / 2
             steps = steps[np.argsort(np.linalg.norm(steps, axis=1))]
@@ -149,7 +158,11 @@ class _Grown:
         taken = {start}
         # each with the steps from it, and the one that those after it are like
         reached = [((0, 0), start, steps, start)]
+        waves = 0
         while reached and len(places) <= most:
+            if waves == 2 and len(places) < LEAST_AROUND:
+                break
+            waves += 1
             around = self._around(reached)
             wave, reached = reached, []
             for (here, dot, steps, like), sides in zip(wave, around, strict=True):
@@ -167,6 +180,32 @@ class _Grown:
                     reached.append((there, free, step, free if own else like))
         return places
 
+    def complete(self, places: Lattice, most: int) -> None:
+        """Add the dots next to a grid that are where all of its dots say that they are.
+
+        Far from the start and near the horizon the last step alone says it less well.
+        """
+        added = True
+        while added and len(places) <= most:
+            added = False
+            mapped = GridMap(np.array(list(places), float), self._points[list(places.values())])
+            taken = set(places.values())
+            next_to = {
+                (x + column, y + row): dot
+                for (x, y), dot in places.items()
+                for column, row in _AROUND
+                if (x + column, y + row) not in places
+            }
+            at = np.array(list(next_to), dtype=np.float64)
+            longest = NEAR * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(axis=1)
+            off, near = self._tree.query(mapped(at))
+            fits = (off < longest) & self._follows(near, np.array(list(next_to.values())))
+            for place, dot, fit in zip(next_to, near.tolist(), fits.tolist(), strict=True):
+                if fit and dot not in taken:
+                    places[place] = dot
+                    taken.add(dot)
+                    added = True
+
     def _around(self, reached: list[tuple[Place, int, Array, int]]) -> list[list[list[int]]]:
         """Return for each dot and each of its four sides the dots that may be next there."""
         dots = np.array([dot for _, dot, _, _ in reached])
@@ -181,6 +220,20 @@ class _Grown:
             [[dot for dot, fit in zip(*side, strict=True) if fit] for side in zip(*one, strict=True)]
             for one in zip(near.tolist(), fits.tolist(), strict=True)
         ]
+
+
+def _across(ways: Array, apart: Array) -> Array:
+    """Return how far apart (N,) the best two opposites are that lie across the best two of all.
+
+    ``ways`` (N, K, 2) lead to neighbours, two of which are ``apart`` (N, K, K) from being opposite.
+    """
+    count, around, _ = apart.shape
+    between = (ways[:, :, None] - ways[:, None]).reshape(count, around * around, 2)
+    between /= np.maximum(np.linalg.norm(between, axis=2, keepdims=True), 1e-9)
+    flat = apart.reshape(count, around * around)
+    first = between[np.arange(count), flat.argmin(axis=1)][:, None]
+    sine = np.abs(between[:, :, 0] * first[:, :, 1] - between[:, :, 1] * first[:, :, 0])
+    return np.asarray(np.where(sine > LEAST_SINE, flat, np.inf).min(axis=1))
 
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
