@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from smartcam.calibration._detection.grid_growing import Lattice
     from smartcam.calibration._detection.image import GreyImage
     from smartcam.calibration._geometry.rotations import Array
 
@@ -97,22 +98,24 @@ def parity(places: NDArray[np.intp]) -> Array:
     return np.where(places.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
-def boards(image: GreyImage, *, most: int) -> Iterator[Board]:
-    """Yield the largest board in each size of an image, with ``most`` corners or a few more."""
+def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
+    """Yield the largest board in each size of an image, with ``most`` corners or some more.
+
+    The search in a size ends with the first one of ``count`` corners or more.
+    """
     usual = math.ceil(max(image.size) / USUAL_SIDE)
     for times in dict.fromkeys((usual, 2 * usual, (usual + 1) // 2)):
         seen = find_saddles(reduced(image.bytes, times))
-        grown = lattices(
-            seen.points,
-            seen.alike,
-            least=4,
-            most=most,
-            neighbours=NEIGHBOURS,
-        )
-        found = max(grown, key=len, default=None)
-        if found:
-            points = (seen.points[list(found.values())] + 0.5) * times - 0.5
-            yield Board(points, np.array(list(found), dtype=np.intp)).trimmed()
+        largest: Lattice = {}
+        for found in lattices(
+            seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS
+        ):
+            largest = max(largest, found, key=len)
+            if len(largest) >= count:
+                break
+        if largest:
+            points = (seen.points[list(largest.values())] + 0.5) * times - 0.5
+            yield Board(points, np.array(list(largest), dtype=np.intp)).trimmed()
 
 
 def completed(image: GreyImage, board: Board) -> Board | None:

@@ -90,7 +90,7 @@ def _candidates(image: GreyImage, target: Checkerboard, seen: _Seen) -> Iterator
     The latter take much longer and are asked only where a part of such a board is seen.
     """
     count = target.columns * target.rows
-    for board in boards(image, most=(target.columns + 2) * (target.rows + 2)):
+    for board in boards(image, count, most=(target.columns + 2) * (target.rows + 2)):
         found = board.by_rows(target.columns, target.rows)
         if found is not None:
             yield found
