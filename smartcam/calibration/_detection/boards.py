@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from smartcam.calibration._geometry.rotations import Array
 
 USUAL_SIDE = 800
-"""Longest side, pixels, of the image that is looked at first; then at half and at double of it."""
+"""Longest side, pixels, of the image that is looked at in half of this size first, then in this,
+and then in double size, as far as it is as large."""
 
 NEIGHBOURS = 8
 """Saddles around one among which a board's next ones are: four and what else is near."""
@@ -103,13 +104,11 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
 
     The search in a size ends with the first one of ``count`` corners or more.
     """
-    usual = math.ceil(max(image.size) / USUAL_SIDE)
-    for times in dict.fromkeys((usual, 2 * usual, (usual + 1) // 2)):
+    least = math.ceil(max(image.size) / USUAL_SIDE)
+    for times in dict.fromkeys((2 * least, least, (least + 1) // 2)):
         seen = find_saddles(reduced(image.bytes, times))
         largest: Lattice = {}
-        for found in lattices(
-            seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS
-        ):
+        for found in lattices(seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS):
             largest = max(largest, found, key=len)
             if len(largest) >= count:
                 break

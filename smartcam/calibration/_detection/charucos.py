@@ -120,8 +120,9 @@ def _numbered(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Arra
 
 
 def _flipped(image: GreyImage) -> GreyImage:
-    levels, bytes_ = (np.ascontiguousarray(part[:, ::-1]) for part in image)
-    return GreyImage(levels, bytes_)
+    return GreyImage(
+        np.ascontiguousarray(image.levels[:, ::-1]), np.ascontiguousarray(image.bytes[:, ::-1])
+    )
 
 
 class _Seen(NamedTuple):
@@ -148,7 +149,7 @@ def _detect(image: GreyImage, target: Charuco) -> _Seen:
     best = _look(image.bytes, 1.0, target, best)
     small = max(image.size) <= LARGEST_DOUBLED and 2 * len(best.ids) <= len(target.points)
     if small and best.has_markers:
-        best = _look(scaled(image, 2.0), 2.0, target, best)
+        best = _look(scaled(image.bytes, 2.0), 2.0, target, best)
     return best
 
 
@@ -161,8 +162,7 @@ def _is_all(seen: _Seen, target: Charuco, image: GreyImage) -> bool:
         return False
     expected = apply_homography(matrix, target.points[:, :2])
     inside = ((expected >= 0) & (expected <= np.array(image.size) - 1)).all(axis=1)
-    inside[seen.ids] = False
-    return not inside.any()
+    return bool(np.isin(np.flatnonzero(inside), seen.ids).all())
 
 
 def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Seen) -> _Seen:
@@ -196,7 +196,9 @@ def _in_rows(quads: list[Array], board: Any) -> bool:
         return False
     corners = np.array(quads, dtype=np.float64).reshape(-1, 4, 2)
     diagonals = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-    areas = np.abs(diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0])
+    areas = np.abs(
+        diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0]
+    )
     alike = alike_areas(np.maximum(areas / 2, 1.0))
     most = len(board.getIds())
     return any(lattices(corners.mean(axis=1), alike, least=LEAST_IN_ROWS, most=most))

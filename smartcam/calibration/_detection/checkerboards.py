@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -90,21 +91,22 @@ def _candidates(image: GreyImage, target: Checkerboard, seen: _Seen) -> Iterator
     The latter take much longer and are asked only where a part of such a board is seen.
     """
     count = target.columns * target.rows
+    parts = []
     for board in boards(image, count, most=(target.columns + 2) * (target.rows + 2)):
         found = board.by_rows(target.columns, target.rows)
         if found is not None:
             yield found
-        if min(board.shape) < 3 or len(board.places) < min(LEAST_SEEN, LEAST_FITTED * count):
-            continue
+        if min(board.shape) >= 3 and len(board.places) >= min(LEAST_SEEN, LEAST_FITTED * count):
+            parts.append(board)
+    for board in sorted(parts, key=lambda part: -len(part.places)):
         whole = completed(image, board)
         if whole is None:
             continue
-        if seen.shape is None or np.prod(whole.shape) > np.prod(seen.shape):
-            seen.shape, seen.other = whole.shape, whole.is_full
         found = whole.by_rows(target.columns, target.rows)
         if found is not None:
-            seen.other = False
             yield found
+        if seen.shape is None or math.prod(whole.shape) > math.prod(seen.shape):
+            seen.shape, seen.other = whole.shape, found is None and whole.is_full
     if seen.shape is not None and not seen.other:
         yield from _opencvs(image, target)
 
@@ -123,7 +125,7 @@ def _opencvs(image: GreyImage, target: Checkerboard) -> Iterator[Array]:
         (2 * usual, cv2.findChessboardCornersSB, sector),
     ]
     for scale, find, flags in attempts:
-        ok, corners = find(scaled(image, scale), pattern, flags=flags)
+        ok, corners = find(scaled(image.bytes, scale), pattern, flags=flags)
         if ok and len(corners) == target.columns * target.rows:
             found: Array = np.array(corners, dtype=np.float64).reshape(-1, 2)
             yield (found + 0.5) / scale - 0.5
@@ -194,8 +196,27 @@ def _number(
             return float(dark + (light - dark) * part)
 
         return marked(ways, level, f"{what} with a dark area at the origin{note}")
-    black = [way for way in ways if way.proper and _blackness(target, corners, way) > 0]
+    proper = [way for way in ways if way.proper]
+    black = [way for way in proper if _blackness(target, corners, way) > 0]
+    if proper and not black and target.columns % 2 == target.rows % 2 == 1:
+        raise _white_origin(target, what)
     return leftmost(black or ways, what), None
+
+
+def _white_origin(target: Checkerboard, what: str) -> CalibrationError:
+    """Return an error of a board whose black corners are where the target's white ones are.
+
+    Of counts that are both odd and differ, two corners that lie opposite each other are black, and
+    turning the sheet exchanges no black one with a white one.
+    """
+    return CalibrationError(
+        f"{what}: expected a black square outside of the corner at the origin, got a white one: "
+        "an image that is mirrored, or a negative, or the board is one of "
+        f"{target.rows} x {target.columns}",
+        code=Code.MIRRORED,
+        expected="a black square",
+        got="a white one",
+    )
 
 
 class _Shades(NamedTuple):

@@ -91,38 +91,46 @@ def _grids(
 
     They are dark in the image that comes with them, which is the given one or its negative.
     """
-    for inked, scale, spots in _looks(image, target):
+    for light, scale, spots in _looks(image.bytes, target):
         for points, places in _laid_out(spots, target, seen):
             found = (points + 0.5) / scale - 0.5
             ways = arrangements(found, places, target)
             if ways and _is_flat(target, found[ways[0].order.ravel()]):
-                yield inked, found, ways
+                yield _negative(image) if light else image, found, ways
 
 
-def _looks(image: GreyImage, target: CircleGrid) -> Iterator[tuple[GreyImage, float, Spots]]:
-    """Yield the dark spots of an image and of its negative, and how large these were looked at.
+def _negative(image: GreyImage) -> GreyImage:
+    return GreyImage(255 - image.levels, 255 - image.bytes)
+
+
+def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool, float, Spots]]:
+    """Yield whether it is the negative of an image, its size in parts of the given one, and spots.
 
     A large image is looked at in a small size first, and any one in double size where there may be
     dots of a few pixels.
     """
-    both = image, GreyImage(255 - image.levels, 255 - image.bytes)
-    times, usual = math.ceil(max(image.size) / SMALL_SIDE), min(1.0, USUAL_SIZE / max(image.size))
+    longest = max(image.shape)
+    times, usual = math.ceil(longest / SMALL_SIDE), min(1.0, USUAL_SIZE / longest)
     most = MORE_SPOTS + 2 * len(target.points)
     if times > 1:
-        for inked in both:
-            yield inked, 1 / times, _pieces(reduced(inked.bytes, times), WIDE, target).spots(most)
-    fine = [False, False]
-    for part, (number, inked) in itertools.product((WIDE, NARROW), enumerate(both)):
-        pieces = _pieces(scaled(inked, usual), part, target)
-        yield inked, usual, pieces.spots(most)
-        fine[number] = part == NARROW and _may_be_dots(pieces.specks(), target)
-    for inked in itertools.compress(both, fine):
-        pieces = _pieces(scaled(inked, 2 * usual), NARROW, target)
-        yield inked, 2 * usual, pieces.spots(most)
+        small = reduced(image, times)
+        for light in (False, True):
+            yield light, 1 / times, _pieces(small, light, WIDE, target).spots(most)
+    looked_at = scaled(image, usual)
+    fine = []
+    for part, light in itertools.product((WIDE, NARROW), (False, True)):
+        pieces = _pieces(looked_at, light, part, target)
+        yield light, usual, pieces.spots(most)
+        if part == NARROW and _may_be_dots(pieces.specks(), target):
+            fine.append(light)
+    for light in fine:
+        pieces = _pieces(scaled(image, 2 * usual), light, NARROW, target)
+        yield light, 2 * usual, pieces.spots(most)
 
 
-def _pieces(bytes_: NDArray[np.uint8], part: float, target: CircleGrid) -> Pieces:
-    return dark_pieces(bytes_, round(part * max(bytes_.shape) / _longest(target)))
+def _pieces(image: NDArray[np.uint8], light: bool, part: float, target: CircleGrid) -> Pieces:
+    around = round(part * max(image.shape) / _longest(target))
+    return dark_pieces(255 - image if light else image, around)
 
 
 def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:

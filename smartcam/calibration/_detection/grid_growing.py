@@ -52,7 +52,7 @@ MOST_TRIES = 8
 what stands so by chance, so the first one is one of them as a rule."""
 
 LEAST_AROUND = 8
-"""Dots within two steps of one, itself among them, or it is no grid's: within one there are nine."""
+"""Dots that are reached by two steps from a grid's dot at least, itself among them."""
 
 Place = tuple[int, int]
 
@@ -134,9 +134,7 @@ class _Grown:
         products = ways @ ways.transpose(0, 2, 1)
         squares = np.maximum(np.einsum("nii->ni", products), 1e-18)
         apart = squares[:, :, None] + squares[:, None] + 2 * products
-        apart = np.sqrt(
-            np.maximum(apart, 0) / np.minimum(squares[:, :, None], squares[:, None])
-        )
+        apart = np.sqrt(np.maximum(apart, 0) / np.minimum(squares[:, :, None], squares[:, None]))
         apart[~(alike[:, :, None] & alike[:, None])] = np.inf
         best = apart.min(axis=(1, 2))
         ranked = np.argsort(best)[: min(MOST_RANKED, int((best < OPPOSITE).sum()))]
@@ -217,7 +215,10 @@ class _Grown:
         fits = off < NEAR * np.linalg.norm(ways, axis=2)[:, :, None]
         fits &= self._follows(near, like[:, None, None])
         return [
-            [[dot for dot, fit in zip(*side, strict=True) if fit] for side in zip(*one, strict=True)]
+            [
+                [dot for dot, fit in zip(*side, strict=True) if fit]
+                for side in zip(*one, strict=True)
+            ]
             for one in zip(near.tolist(), fits.tolist(), strict=True)
         ]
 

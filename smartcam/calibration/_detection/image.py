@@ -73,19 +73,17 @@ def grey_image(image: Any) -> GreyImage:
     return GreyImage(levels, np.rint(levels).astype(np.uint8))
 
 
-def scaled(image: GreyImage, scale: float) -> NDArray[np.uint8]:
-    """Return an image's bytes, ``scale`` times as wide and high.
+def scaled(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
+    """Return an image, ``scale`` times as wide and high.
 
     A place ``p`` of it is ``(p + 0.5) / scale - 0.5`` in the image.
     """
     if scale == 1.0:
-        return image.bytes
+        return image
     cv2 = load("cv2")
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    bytes_: NDArray[np.uint8] = cv2.resize(
-        image.bytes, None, fx=scale, fy=scale, interpolation=kind
-    )
-    return bytes_
+    other: NDArray[np.uint8] = cv2.resize(image, None, fx=scale, fy=scale, interpolation=kind)
+    return other
 
 
 def reduced(levels: NDArray[Level], times: int) -> NDArray[Level]:

@@ -9,7 +9,7 @@ import pytest
 from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.blobs import dark_spots
 from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._detection.grid_growing import lattices
+from smartcam.calibration._detection.grid_growing import alike_areas, lattices
 from smartcam.calibration._geometry.homography import apply_homography, fit_homography
 from smartcam.calibration._printing.sheets import make_sheet
 from smartcam.calibration._targets import CircleGrid
@@ -147,7 +147,7 @@ def test_lattices_among_other_dots_have_each_of_the_grid() -> None:
     pixels = drawn(PLAIN, tilt=50, roll=30).pixels
     others = np.random.default_rng(4).uniform([0, 380], [100, 480], (30, 2))
     points = np.vstack([others, pixels])
-    (grid,) = lattices(points, np.ones(len(points)), least=20, most=60)
+    (grid,) = lattices(points, alike_areas(np.ones(len(points))), least=20, most=60)
     assert sorted(grid.values()) == list(range(30, 78))
     places = np.array(list(grid), dtype=np.float64)
     matrix = fit_homography(places, points[list(grid.values())])
@@ -158,11 +158,13 @@ def test_lattices_among_other_dots_have_each_of_the_grid() -> None:
 
 def test_lattices_of_larger_grids_end_with_dots_too_many() -> None:
     pixels = drawn(PLAIN).pixels
-    assert {len(one) for one in lattices(pixels, np.ones(48), least=9, most=20)} >= {21}
+    assert {len(one) for one in lattices(pixels, alike_areas(np.ones(48)), least=9, most=20)} >= {
+        21
+    }
     uneven = np.where(np.arange(48) % 2, 1.0, 3.0)
-    assert list(lattices(pixels, uneven, least=25, most=48)) == []
+    assert list(lattices(pixels, alike_areas(uneven), least=25, most=48)) == []
 
 
 def test_lattices_of_few_points_are_none() -> None:
-    assert list(lattices(np.zeros((4, 2)), np.ones(4), least=4, most=9)) == []
-    assert list(lattices(np.zeros((9, 2)), np.ones(9), least=4, most=9)) == []
+    assert list(lattices(np.zeros((4, 2)), alike_areas(np.ones(4)), least=4, most=9)) == []
+    assert list(lattices(np.zeros((9, 2)), alike_areas(np.ones(9)), least=4, most=9)) == []
