@@ -18,6 +18,8 @@ from smartcam.calibration._views import TargetView
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from smartcam.calibration._geometry.rotations import Array
@@ -31,6 +33,10 @@ LARGEST_DOUBLED = 2600
 
 LEAST_IN_ROWS = 5
 """Dark quadrangles in rows and columns that may be a board's markers, at least."""
+
+LEAST_READ, MOST_UNREAD = 0.6, 4.0
+"""Pixels of a module of a marker: with fewer it is not read in double size, either; with more there
+is none, where none was read."""
 
 PART = 0.45
 """Of a square around a corner that is fitted."""
@@ -104,7 +110,7 @@ def _numbered(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Arra
     count = len(seen.ids)
     if 2 * count > max(len(target.points), 4 * FEWEST):
         return seen.ids, seen.points
-    if seen.has_markers and len(_detect(_flipped(image), target).ids) >= max(FEWEST, 2 * count):
+    if seen.side and len(_detect(_flipped(image), target).ids) >= max(FEWEST, 2 * count):
         raise CalibrationError(
             f"charuco of {target.columns} x {target.rows} squares: expected an image of the sheet "
             "as one reads it, got one that is mirrored",
@@ -131,7 +137,9 @@ class _Seen(NamedTuple):
     ids: NDArray[np.intp]  # (N,), ascending
     points: Array  # (N, 2), pixels
     markers: int  # how many were read
-    has_markers: bool  # whether some were read, or stand in rows and columns
+    # of what may be markers, pixels of the given image: of those that were read, or of quadrangles
+    # in rows and columns; 0: there are none
+    side: float
 
 
 def _detect(image: GreyImage, target: Charuco) -> _Seen:
@@ -140,15 +148,15 @@ def _detect(image: GreyImage, target: Charuco) -> _Seen:
     The next one is looked at where the one before does not show enough; the last one only where
     there may be markers that are too small to be read.
     """
-    best = _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, has_markers=False)
+    best = _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0.0)
     times = math.ceil(max(image.size) / USUAL_SIZE)
     if times > 1:
         best = _look(reduced(image.bytes, times), 1 / times, target, best)
         if _is_all(best, target, image):
             return best
     best = _look(image.bytes, 1.0, target, best)
-    small = max(image.size) <= LARGEST_DOUBLED and 2 * len(best.ids) <= len(target.points)
-    if small and best.has_markers:
+    few = max(image.size) <= LARGEST_DOUBLED and 2 * len(best.ids) <= len(target.points)
+    if few and (best.markers or 0 < best.side < MOST_UNREAD * _modules(charuco_board(target))):
         best = _look(scaled(image.bytes, 2.0), 2.0, target, best)
     return best
 
@@ -173,35 +181,53 @@ def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Seen)
     given.minMarkers = 1
     finder = cv2.aruco.ArucoDetector(board.getDictionary())
     quads, numbers, others = finder.detectMarkers(bytes_)
-    has_markers = best.has_markers or numbers is not None or _in_rows([*quads, *others], board)
+    side = _side(quads) if numbers is not None else _side_in_rows(others, board)
+    best = best._replace(side=max(best.side, side / scale))
     if numbers is None:
-        return best._replace(has_markers=has_markers)
+        return best
     quads, numbers, _, _ = finder.refineDetectedMarkers(bytes_, board, quads, numbers, others)
     detector = cv2.aruco.CharucoDetector(board, given)
     corners, found, *_ = detector.detectBoard(bytes_, markerCorners=quads, markerIds=numbers)
     markers = max(best.markers, len(numbers))
     if found is None or len(found) <= len(best.ids):
-        return best._replace(markers=markers, has_markers=has_markers)
+        return best._replace(markers=markers)
     # OpenCV counts rows from the top
     row, column = np.divmod(np.array(found, dtype=np.intp).ravel(), target.columns - 1)
     ids = (target.rows - 2 - row) * (target.columns - 1) + column
     points = (np.array(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     order = np.argsort(ids)
-    return _Seen(ids[order], points[order], markers, has_markers)
+    return _Seen(ids[order], points[order], markers, best.side)
 
 
-def _in_rows(quads: list[Array], board: Any) -> bool:
-    """Return whether dark quadrangles (1, 4, 2) stand in rows and columns as markers do."""
-    if len(quads) < LEAST_IN_ROWS:
-        return False
+def _modules(board: Any) -> int:
+    """Return how many squares a side of a marker has, its black rim among them."""
+    return int(board.getDictionary().markerSize) + 2
+
+
+def _areas(quads: Sequence[Array]) -> Array:
     corners = np.array(quads, dtype=np.float64).reshape(-1, 4, 2)
-    diagonals = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-    areas = np.abs(
-        diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0]
-    )
-    alike = alike_areas(np.maximum(areas / 2, 1.0))
+    (a, b), (c, d) = (corners[:, 2] - corners[:, 0]).T, (corners[:, 3] - corners[:, 1]).T
+    areas: Array = np.maximum(np.abs(a * d - b * c) / 2, 1.0)
+    return areas
+
+
+def _side(quads: Sequence[Array]) -> float:
+    return float(np.sqrt(np.median(_areas(quads))))
+
+
+def _side_in_rows(quads: Sequence[Array], board: Any) -> float:
+    """Return the side of dark quadrangles (1, 4, 2) that stand in rows and columns as markers do.
+
+    0: there are none, or too small ones for a marker that can be read.
+    """
+    if len(quads) < LEAST_IN_ROWS:
+        return 0.0
+    areas = _areas(quads)
+    middles = np.array(quads, dtype=np.float64).reshape(-1, 4, 2).mean(axis=1)
     most = len(board.getIds())
-    return any(lattices(corners.mean(axis=1), alike, least=LEAST_IN_ROWS, most=most))
+    found = lattices(middles, alike_areas(areas), least=LEAST_IN_ROWS, most=most)
+    sides = [_side([quads[one] for one in grid.values()]) for grid in found]
+    return max((side for side in sides if side > LEAST_READ * _modules(board)), default=0.0)
 
 
 def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:

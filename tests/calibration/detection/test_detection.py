@@ -164,13 +164,6 @@ def test_find_target_margin_is_the_marks_contrast(target: Target) -> None:
     assert 140 < view.margin < 181
 
 
-@pytest.mark.parametrize("target", [DARK, DOTS], ids=repr)
-def test_find_target_in_mirror_image_is_refused(target: Target) -> None:
-    image = np.ascontiguousarray(drawn(target, tilt=20).image[:, ::-1])
-    with refused(Code.MIRRORED, "expected an image of the sheet as one reads it", "mirrored"):
-        find_target(image, target)
-
-
 @pytest.mark.parametrize(
     "dictionary", [pytest.param("DICT_5X5_250", marks=pytest.mark.long), "DICT_4X4_50"]
 )
