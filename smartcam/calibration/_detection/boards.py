@@ -51,6 +51,12 @@ ASIDE = 0.25
 LEAST_AREA = 9.0
 """Of a square that is fitted, pixels^2."""
 
+MOST_REACH = 8.0
+"""Pixels from a corner that are fitted at most: enough to see whether there is one."""
+
+MOST_FITTED = 24
+"""Corners of a part of a board by which is judged whether it is one."""
+
 MOST_ROUNDS = 4
 """In which a board is completed."""
 
@@ -119,9 +125,10 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
 
 def completed(image: GreyImage, board: Board) -> Board | None:
     """Return a board with the corners that were missed; None where fits show none."""
-    _, signs = _fitted(image, board, board.places)
-    sign = float(parity(board.places) @ signs)
-    if abs(sign) < LEAST_FITTED * len(board.places):
+    some = board.places[:: math.ceil(len(board.places) / MOST_FITTED)]
+    _, signs = _fitted(image, board, some)
+    sign = float(parity(some) @ signs)
+    if abs(sign) < LEAST_FITTED * len(some):
         return None
     for _ in range(MOST_ROUNDS):
         missing = _missing(board)
@@ -157,9 +164,11 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
     inside = ((points >= 0) & (points <= np.array(image.size) - 1)).all(axis=1)
     inside &= np.abs(np.linalg.det(ways)) > LEAST_AREA
     if inside.any():
-        corners = refine_corners(image, points[inside], PART * ways[inside])
+        lengths = np.linalg.norm(ways[inside], axis=2)
+        part = np.minimum(PART, MOST_REACH / lengths.max(axis=1))[:, None, None]
+        corners = refine_corners(image, points[inside], part * ways[inside])
         aside = np.linalg.norm(corners.points - points[inside], axis=1)
-        step = np.linalg.norm(ways[inside], axis=2).min(axis=1)
+        step = lengths.min(axis=1)
         good = corners.fitted & (aside < ASIDE * step)
         points[inside] = corners.points
         signs[inside] = np.sign(corners.gains) * good

@@ -34,7 +34,7 @@ LARGEST_DOUBLED = 2600
 LEAST_IN_ROWS = 5
 """Dark quadrangles in rows and columns that may be a board's markers, at least."""
 
-LEAST_READ, MOST_UNREAD = 0.6, 4.0
+LEAST_READ, MOST_UNREAD = 0.6, 2.5
 """Pixels of a module of a marker: with fewer it is not read in double size, either; with more there
 is none, where none was read."""
 

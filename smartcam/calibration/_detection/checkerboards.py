@@ -82,7 +82,6 @@ class _Seen:
     """What a search came by, for its error."""
 
     shape: tuple[int, int] | None = None  # columns and rows of the largest board
-    other: bool = False  # whether that is a whole one of another size
 
 
 def _candidates(image: GreyImage, target: Checkerboard, seen: _Seen) -> Iterator[Array]:
@@ -106,8 +105,10 @@ def _candidates(image: GreyImage, target: Checkerboard, seen: _Seen) -> Iterator
         if found is not None:
             yield found
         if seen.shape is None or math.prod(whole.shape) > math.prod(seen.shape):
-            seen.shape, seen.other = whole.shape, found is None and whole.is_full
-    if seen.shape is not None and not seen.other:
+            seen.shape = whole.shape
+        if found is None and whole.is_full:
+            return
+    if seen.shape is not None:
         yield from _opencvs(image, target)
 
 

@@ -47,7 +47,7 @@ bend one of less than 20 dots less."""
 MOST_RANKED = 128
 """Dots with the best two opposite each other, among which those are chosen that have four."""
 
-MOST_TRIES = 8
+MOST_TRIES = 4
 """Of these, from which a grid is grown. A grid's dots stand opposite each other more exactly than
 what stands so by chance, so the first one is one of them as a rule."""
 
