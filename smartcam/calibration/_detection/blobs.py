@@ -39,6 +39,11 @@ MOST_LONG = 6.0
 """Times as long as wide at most: a dot that is seen 80 degrees from the front."""
 
 
+LEAST_OF_BOX = 0.2
+"""Of the upright rectangle around it, what a piece fills at least: an ellipse six times as long as
+wide, filled as little as that, has 0.22 where it lies aslant."""
+
+
 class Spots(NamedTuple):
     """What may be dots."""
 
@@ -58,7 +63,7 @@ class Pieces(NamedTuple):
         """Return those that are filled and round, of the ``most`` largest pieces."""
         _, _, wide, high, areas = self.boxes.T
         chosen = (areas >= LEAST_AREA) & (areas <= LARGEST_PART * self.dark.size)
-        chosen &= areas >= wide * high / (2 * MOST_LONG)
+        chosen &= areas >= LEAST_OF_BOX * wide * high
         chosen[0] = False
         kept = np.flatnonzero(chosen)
         if len(kept) > most:

@@ -27,15 +27,16 @@ NEIGHBOURS = 12
 """Dots around one among which those opposite each other are looked for: a grid's eight next ones
 and what may be printed between."""
 
-OPPOSITE = 0.3
+OPPOSITE = 0.2
 """Of a step, by which the steps to two dots opposite each other differ at most."""
 
 LEAST_SINE = 0.5
 """Of the angle between the steps to a grid's next column and its next row: 30 degrees; the two
 shortest steps of a lattice have 60 or more."""
 
-NEAR = 0.3
-"""Of a step, from where it leads to the dot that is found there at most."""
+NEAR, NEAR_FIRST = 0.3, 0.2
+"""Of a step, from where it leads to the dot that is found there at most; within two steps of the
+first dot, from where steps change less."""
 
 ALIKE = 1.8
 """Times the area of its neighbour that a dot has at most."""
@@ -161,7 +162,7 @@ class _Grown:
             if waves == 2 and len(places) < LEAST_AROUND:
                 break
             waves += 1
-            around = self._around(reached)
+            around = self._around(reached, NEAR_FIRST if waves < 2 else NEAR)
             wave, reached = reached, []
             for (here, dot, steps, like), sides in zip(wave, around, strict=True):
                 for side, fits in enumerate(sides):
@@ -204,15 +205,20 @@ class _Grown:
                     taken.add(dot)
                     added = True
 
-    def _around(self, reached: list[tuple[Place, int, Array, int]]) -> list[list[list[int]]]:
-        """Return for each dot and each of its four sides the dots that may be next there."""
+    def _around(
+        self, reached: list[tuple[Place, int, Array, int]], limit: float
+    ) -> list[list[list[int]]]:
+        """Return for each dot and each of its four sides the dots that may be next there.
+
+        ``limit``: of a step, from where it leads to such a dot at most.
+        """
         dots = np.array([dot for _, dot, _, _ in reached])
         like = np.array([like for _, _, _, like in reached])
         steps = np.stack([steps for _, _, steps, _ in reached])
         ways = np.concatenate([steps, -steps], axis=1)
         ahead = self._points[dots][:, None] + ways
         off, near = self._tree.query(ahead, min(3, len(self._points)))
-        fits = off < NEAR * np.linalg.norm(ways, axis=2)[:, :, None]
+        fits = off < limit * np.linalg.norm(ways, axis=2)[:, :, None]
         fits &= self._follows(near, like[:, None, None])
         return [
             [
