@@ -131,7 +131,7 @@ def _flipped(image: GreyImage) -> GreyImage:
     )
 
 
-class _Seen(NamedTuple):
+class _Sighting(NamedTuple):
     """What was found of a board."""
 
     ids: NDArray[np.intp]  # (N,), ascending
@@ -142,13 +142,13 @@ class _Seen(NamedTuple):
     side: float
 
 
-def _detect(image: GreyImage, target: Charuco) -> _Seen:
+def _detect(image: GreyImage, target: Charuco) -> _Sighting:
     """Find a board in a reduced image, in the given one, and in one that is twice as large.
 
     The next one is looked at where the one before does not show enough; the last one only where
     there may be markers that are too small to be read.
     """
-    best = _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0.0)
+    best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0.0)
     times = math.ceil(max(image.size) / USUAL_SIZE)
     if times > 1:
         best = _look(reduced(image.bytes, times), 1 / times, target, best)
@@ -161,7 +161,7 @@ def _detect(image: GreyImage, target: Charuco) -> _Seen:
     return best
 
 
-def _is_all(seen: _Seen, target: Charuco, image: GreyImage) -> bool:
+def _is_all(seen: _Sighting, target: Charuco, image: GreyImage) -> bool:
     """Return whether all corners were found that should be in the image."""
     if len(seen.ids) < FEWEST:
         return False
@@ -173,7 +173,7 @@ def _is_all(seen: _Seen, target: Charuco, image: GreyImage) -> bool:
     return bool(np.isin(np.flatnonzero(inside), seen.ids).all())
 
 
-def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Seen) -> _Seen:
+def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sighting) -> _Sighting:
     """Return what an image shows that is ``scale`` times as large, or the best before it."""
     cv2 = load("cv2")
     board = charuco_board(target)
@@ -196,7 +196,7 @@ def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Seen)
     ids = (target.rows - 2 - row) * (target.columns - 1) + column
     points = (np.array(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     order = np.argsort(ids)
-    return _Seen(ids[order], points[order], markers, best.side)
+    return _Sighting(ids[order], points[order], markers, best.side)
 
 
 def _modules(board: Any) -> int:

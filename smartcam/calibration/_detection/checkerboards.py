@@ -55,7 +55,7 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
 
     Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
     """
-    seen = _Seen()
+    seen = _Search()
     for found in _candidates(image, target, seen):
         corners = refine_corners(image, found, PART * _steps(found, target))
         if _looks_right(corners, target):
@@ -78,13 +78,13 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
 
 
 @dataclass
-class _Seen:
+class _Search:
     """What a search came by, for its error."""
 
     shape: tuple[int, int] | None = None  # columns and rows of the largest board
 
 
-def _candidates(image: GreyImage, target: Checkerboard, seen: _Seen) -> Iterator[Array]:
+def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterator[Array]:
     """Yield corners row by row, as we and then OpenCV's detectors see them.
 
     The latter take much longer and are asked only where a part of such a board is seen.
@@ -167,7 +167,7 @@ def _looks_right(corners: Corners, target: Checkerboard) -> bool:
     return bool(abs(colours.mean()) >= LEAST_FITTED)
 
 
-def _not_found(target: Checkerboard, seen: _Seen) -> CalibrationError:
+def _not_found(target: Checkerboard, seen: _Search) -> CalibrationError:
     """Return an error that says which board is seen instead, if there is one."""
     shape = seen.shape
     instead = "found none" if shape is None else f"found one of about {shape[0]} x {shape[1]}"
