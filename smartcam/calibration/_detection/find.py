@@ -31,11 +31,11 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     image rather than to the left.
 
     A mirrored image is refused where the print tells it: of a ChArUco board; of a checkerboard or a
-    grid of dots with a mark or a larger dot at its origin, and other counts of columns and rows; of
-    a checkerboard without a mark whose columns and rows are odd and differ, by its black corners;
-    of an asymmetric grid with an even count of rows other than twice that of its columns. The
-    mirror image of any other target is what the target itself looks like when it is turned: its
-    view has the points mirrored, and nothing in one image tells it.
+    grid of dots with a mark or a larger dot at its origin, unless it is square (as many columns as
+    rows; of an asymmetric grid, half as many); of a checkerboard without a mark whose columns and
+    rows are odd and differ, by its black corners; of an asymmetric grid with an even count of rows
+    that is not square. The mirror image of any other target looks like the target itself when it is
+    turned: its view has the points mirrored, and nothing in one image tells it.
 
     An image without a target is given up after work that is bounded: by the saddles, dark spots or
     quadrangles that are looked at, and from how many of them a grid is grown.

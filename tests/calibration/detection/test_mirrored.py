@@ -45,6 +45,7 @@ NOT_TOLD: list[Target] = [
     dots(7, 7, shifted=False, larger=0.015),
     dots(4, 11, shifted=True),
     dots(4, 8, shifted=True),
+    dots(4, 8, shifted=True, larger=0.016),
 ]
 
 
