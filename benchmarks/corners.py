@@ -1,5 +1,7 @@
 """Corners and dots in images: how near their error is to what noise allows, how long they take.
 
+Searches are timed beside OpenCV's: where no target is, and in large images with one.
+
 Corners are drawn with known places, angles and blur, and noise of 1, 2 and 5 grey levels; no
 estimate without a bias can have a smaller error than the Cramer-Rao bound with unknown angles,
 blur, gain and offset. All sides get the same images and the same starts.
@@ -22,14 +24,19 @@ from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._detection.image import GreyImage
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Checkerboard, CircleGrid
+from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
 from smartcam.calibration.simulation._images import render
+from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from smartcam.calibration._geometry.rotations import Array
+    from numpy.typing import NDArray
 
+    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._targets import Target
+
+    Image = NDArray[np.uint8]
     Refine = Callable[[GreyImage, Array, Array], Array]
 
 __all__ = ["run"]
@@ -48,6 +55,17 @@ def run(plan: Plan) -> Iterable[Comparison]:
             yield from _corners(plan, noise, blur)
     yield from _dots(plan)
     yield from _times(plan)
+    for case, image in _empty_scenes():
+        yield from _searches(plan, f"no target, {case}", image, Goal("at most", 30, "ms"))
+    for target in (PLAIN, BOARD, GRID):
+        yield from _large(plan, target)
+
+
+PLAIN = Checkerboard(columns=9, rows=6, square=0.025)
+BOARD = Charuco(columns=8, rows=6, square=0.03, marker=0.02)
+GRID = CircleGrid(columns=10, rows=8, spacing=0.02, diameter=0.01, origin_diameter=0.016)
+
+CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 class _Drawn(NamedTuple):
@@ -150,7 +168,7 @@ def _corners(plan: Plan, noise: float, blur: float) -> Iterator[Comparison]:
         )
 
 
-def _pose(target: Checkerboard | CircleGrid, tilt: float) -> Transform:
+def _pose(target: Target, tilt: float) -> Transform:
     turn = np.asarray(cv2.Rodrigues(np.radians(tilt) * np.array([0.6, 0.8, 0]))[0]) @ np.diag(
         [1.0, -1.0, -1.0]
     )
@@ -228,3 +246,104 @@ def _times(plan: Plan) -> Iterator[Comparison]:
             goal,
         )
     cv2.setNumThreads(threads)
+
+
+def _empty_scenes() -> Iterator[tuple[str, Image]]:
+    """Yield images of 640 x 480 pixels that show no target."""
+    random = np.random.default_rng(7)
+    frequency = np.hypot(np.fft.fftfreq(480)[:, None], np.fft.fftfreq(640))
+    frequency[0, 0] = 1.0
+    clouds = np.fft.ifft2(np.fft.fft2(random.normal(size=(480, 640))) / frequency).real
+    yield "texture (1/f)", _bytes(128 + 45 * clouds / clouds.std())
+    yield "noise of 40", _bytes(random.normal(128, 40, (480, 640)))
+    desk = np.full((480, 640), 200, dtype=np.uint8)
+    for _ in range(250):
+        corners = random.uniform((0, 0), (640, 480)) + random.uniform(-45, 45, (4, 2))
+        hull = cv2.convexHull(corners.astype(np.int32))
+        cv2.fillConvexPoly(desk, hull, (random.uniform(0, 255),))
+    yield "polygons", desk
+    page = np.full((480, 640), 230, dtype=np.uint8)
+    for row in range(20, 480, 15):
+        line = "".join(map(chr, random.integers(33, 126, 90)))
+        cv2.putText(page, line, (5, row), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20.0,), 1, cv2.LINE_AA)
+    yield "text", page
+    yield "uniform", np.full((480, 640), 128, dtype=np.uint8)
+    other = Checkerboard(columns=10, rows=7, square=0.02)
+    yield "another board", render(other, _camera(640), _pose(other, 20), noise=2)
+
+
+def _bytes(levels: Array) -> Image:
+    return np.asarray(np.rint(levels).clip(0, 255), dtype=np.uint8)
+
+
+def _camera(width: int) -> CameraModel:
+    scale = width / 640
+    return CameraModel(
+        size=(width, round(480 * scale) if width == 640 else width * 9 // 16),
+        matrix=np.array([[600 * scale, 0, width / 2], [0, 600 * scale, width * 0.3], [0, 0, 1]]),
+    )
+
+
+def _large(plan: Plan, target: Target) -> Iterator[Comparison]:
+    camera = _camera(960 if plan.quick else 3840)
+    image = render(target, camera, _pose(target, 30), noise=2)
+    wide, high = camera.size
+    case = f"{target.kind} seen, {wide} x {high} pixels"
+    yield from _searches(plan, case, image, Goal("at most", 100, "ms"), target)
+
+
+def _searches(
+    plan: Plan, case: str, image: Image, goal: Goal, target: Target | None = None
+) -> Iterator[Comparison]:
+    """Time searches for a target on one core, those of OpenCV for a board of 9 x 6.
+
+    Without a ``target`` all three kinds are looked for, one after the other.
+    """
+    ours: dict[str, Callable[[], object]] = {
+        wanted.kind: functools.partial(_search, image, wanted)
+        for wanted in ((PLAIN, BOARD, GRID) if target is None else (target,))
+    }
+    pattern = (PLAIN.columns, PLAIN.rows)
+    find, sectors = cv2.findChessboardCorners, cv2.findChessboardCornersSB
+    theirs: dict[str, Callable[[], object]] = {
+        "findChessboardCorners": lambda: find(image, pattern, flags=CLASSIC),
+        "findChessboardCorners, FAST_CHECK": lambda: find(
+            image, pattern, flags=CLASSIC | cv2.CALIB_CB_FAST_CHECK
+        ),
+        "findChessboardCornersSB": lambda: sectors(image, pattern),
+    }
+    if target not in (None, PLAIN):
+        theirs = {}
+    found = _taking_turns(plan, {**ours, **theirs})
+    for kind in ours:
+        yield Comparison(
+            "corners", f"{case}: find_target, {kind}", found[kind], None, "alone", goal
+        )
+    for name in theirs:
+        yield Comparison(
+            "corners",
+            f"{case}: find_target, checkerboard, over {name}",
+            found[PLAIN.kind],
+            found[name],
+        )
+
+
+def _search(image: Image, target: Target) -> bool:
+    try:
+        find_target(image, target)
+    except CalibrationError:
+        return False
+    return True
+
+
+def _taking_turns(plan: Plan, work: dict[str, Callable[[], object]]) -> dict[str, Series]:
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    times: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(plan.rounds):
+        for name, task in work.items():
+            begin = time.process_time()
+            task()
+            times[name].append(1e3 * (time.process_time() - begin))
+    cv2.setNumThreads(threads)
+    return {name: Series(name, "ms", of) for name, of in times.items()}

@@ -25,6 +25,9 @@ LEAST_STEP = 7
 LEAST_AREA = 9
 """Pixels of a spot at least."""
 
+LEAST_SPECK, LARGEST_SPECK = 3, 24
+"""Pixels of a dot that is too small, or that is said to be small, to be told from others."""
+
 LARGEST_PART = 1 / 16
 """Of an image, the area of a spot at most: a grid has nine dots or more."""
 
@@ -36,6 +39,11 @@ MOST_LONG = 6.0
 """Times as long as wide at most: a dot that is seen 80 degrees from the front."""
 
 
+LEAST_OF_BOX = 0.2
+"""Of the upright rectangle around it, what a piece fills at least: an ellipse six times as long as
+wide, filled as little as that, has 0.22 where it lies aslant."""
+
+
 class Spots(NamedTuple):
     """What may be dots."""
 
@@ -43,11 +51,47 @@ class Spots(NamedTuple):
     areas: Array  # (N,), pixels^2
 
 
-def dark_spots(image: NDArray[np.uint8], around: int, *, most: int) -> Spots:
-    """Return the spots of an image (H, W).
+class Pieces(NamedTuple):
+    """What is dark in an image and hangs together."""
+
+    dark: NDArray[np.uint8]  # (H, W), 1 where it is
+    labels: NDArray[np.int32]  # (H, W), which piece each pixel is of; 0: none
+    boxes: NDArray[np.int32]  # (N, 5): left, top, width, height, area; the first is not a piece
+    middles: Array  # (N, 2), pixels
+
+    def spots(self, most: int) -> Spots:
+        """Return those that are filled and round, of the ``most`` largest pieces."""
+        _, _, wide, high, areas = self.boxes.T
+        chosen = (areas >= LEAST_AREA) & (areas <= LARGEST_PART * self.dark.size)
+        chosen &= areas >= LEAST_OF_BOX * wide * high
+        chosen[0] = False
+        kept = np.flatnonzero(chosen)
+        if len(kept) > most:
+            kept = kept[np.argsort(areas[kept])[-most:]]
+        number = np.full(len(areas), -1, dtype=np.int32)
+        number[kept] = np.arange(len(kept))
+        pieces = self._some(kept)
+        good = _filled(self, number, pieces)
+        return Spots(pieces.points[good], pieces.areas[good])
+
+    def specks(self) -> Spots:
+        """Return those that may be dots of which only a few pixels are seen."""
+        _, _, wide, high, areas = self.boxes.T
+        chosen = (areas >= LEAST_SPECK) & (areas <= LARGEST_SPECK)
+        chosen &= (wide <= MOST_LONG / 2 * high) & (high <= MOST_LONG / 2 * wide)
+        chosen[0] = False
+        return self._some(np.flatnonzero(chosen))
+
+    def _some(self, kept: NDArray[np.intp]) -> Spots:
+        middles, areas = self.middles[kept], self.boxes[kept, 4]
+        return Spots(middles.astype(np.float64), areas.astype(np.float64))
+
+
+def dark_pieces(image: NDArray[np.uint8], around: int) -> Pieces:
+    """Return the dark pieces of an image (H, W).
 
     ``around``: side of the square whose mean a pixel is compared with; about two of the distances
-    between dots. ``most``: pieces that are looked at, the largest ones.
+    between dots.
     """
     cv2 = load("cv2")
     smooth = cv2.blur(image, (3, 3))
@@ -55,29 +99,21 @@ def dark_spots(image: NDArray[np.uint8], around: int, *, most: int) -> Spots:
     dark = cv2.adaptiveThreshold(
         smooth, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, side, LEAST_STEP
     )
-    count, labels, boxes, middles = cv2.connectedComponentsWithStats(dark, connectivity=4)
-    _, _, wide, high, areas = boxes.T
-    chosen = (areas >= LEAST_AREA) & (areas <= LARGEST_PART * image.size)
-    chosen &= areas >= wide * high / (2 * MOST_LONG)
-    chosen[0] = False
-    kept = np.flatnonzero(chosen)
-    if len(kept) > most:
-        kept = kept[np.argsort(areas[kept])[-most:]]
-    number = np.full(count, -1, dtype=np.int32)
-    number[kept] = np.arange(len(kept))
-    pieces = Spots(middles[kept].astype(np.float64), areas[kept].astype(np.float64))
-    good = _filled(number[labels], pieces)
-    return Spots(pieces.points[good], pieces.areas[good])
+    _, labels, boxes, middles = cv2.connectedComponentsWithStats(dark, connectivity=4)
+    return Pieces(dark, labels, boxes, middles)
 
 
-def _filled(number: NDArray[np.int32], pieces: Spots) -> NDArray[np.bool_]:
+def _filled(all_: Pieces, number: NDArray[np.int32], pieces: Spots) -> NDArray[np.bool_]:
     """Return whether each piece fills an ellipse that is not too long.
 
-    ``number`` (H, W) says which piece each pixel is of; -1: none.
+    ``number`` says which of the ``pieces`` each of all pieces is; -1: none.
     """
     count = len(pieces.areas)
-    v, u = np.nonzero(number >= 0)
-    which = number[v, u]
+    at = np.flatnonzero(all_.dark)
+    which = number[all_.labels.ravel()[at]]
+    chosen = which >= 0
+    which = which[chosen]
+    v, u = np.divmod(at[chosen], all_.dark.shape[1])
     x, y = u - pieces.points[which, 0], v - pieces.points[which, 1]
     # An ellipse with half axes a and b has second moments a^2 / 4 and b^2 / 4 along them: its area,
     # pi a b, is 4 pi sqrt(det M). The larger eigenvalue of M over sqrt(det M) is a / b.

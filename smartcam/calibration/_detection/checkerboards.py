@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from smartcam.calibration._codes import Code
+from smartcam.calibration._detection.boards import LEAST_FITTED, PART, boards, completed, parity
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.dots import GridMap
 from smartcam.calibration._detection.image import USUAL_SIZE, scaled
@@ -29,11 +32,9 @@ if TYPE_CHECKING:
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import Checkerboard
 
-PART = 0.45
-"""Of a square around a corner that is fitted: its own edges, not the next ones and their blur."""
-
-LEAST_FITTED = 0.6
-"""Of the corners whose fit is good and whose colours are in turn; a wrong board has fewer."""
+LEAST_SEEN = 10
+"""Corners that hang together in what may be a part of a board: pictures of leaves, bricks and noise
+have up to nine."""
 
 STRAY = 0.5
 """Pixels by which a corner may lie apart from where the others say it is, beside four times the
@@ -54,13 +55,14 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
 
     Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
     """
-    for found in _candidates(image, target):
+    seen = _Search()
+    for found in _candidates(image, target, seen):
         corners = refine_corners(image, found, PART * _steps(found, target))
         if _looks_right(corners, target):
             corners = _without_strays(image, corners, target)
             break
     else:
-        raise _not_found(image, target)
+        raise _not_found(target, seen)
     ways = arrangements(corners.points, rows_of(target.columns, target.rows), target)
     way, margin = _number(image, target, corners, ways)
     order = way.order.ravel()
@@ -75,7 +77,42 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
     )
 
 
-def _candidates(image: GreyImage, target: Checkerboard) -> Iterator[Array]:
+@dataclass
+class _Search:
+    """What a search came by, for its error."""
+
+    shape: tuple[int, int] | None = None  # columns and rows of the largest board
+
+
+def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterator[Array]:
+    """Yield corners row by row, as we and then OpenCV's detectors see them.
+
+    The latter take much longer and are asked only where a part of such a board is seen.
+    """
+    count = target.columns * target.rows
+    parts = []
+    for board in boards(image, count, most=(target.columns + 2) * (target.rows + 2)):
+        found = board.by_rows(target.columns, target.rows)
+        if found is not None:
+            yield found
+        if min(board.shape) >= 3 and len(board.places) >= min(LEAST_SEEN, LEAST_FITTED * count):
+            parts.append(board)
+    for board in sorted(parts, key=lambda part: -len(part.places)):
+        whole = completed(image, board)
+        if whole is None:
+            continue
+        found = whole.by_rows(target.columns, target.rows)
+        if found is not None:
+            yield found
+        if seen.shape is None or math.prod(whole.shape) > math.prod(seen.shape):
+            seen.shape = whole.shape
+        if found is None and whole.is_full:
+            return
+    if seen.shape is not None:
+        yield from _opencvs(image, target)
+
+
+def _opencvs(image: GreyImage, target: Checkerboard) -> Iterator[Array]:
     """Yield corners row by row, as one of OpenCV's detectors after the other sees them."""
     cv2: Any = load("cv2")
     pattern = (target.columns, target.rows)
@@ -89,7 +126,7 @@ def _candidates(image: GreyImage, target: Checkerboard) -> Iterator[Array]:
         (2 * usual, cv2.findChessboardCornersSB, sector),
     ]
     for scale, find, flags in attempts:
-        ok, corners = find(scaled(image, scale), pattern, flags=flags)
+        ok, corners = find(scaled(image.bytes, scale), pattern, flags=flags)
         if ok and len(corners) == target.columns * target.rows:
             found: Array = np.array(corners, dtype=np.float64).reshape(-1, 2)
             yield (found + 0.5) / scale - 0.5
@@ -125,30 +162,21 @@ def _without_strays(image: GreyImage, corners: Corners, target: Checkerboard) ->
     return corners
 
 
-def _parity(target: Checkerboard) -> Array:
-    column, row = rows_of(target.columns, target.rows).T
-    return np.where((column + row) % 2 == 0, 1.0, -1.0)
-
-
 def _looks_right(corners: Corners, target: Checkerboard) -> bool:
-    colours = _parity(target) * np.sign(corners.gains) * corners.fitted
+    colours = parity(rows_of(target.columns, target.rows)) * np.sign(corners.gains) * corners.fitted
     return bool(abs(colours.mean()) >= LEAST_FITTED)
 
 
-def _not_found(image: GreyImage, target: Checkerboard) -> CalibrationError:
+def _not_found(target: Checkerboard, seen: _Search) -> CalibrationError:
     """Return an error that says which board is seen instead, if there is one."""
-    cv2 = load("cv2")
-    scale = min(1.0, USUAL_SIZE / max(image.size))
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    ok, _, meta = cv2.findChessboardCornersSBWithMeta(scaled(image, scale), (3, 3), flags)
-    seen = None if not ok else (meta.shape[1], meta.shape[0])
-    instead = "found none" if seen is None else f"found one of about {seen[0]} x {seen[1]}"
+    shape = seen.shape
+    instead = "found none" if shape is None else f"found one of about {shape[0]} x {shape[1]}"
     return CalibrationError(
         f"checkerboard: expected a board of {target.columns} x {target.rows} inner corners that is "
         f"seen as a whole, {instead}",
         code=Code.TARGET_NOT_FOUND,
         expected=(target.columns, target.rows),
-        got=seen,
+        got=shape,
     )
 
 
@@ -169,8 +197,27 @@ def _number(
             return float(dark + (light - dark) * part)
 
         return marked(ways, level, f"{what} with a dark area at the origin{note}")
-    black = [way for way in ways if way.proper and _blackness(target, corners, way) > 0]
+    proper = [way for way in ways if way.proper]
+    black = [way for way in proper if _blackness(target, corners, way) > 0]
+    if proper and not black and target.columns % 2 == target.rows % 2 == 1:
+        raise _white_origin(target, what)
     return leftmost(black or ways, what), None
+
+
+def _white_origin(target: Checkerboard, what: str) -> CalibrationError:
+    """Return an error of a board whose black corners are where the target's white ones are.
+
+    Of counts that are both odd and differ, two corners that lie opposite each other are black, and
+    turning the sheet exchanges no black one with a white one.
+    """
+    return CalibrationError(
+        f"{what}: expected a black square outside of the corner at the origin, got a white one: "
+        "an image that is mirrored, or a negative, or the board is one of "
+        f"{target.rows} x {target.columns}",
+        code=Code.MIRRORED,
+        expected="a black square",
+        got="a white one",
+    )
 
 
 class _Shades(NamedTuple):
@@ -197,7 +244,7 @@ def _blackness(target: Checkerboard, corners: Corners, way: Arrangement) -> floa
     # gains refer to the found grid's columns and rows, which may run against the target's
     against = float(np.sign(order[0, 1] - order[0, 0]) * np.sign(order[1, 0] - order[0, 0]))
     signs = np.sign(corners.gains[order.ravel()])
-    return against * float(_parity(target) @ signs)
+    return against * float(parity(rows_of(target.columns, target.rows)) @ signs)
 
 
 def _near(grid: Array, at: Array) -> Array:

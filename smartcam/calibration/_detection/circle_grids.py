@@ -9,15 +9,15 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from smartcam.calibration._codes import Code
-from smartcam.calibration._detection.blobs import dark_spots
+from smartcam.calibration._detection.blobs import dark_pieces
 from smartcam.calibration._detection.dots import GridMap, refine_dots
-from smartcam.calibration._detection.grid_growing import lattices
-from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, scaled
+from smartcam.calibration._detection.grid_growing import alike_areas, lattices
+from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
 from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._geometry.homography import local_steps
@@ -29,15 +29,25 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._detection.blobs import Spots
+    from smartcam.calibration._detection.blobs import Pieces, Spots
     from smartcam.calibration._detection.dots import Dots
     from smartcam.calibration._detection.ordering import Arrangement
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import CircleGrid
 
-LOOKS: Final = ((1, 1.0), (1, 0.3), (2, 0.3))
-"""How an image is looked at: its size in parts of the usual one, and the side of the square that a
-pixel is compared with, in distances between dots of a grid that fills the image."""
+WIDE, NARROW = 1.0, 0.3
+"""Side of the square that a pixel is compared with, in distances between dots of a grid that fills
+the image."""
+
+SMALL_SIDE = 800
+"""Longest side of the image in which a grid is looked for first, pixels."""
+
+LEAST_PART = 0.4
+"""Of the dots of a grid that stand in rows and columns among those of a few pixels, at least. So
+many of them are still told apart where all of them are in an image twice as large."""
+
+NEIGHBOURS = 8
+"""Of a dot of a few pixels, among which a grid's next ones are."""
 
 MORE_SPOTS = 1000
 """Beside twice the dots of the target: of an image with more, the largest are looked at."""
@@ -81,19 +91,53 @@ def _grids(
 
     They are dark in the image that comes with them, which is the given one or its negative.
     """
-    usual = min(1.0, USUAL_SIZE / max(image.size))
-    negative = GreyImage(255 - image.levels, 255 - image.bytes)
-    for (times, part), inked in itertools.product(LOOKS, (image, negative)):
-        looked_at = scaled(inked, times * usual)
-        around = round(part * max(looked_at.shape) / _longest(target))
-        spots = dark_spots(looked_at, around, most=MORE_SPOTS + 2 * len(target.points))
-        if seen.spots is None:
-            seen.spots = len(spots.areas)
+    for light, scale, spots in _looks(image.bytes, target):
         for points, places in _laid_out(spots, target, seen):
-            found = (points + 0.5) / (times * usual) - 0.5
+            found = (points + 0.5) / scale - 0.5
             ways = arrangements(found, places, target)
             if ways and _is_flat(target, found[ways[0].order.ravel()]):
-                yield inked, found, ways
+                yield _negative(image) if light else image, found, ways
+
+
+def _negative(image: GreyImage) -> GreyImage:
+    return GreyImage(255 - image.levels, 255 - image.bytes)
+
+
+def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool, float, Spots]]:
+    """Yield whether it is the negative of an image, its size in parts of the given one, and spots.
+
+    A large image is looked at in a small size first, and any one in double size where there may be
+    dots of a few pixels.
+    """
+    longest = max(image.shape)
+    times, usual = math.ceil(longest / SMALL_SIDE), min(1.0, USUAL_SIZE / longest)
+    most = MORE_SPOTS + 2 * len(target.points)
+    if times > 1:
+        small = reduced(image, times)
+        for light in (False, True):
+            yield light, 1 / times, _pieces(small, light, WIDE, target).spots(most)
+    looked_at = scaled(image, usual)
+    fine = []
+    for part, light in itertools.product((WIDE, NARROW), (False, True)):
+        pieces = _pieces(looked_at, light, part, target)
+        yield light, usual, pieces.spots(most)
+        if part == NARROW and _may_be_dots(pieces.specks(), target):
+            fine.append(light)
+    for light in fine:
+        pieces = _pieces(scaled(image, 2 * usual), light, NARROW, target)
+        yield light, 2 * usual, pieces.spots(most)
+
+
+def _pieces(image: NDArray[np.uint8], light: bool, part: float, target: CircleGrid) -> Pieces:
+    around = round(part * max(image.shape) / _longest(target))
+    return dark_pieces(255 - image if light else image, around)
+
+
+def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:
+    """Return whether a good part of a grid may be among dots of a few pixels."""
+    least = max(4, round(LEAST_PART * len(target.points)))
+    alike = alike_areas(specks.areas)
+    return any(lattices(specks.points, alike, least=least, most=least, neighbours=NEIGHBOURS))
 
 
 def _laid_out(
@@ -101,8 +145,17 @@ def _laid_out(
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
     """Yield as many dots (N, 2) in rows and columns as the target has, and their places (N, 2)."""
     count = target.columns * target.rows
+    if seen.spots is None:
+        seen.spots = len(spots.areas)
+    elif len(spots.areas) < count:
+        return
     larger = ((target.origin_diameter or target.diameter) / target.diameter) ** 2
-    for grid in lattices(spots.points, spots.areas, least=LEAST_TOLD, most=count, larger=larger):
+    like, larger_like = alike_areas(spots.areas), alike_areas(spots.areas, larger)
+
+    def follows(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
+        return like(one, other) | larger_like(one, other)
+
+    for grid in lattices(spots.points, like, follows=follows, least=LEAST_TOLD, most=count):
         seen.largest = max(seen.largest, len(grid))
         if len(grid) == count:
             yield spots.points[list(grid.values())], np.array(list(grid), dtype=np.intp)

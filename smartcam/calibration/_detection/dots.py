@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._detection.image import GreyImage
+from smartcam.calibration._detection.image import GreyImage, reduced
 from smartcam.calibration._detection.levenberg import (
     GAIN,
     covariances,
@@ -140,9 +140,7 @@ def _refine_smaller(
     image: GreyImage, points: Array, radii: Array, reaches: Array, times: int
 ) -> Dots:
     """Return the same of an image whose pixels are the means of ``times`` by ``times`` of them."""
-    height, width = (side // times for side in image.bytes.shape)
-    cut = image.levels[: height * times, : width * times]
-    levels = cut.reshape(height, times, width, times).mean(axis=(1, 3), dtype=np.float32)
+    levels = reduced(image.levels, times)
     smaller = GreyImage(levels, np.rint(levels).astype(np.uint8))
     dots = refine_dots(smaller, (points + 0.5) / times - 0.5, radii / times, reaches / times)
     return Dots(

@@ -28,8 +28,17 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     Points are numbered as the target does. Its origin is told by its mark, its larger dot or its
     ids; without these by the outermost square there, which is black, where only one of the corners
     in question has a black one. Where nothing tells it, the target's x points to the right of the
-    image rather than to the left. A mirrored image is noticed only where the target's marks allow
-    it.
+    image rather than to the left.
+
+    A mirrored image is refused where the print tells it: of a ChArUco board; of a checkerboard or a
+    grid of dots with a mark or a larger dot at its origin, unless it is square (as many columns as
+    rows; of an asymmetric grid, half as many); of a checkerboard without a mark whose columns and
+    rows are odd and differ, by its black corners; of an asymmetric grid with an even count of rows
+    that is not square. The mirror image of any other target looks like the target itself when it is
+    turned: its view has the points mirrored, and nothing in one image tells it.
+
+    An image without a target is given up after work that is bounded: by the saddles, dark spots or
+    quadrangles that are looked at, and from how many of them a grid is grown.
 
     Args:
         image: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; 16 to 20,000 pixels wide
@@ -45,7 +54,8 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     Raises:
         CalibrationError: SHAPE: no such image, or a ChArUco board of an unknown dictionary;
             TARGET_NOT_FOUND; AMBIGUOUS_ORIGIN: the mark is not darker than the other corners by 30
-            grey levels of 255; MIRRORED.
+            grey levels of 255; MIRRORED: the image shows the target as in a mirror, or, where only
+            its black corners tell, as a negative or with columns and rows exchanged.
         MissingExtraError: OpenCV is not installed.
     """
     grey = grey_image(image)

@@ -7,18 +7,19 @@ steps change from dot to dot, which is why the last two of a row predict the thi
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._geometry.homography import apply_homography, fit_homography, local_steps
+from smartcam.calibration._detection.dots import GridMap
+from smartcam.calibration._geometry.homography import local_steps
 from smartcam.calibration._optional_imports import load
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
 
     from smartcam.calibration._geometry.rotations import Array
 
@@ -26,25 +27,33 @@ NEIGHBOURS = 12
 """Dots around one among which those opposite each other are looked for: a grid's eight next ones
 and what may be printed between."""
 
-OPPOSITE = 0.3
+OPPOSITE = 0.2
 """Of a step, by which the steps to two dots opposite each other differ at most."""
 
 LEAST_SINE = 0.5
 """Of the angle between the steps to a grid's next column and its next row: 30 degrees; the two
 shortest steps of a lattice have 60 or more."""
 
-NEAR = 0.3
-"""Of a step, from where it leads to the dot that is found there at most."""
+NEAR, NEAR_FIRST = 0.3, 0.2
+"""Of a step, from where it leads to the dot that is found there at most; within two steps of the
+first dot, from where steps change less."""
 
 ALIKE = 1.8
 """Times the area of its neighbour that a dot has at most."""
 
 REGULAR = 0.08
 """Of a step, from where a flat grid has its dots to where they are, in the median at most: lenses
-bend less."""
+bend one of less than 20 dots less."""
 
-MOST_TRIES = 50
-"""Dots from which a grid is grown."""
+MOST_RANKED = 128
+"""Dots with the best two opposite each other, among which those are chosen that have four."""
+
+MOST_TRIES = 4
+"""Of these, from which a grid is grown. A grid's dots stand opposite each other more exactly than
+what stands so by chance, so the first one is one of them as a rule."""
+
+LEAST_AROUND = 8
+"""Dots that are reached by two steps from a grid's dot at least, itself among them."""
 
 Place = tuple[int, int]
 
@@ -53,31 +62,52 @@ _AROUND: Final[list[Place]] = [(1, 0), (0, 1), (-1, 0), (0, -1)]
 Lattice = dict[Place, int]
 """The dot at a column and a row, counted from anywhere in any direction."""
 
+Alike: TypeAlias = "Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]"
+"""Whether dots, by their indices, may be neighbours of others."""
+
 
 def lattices(
-    points: Array, areas: Array, *, least: int, most: int, larger: float = 1.0
+    points: Array,
+    alike: Alike,
+    *,
+    least: int,
+    most: int,
+    follows: Alike | None = None,
+    neighbours: int = NEIGHBOURS,
 ) -> Iterator[Lattice]:
     """Yield grids, each of dots that hang together.
 
-    ``points`` (N, 2), pixels, have ``areas`` (N,), pixels^2; a dot's area may be that of its
-    neighbours, or ``larger`` times as much. A grid has at least ``least`` dots, four or more; of
-    one with more than ``most``, a few more than these are returned.
+    ``alike`` tells which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
+    else may come after one. A grid has at least ``least`` dots, four or more; of one with more than
+    ``most``, a few more than these are returned. It is grown from dots that have two pairs of their
+    next ``neighbours`` opposite each other, of which no more than MOST_TRIES are tried.
     """
     if len(points) < 5:
         return
-    grown = _Grown(points, areas, larger)
-    seen = np.zeros(len(points), dtype=np.bool_)
     tries = MOST_TRIES
-    for start, steps in grown.starts():
+    grown = _Grown(points, alike, follows or alike)
+    seen = np.zeros(len(points), dtype=np.bool_)
+    for start, steps in grown.starts(neighbours):
         if seen[start]:
             continue
         found = grown.grow(start, steps, most)
         seen[list(found.values())] = True
         if len(found) >= least and _is_regular(points, found):
+            grown.complete(found, most)
             yield found
         tries -= 1
         if tries == 0:
             return
+
+
+def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
+    """Return whether dots are alike by their ``areas`` (N,), or one is ``larger`` times another."""
+
+    def alike(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
+        part = areas[one] / (larger * areas[other])
+        return np.asarray((part < ALIKE) & (part > 1 / ALIKE))
+
+    return alike
 
 
 @dataclass(eq=False)
@@ -85,29 +115,32 @@ class _Grown:
     """Dots by their places, and grids that are grown from one of them."""
 
     _points: Array
-    _areas: Array
-    _larger: float
+    _alike: Alike
+    _follows: Alike
 
     def __post_init__(self) -> None:
         self._tree = load("scipy.spatial").cKDTree(self._points)
 
-    def starts(self) -> Iterator[tuple[int, Array]]:
+    def starts(self, neighbours: int) -> Iterator[tuple[int, Array]]:
         """Yield dots with neighbours on four sides, and the steps (2, 2) to two of them.
 
-        Those that have two exactly opposite each other come first.
+        Those whose neighbours are exactly opposite each other come first.
         """
         points = self._points
-        _, near = self._tree.query(points, min(NEIGHBOURS + 1, len(points)))
+        _, near = self._tree.query(points, min(neighbours + 1, len(points)))
         near = near[:, 1:]
-        part = self._areas[near] / self._areas[:, None]
-        alike = (part < ALIKE) & (part > 1 / ALIKE)
+        alike = self._alike(near, np.arange(len(points))[:, None])
         ways = points[near] - points[:, None]
-        lengths = np.maximum(np.linalg.norm(ways, axis=2), 1e-9)
-        apart = np.linalg.norm(ways[:, :, None] + ways[:, None], axis=3)
-        apart /= np.minimum(lengths[:, :, None], lengths[:, None])
+        # |a + b|^2 = |a|^2 + |b|^2 + 2 a b, all pairs by one product
+        products = ways @ ways.transpose(0, 2, 1)
+        squares = np.maximum(np.einsum("nii->ni", products), 1e-18)
+        apart = squares[:, :, None] + squares[:, None] + 2 * products
+        apart = np.sqrt(np.maximum(apart, 0) / np.minimum(squares[:, :, None], squares[:, None]))
         apart[~(alike[:, :, None] & alike[:, None])] = np.inf
         best = apart.min(axis=(1, 2))
-        for index in np.argsort(best)[: int((best < OPPOSITE).sum())].tolist():
+        ranked = np.argsort(best)[: min(MOST_RANKED, int((best < OPPOSITE).sum()))]
+        worse = _across(ways[ranked], apart[ranked])
+        for index in ranked[np.argsort(worse)][: int((worse < OPPOSITE).sum())].tolist():
             ahead, behind = np.nonzero(np.triu(apart[index] < OPPOSITE))
             steps = (ways[index, ahead] - ways[index, behind]) / 2
             steps = steps[np.argsort(np.linalg.norm(steps, axis=1))]
@@ -119,47 +152,102 @@ class _Grown:
                     break
 
     def grow(self, start: int, steps: Array, most: int) -> Lattice:
-        """Return all dots that are reached from one step by step, or a few more than ``most``."""
+        """Return all dots that are reached from one step by step, or some more than ``most``."""
         places: Lattice = {(0, 0): start}
         taken = {start}
-        reached = deque([((0, 0), steps, float(self._areas[start]))])
+        # each with the steps from it, and the one that those after it are like
+        reached = [((0, 0), start, steps, start)]
+        waves = 0
         while reached and len(places) <= most:
-            here, steps, area = reached.popleft()
-            ways = np.concatenate([steps, -steps])
-            ahead = self._points[places[here]] + ways
-            off, near = self._tree.query(ahead, min(3, len(self._points)))
-            longest = NEAR * np.linalg.norm(ways, axis=1)
-            for side, (column, row) in enumerate(_AROUND):
-                there = (here[0] + column, here[1] + row)
-                dots = near[side, off[side] < longest[side]].tolist()
-                fits = [dot for dot in dots if dot not in taken and self._follows(dot, area)]
-                if there in places or not fits:
-                    continue
-                dot = places[there] = fits[0]
-                taken.add(dot)
-                step = steps.copy()
-                step[side % 2] = (column + row) * (self._points[dot] - self._points[places[here]])
-                own = float(self._areas[dot])
-                reached.append((there, step, own if _alike(own, area) else area))
+            if waves == 2 and len(places) < LEAST_AROUND:
+                break
+            waves += 1
+            around = self._around(reached, NEAR_FIRST if waves < 2 else NEAR)
+            wave, reached = reached, []
+            for (here, dot, steps, like), sides in zip(wave, around, strict=True):
+                for side, fits in enumerate(sides):
+                    column, row = _AROUND[side]
+                    there = (here[0] + column, here[1] + row)
+                    free = next((one for one in fits if one not in taken), None)
+                    if free is None or there in places:
+                        continue
+                    places[there] = free
+                    taken.add(free)
+                    step = steps.copy()
+                    step[side % 2] = (column + row) * (self._points[free] - self._points[dot])
+                    own = bool(self._alike(np.array(free), np.array(like)))
+                    reached.append((there, free, step, free if own else like))
         return places
 
-    def _follows(self, dot: int, area: float) -> bool:
-        mine = float(self._areas[dot])
-        return _alike(mine, area) or _alike(mine, self._larger * area)
+    def complete(self, places: Lattice, most: int) -> None:
+        """Add the dots next to a grid that are where all of its dots say that they are.
+
+        Far from the start and near the horizon the last step alone says it less well.
+        """
+        added = True
+        while added and len(places) <= most:
+            added = False
+            mapped = GridMap(np.array(list(places), float), self._points[list(places.values())])
+            taken = set(places.values())
+            next_to = {
+                (x + column, y + row): dot
+                for (x, y), dot in places.items()
+                for column, row in _AROUND
+                if (x + column, y + row) not in places
+            }
+            at = np.array(list(next_to), dtype=np.float64)
+            longest = NEAR * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(axis=1)
+            off, near = self._tree.query(mapped(at))
+            fits = (off < longest) & self._follows(near, np.array(list(next_to.values())))
+            for place, dot, fit in zip(next_to, near.tolist(), fits.tolist(), strict=True):
+                if fit and dot not in taken:
+                    places[place] = dot
+                    taken.add(dot)
+                    added = True
+
+    def _around(
+        self, reached: list[tuple[Place, int, Array, int]], limit: float
+    ) -> list[list[list[int]]]:
+        """Return for each dot and each of its four sides the dots that may be next there.
+
+        ``limit``: of a step, from where it leads to such a dot at most.
+        """
+        dots = np.array([dot for _, dot, _, _ in reached])
+        like = np.array([like for _, _, _, like in reached])
+        steps = np.stack([steps for _, _, steps, _ in reached])
+        ways = np.concatenate([steps, -steps], axis=1)
+        ahead = self._points[dots][:, None] + ways
+        off, near = self._tree.query(ahead, min(3, len(self._points)))
+        fits = off < limit * np.linalg.norm(ways, axis=2)[:, :, None]
+        fits &= self._follows(near, like[:, None, None])
+        return [
+            [
+                [dot for dot, fit in zip(*side, strict=True) if fit]
+                for side in zip(*one, strict=True)
+            ]
+            for one in zip(near.tolist(), fits.tolist(), strict=True)
+        ]
+
+
+def _across(ways: Array, apart: Array) -> Array:
+    """Return how far apart (N,) the best two opposites are that lie across the best two of all.
+
+    ``ways`` (N, K, 2) lead to neighbours, two of which are ``apart`` (N, K, K) from being opposite.
+    """
+    count, around, _ = apart.shape
+    between = (ways[:, :, None] - ways[:, None]).reshape(count, around * around, 2)
+    between /= np.maximum(np.linalg.norm(between, axis=2, keepdims=True), 1e-9)
+    flat = apart.reshape(count, around * around)
+    first = between[np.arange(count), flat.argmin(axis=1)][:, None]
+    sine = np.abs(between[:, :, 0] * first[:, :, 1] - between[:, :, 1] * first[:, :, 0])
+    return np.asarray(np.where(sine > LEAST_SINE, flat, np.inf).min(axis=1))
 
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
     """Return whether a flat sheet's grid may be seen so: among many dots, chance finds others."""
     places = np.array(list(grid), dtype=np.float64)
     found = points[list(grid.values())]
-    matrix = fit_homography(places, found)
-    if matrix is None:
-        return False
-    seen = partial(apply_homography, matrix)
+    seen = GridMap(places, found)
     off = np.linalg.norm(seen(places) - found, axis=1)
     steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
     return bool(np.median(off / steps) < REGULAR)
-
-
-def _alike(area: float, other: float) -> bool:
-    return other / ALIKE < area < other * ALIKE

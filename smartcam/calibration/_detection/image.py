@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,9 @@ USUAL_SIZE = 1600
 
 In a larger one it takes seconds and finds less.
 """
+
+
+Level = TypeVar("Level", np.uint8, np.float32)
 
 
 class GreyImage(NamedTuple):
@@ -71,16 +74,28 @@ def grey_image(image: Any) -> GreyImage:
     return GreyImage(levels, np.rint(levels).astype(np.uint8))
 
 
-def scaled(image: GreyImage, scale: float) -> NDArray[np.uint8]:
-    """Return an image's bytes, ``scale`` times as wide and high.
+def scaled(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
+    """Return an image, ``scale`` times as wide and high.
 
     A place ``p`` of it is ``(p + 0.5) / scale - 0.5`` in the image.
     """
     if scale == 1.0:
-        return image.bytes
+        return image
     cv2 = load("cv2")
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    bytes_: NDArray[np.uint8] = cv2.resize(
-        image.bytes, None, fx=scale, fy=scale, interpolation=kind
-    )
-    return bytes_
+    other: NDArray[np.uint8] = cv2.resize(image, None, fx=scale, fy=scale, interpolation=kind)
+    return other
+
+
+def reduced(levels: NDArray[Level], times: int) -> NDArray[Level]:
+    """Return levels (H, W) each of which is the mean of ``times`` by ``times`` of the given ones.
+
+    A place ``p`` among them is ``(p + 0.5) * times - 0.5`` in the image.
+    """
+    if times == 1:
+        return levels
+    cv2 = load("cv2")
+    height, width = (side // times for side in levels.shape)
+    cut = levels[: height * times, : width * times]
+    smaller: NDArray[Level] = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
+    return smaller

@@ -1,0 +1,117 @@
+"""Where four squares may meet: saddles of the grey levels.
+
+Around a corner of a checkerboard two dark sectors lie opposite each other between two light ones.
+Its grey levels are a saddle there, and on a circle around it they come twice: a half turn further
+they are the same, and they go up and down twice. By the darker sectors' direction a corner's
+neighbours are told from others: theirs is turned by 90 degrees, however the sheet is seen.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._detection.pixels import Floats
+    from smartcam.calibration._geometry.rotations import Array
+
+SMOOTHED = 1.0
+"""Standard deviation of the Gaussian before second derivatives are taken, pixels."""
+
+LEAST_BENT = 0.3
+"""Of a saddle: ``f_xy^2 - f_xx f_yy``, in grey levels of 255 and pixels; a sharp corner with a step
+of 15 grey levels has 1."""
+
+RADIUS = 3.0
+"""Of the circle that is looked at, pixels: squares of seven pixels have only their own on it."""
+
+LEAST_STEP = 1.0
+"""Grey levels by which a circle's levels swing at least."""
+
+MOST_UNLIKE = 0.35
+"""Of what a circle's levels have in common with those opposite, what they differ by at most."""
+
+MOST_KEPT = 600
+"""Of those that look like a corner, the strongest ones."""
+
+MOST_LOOKED_AT = 1500
+"""Saddles of an image, the strongest ones; so that noise and leaves take no more than others."""
+
+_ANGLES = np.arange(16) * np.pi / 8
+_CIRCLE = RADIUS * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_TWICE = np.column_stack([np.cos(2 * _ANGLES), np.sin(2 * _ANGLES)]) / 16
+
+
+class Saddles(NamedTuple):
+    """What may be corners."""
+
+    points: Array  # (N, 2), pixels
+    # (N, 2), unit vectors, at twice the angle of where the lighter sectors lie
+    turns: Array
+
+    def alike(self, one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return whether corners, by their indices, may be neighbours on a board."""
+        cosine = (self.turns[one] * self.turns[other]).sum(axis=-1)
+        return np.asarray(cosine < -0.5)
+
+
+def find_saddles(image: NDArray[np.uint8]) -> Saddles:
+    """Return the corners that an image (H, W) may show."""
+    cv2 = load("cv2")
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHED)
+    xx, yy, xy = (
+        cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=0.25)
+        for order in ((2, 0), (0, 2), (1, 1))
+    )
+    bent = xy * xy - xx * yy
+    highest = cv2.dilate(bent, np.ones((5, 5), np.uint8))
+    peaks = (bent == highest) & (bent > LEAST_BENT)
+    rim = int(RADIUS) + 1
+    inside = peaks[rim:-rim, rim:-rim]
+    v, u = np.divmod(np.flatnonzero(inside), inside.shape[1])
+    at = np.column_stack([u, v]) + rim
+    if len(at) > MOST_LOOKED_AT:
+        strength = bent[at[:, 1], at[:, 0]]
+        at = at[np.argpartition(strength, -MOST_LOOKED_AT)[-MOST_LOOKED_AT:]]
+    if not len(at):
+        return Saddles(np.zeros((0, 2)), np.zeros((0, 2)))
+    ring = (at[:, None] + _CIRCLE).astype(np.float32)
+    levels = cv2.remap(smooth, ring, None, cv2.INTER_LINEAR).astype(np.float64)
+    turns = levels @ _TWICE
+    swing = np.linalg.norm(turns, axis=1)
+    good = _comes_twice(levels) & (swing > LEAST_STEP)
+    if good.sum() > MOST_KEPT:
+        good &= swing >= np.partition(swing[good], -MOST_KEPT)[-MOST_KEPT]
+    at = at[good]
+    bends = np.stack([part[at[:, 1], at[:, 0]] for part in (xx, xy, xy, yy)], axis=1)
+    return Saddles(at + _way(smooth, at, bends), turns[good] / swing[good, None])
+
+
+def _way(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
+    """Return the ways (N, 2) from pixels to the saddles, where the slope is 0; a pixel at most.
+
+    ``bends`` (N, 4): second derivatives there.
+    """
+    u, v = at.T
+    slopes = np.stack(
+        [smooth[v, u + 1] - smooth[v, u - 1], smooth[v + 1, u] - smooth[v - 1, u]], axis=1
+    )
+    ways = np.linalg.solve(bends.reshape(-1, 2, 2), -slopes[:, :, None] / 2)[:, :, 0]
+    return np.asarray(ways.clip(-1, 1), dtype=np.float64)
+
+
+def _comes_twice(levels: Array) -> NDArray[np.bool_]:
+    """Return whether circles (N, 16) have the same on both halves, one dark and one light part."""
+    here, opposite = levels[:, :8], levels[:, 8:]
+    common, apart = (here + opposite) / 2, (here - opposite) / 2
+    middle = (common.max(axis=1) + common.min(axis=1)) / 2
+    light = common > middle[:, None]
+    changes = (light != np.roll(light, 1, axis=1)).sum(axis=1)
+    spread = common - common.mean(axis=1, keepdims=True)
+    same = (apart**2).sum(axis=1) < MOST_UNLIKE * (spread**2).sum(axis=1)
+    return np.asarray(same & (changes == 2))
