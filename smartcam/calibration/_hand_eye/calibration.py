@@ -34,7 +34,6 @@ from smartcam.calibration._hand_eye.model_selection import (
     NOTHING,
     Problem,
     candidates,
-    choose,
 )
 from smartcam.calibration._hand_eye.result import HandEyeCalibration, as_transform
 from smartcam.calibration._hand_eye.validation import (
@@ -55,7 +54,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._hand_eye.equations import Setup, Solution
+    from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.calibration._hand_eye.model_selection import Candidate
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._lens.poses import TargetPose
@@ -415,11 +414,10 @@ def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibrat
             expected=list(METHODS),
             got=method,
         )
-    found = candidates(problem, free, method)
-    chosen = choose(found, method=method, besides=next(iter(free)) if len(free) == 1 else None)
-    if chosen is None or chosen.solution is None:
+    chosen, found = candidates(problem, free, method)
+    if chosen is None:
         raise poor_fit(f"none at all {problem.count} poses", None)
-    return _result(problem, chosen, chosen.solution, found, pose)
+    return _result(problem, chosen, found, pose)
 
 
 def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
@@ -433,11 +431,10 @@ def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
 def _result(
     problem: Problem,
     chosen: Candidate,
-    solution: Solution,
     found: Sequence[Candidate],
     pose: Transform,
 ) -> HandEyeCalibration:
-    in_hand = problem.robot.in_hand
+    in_hand, solution = problem.robot.in_hand, chosen.solution
     hand, base = pose.source, pose.target
     seen = chosen.problem.seen
     errors = chosen.problem.errors(solution)
@@ -457,14 +454,14 @@ def _result(
         mean_error=float(np.concatenate(errors).mean()),
         leave_one_out=held_out,
         held_out_error=chosen.held_out if math.isfinite(chosen.held_out) else None,
-        covariance=_covariance(problem, chosen, solution),
+        covariance=_covariance(problem, chosen),
         robot_sigmas=None if solution.noise is None else solution.noise.robot,
         robot_poses=(),
         used=(True,) * problem.count,
     )
 
 
-def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Array:
+def _covariance(problem: Problem, chosen: Candidate) -> Array:
     """Return that of the steps of camera and target (12, 12).
 
     Where the noise of the robot was part of the solution, it says; where that was estimated, the
@@ -472,7 +469,7 @@ def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Arra
     Otherwise the solutions without some of the poses say, by the jackknife. NaN where the poses are
     too few to estimate any noise.
     """
-    wider = 1.0
+    wider, solution, others = 1.0, chosen.solution, chosen.others
     if problem.sigmas is None:
         if problem.count < LEAST_KNOWN:
             return np.full((12, 12), np.nan)
@@ -482,11 +479,9 @@ def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Arra
     if solution.information is not None and solution.noise is not None:
         joint: Array = wider * inverse_scaled(solution.information)[:12, :12]
         return joint
-    others = [other for _, other in chosen.folds]
-    if len(others) < 2:
+    if others is None:
         return np.full((12, 12), np.nan)
-    cameras = solution.camera.before(Rigid.stacked(one.camera for one in others))
-    targets = solution.target.before(Rigid.stacked(one.target for one in others))
+    cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
     steps = np.concatenate([cameras, targets], axis=1)
     # (n - 1) / n sum (x_i - mean) (x_i - mean)^T of the n solutions that leave one out.
     # Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11.

@@ -24,6 +24,9 @@ LEAST_POSES = 3
 SAME_TURN = math.radians(0.5)
 """Poses turned less against each other count as one."""
 
+MOST_PAIRED = 40
+"""Poses of which each pair is taken: time grows with the square of their number."""
+
 LEAST_TURN = math.radians(2.0)
 """Rms turn of the poses about the second of their axes; one axis alone determines nothing."""
 
@@ -116,11 +119,17 @@ def second_turn(robot: RobotPoses) -> float:
     return float(singular[1] / math.sqrt(len(between)))
 
 
-def solve_linear(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid] | None:
+def solve_linear(
+    name: str, robot: RobotPoses, seen: Rigid, *, exactly: bool = False
+) -> tuple[Rigid, Rigid] | None:
     """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`LINEAR`); None where it fails.
 
-    ``seen``: ``T_camera_target`` of each view.
+    ``seen``: ``T_camera_target`` of each view. ``exactly``: by all of them, however many: else a
+    method that takes them in pairs gets some of many, which is enough to begin with.
     """
+    if name in HAND_EYE and not exactly and seen.size > MOST_PAIRED:
+        some = np.linspace(0, seen.size - 1, MOST_PAIRED).round().astype(np.intp)
+        robot, seen = robot.taken(some), seen.taken(some)
     try:
         found = LINEAR[name](name, robot, seen)
     except (load("cv2").error, np.linalg.LinAlgError):
