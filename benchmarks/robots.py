@@ -138,9 +138,7 @@ def _planned(
     hand = Rigid(
         exp_rotation(random.uniform(-0.5, 0.5, size=3)), random.uniform(-0.06, 0.06, size=3)
     )
-    looks = [
-        one.rigid for one in around(SHEET, count, tilt=cone, distance=DISTANCE, random=random)
-    ]
+    looks = [one.rigid for one in around(SHEET, count, tilt=cone, distance=DISTANCE, random=random)]
     looks = [looks[i] for i in random.permutation(count)]
     spot = np.array([0.4, 0.0, 0.15]) + random.uniform(-0.05, 0.05, size=3)
     if setup == "eye-in-hand":
@@ -165,8 +163,10 @@ def forward(joints: Array, lengths: Array = LENGTHS) -> Rigid:
     place = place @ Rigid(_about(1, elbow), np.array([0.0, 0.0, upper]))
     place = place @ Rigid(_about(2, roll), np.array([0.0, 0.0, lower]))
     place = place @ Rigid(_about(1, bend), np.zeros(3))
-    return place @ Rigid(_about(2, last), np.array([0.0, 0.0, 0.0])) @ Rigid(
-        np.eye(3), np.array([0.0, 0.0, hand])
+    return (
+        place
+        @ Rigid(_about(2, last), np.array([0.0, 0.0, 0.0]))
+        @ Rigid(np.eye(3), np.array([0.0, 0.0, hand]))
     )
 
 
@@ -215,7 +215,16 @@ KINDS = (
     Kind("offsets6", poses=6, offsets=0.1),
     Kind("tails2", poses=10, degrees=0.02, millimetres=0.1, tails=2),
     Kind("noise40", poses=40, degrees=0.05, millimetres=0.3),
-    Kind("all", poses=20, offsets=0.05, play=0.03, links=0.2, degrees=0.02, millimetres=0.05, drift=0.2),
+    Kind(
+        "all",
+        poses=20,
+        offsets=0.05,
+        play=0.03,
+        links=0.2,
+        degrees=0.02,
+        millimetres=0.05,
+        drift=0.2,
+    ),
     Kind("noise5", poses=5, degrees=0.02, millimetres=0.1),
     Kind("narrow", cone=8, degrees=0.02, millimetres=0.1),
 )

@@ -22,7 +22,7 @@ import numpy as np
 from smartcam.calibration._codes import Code, Remark
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._geometry.rigid import Rigid
-from smartcam.calibration._hand_eye.closed_forms import check_motion, second_turn
+from smartcam.calibration._hand_eye.closed_forms import check_motion, second_turns
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
     PoseObservations,
@@ -36,6 +36,7 @@ from smartcam.calibration._hand_eye.model_selection import (
     candidates,
 )
 from smartcam.calibration._hand_eye.result import HandEyeCalibration, as_transform
+from smartcam.calibration._hand_eye.sights import locate_all
 from smartcam.calibration._hand_eye.validation import (
     check_poses,
     expected_error,
@@ -44,7 +45,7 @@ from smartcam.calibration._hand_eye.validation import (
 )
 from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
-from smartcam.calibration._lens.poses import CAMERA, TARGET, locate
+from smartcam.calibration._lens.poses import CAMERA, TARGET
 from smartcam.calibration._lens.projection import excess, whitening
 from smartcam.exceptions import CalibrationError
 
@@ -62,13 +63,14 @@ if TYPE_CHECKING:
     from smartcam.models import Pose
 
 MOST_POSES = 200
-"""Of one calibration, which takes half a minute then."""
+"""Of one calibration, which takes some seconds then."""
 
 ADVISED_POSES = 8
 """Below as many, what is left over tells little of the error."""
 
 ADVISED_TURN = math.radians(8.0)
-"""Rms turn of the poses about the second of their axes that is worth its name."""
+"""Rms turn of the poses about the second of their axes that is worth its name; that of some of
+eight poses differs by two degrees or three."""
 
 SCALE_OFF = 0.005
 """Difference between the target's size and the nominal one that is worth a remark."""
@@ -147,7 +149,7 @@ def calibrate_hand_eye(
         )
     ordered = [views[i] for i in order]
     lens = camera if camera is not None else calibrate_intrinsics(ordered, sheet="exact").camera
-    located = [locate(one, lens) for one in ordered]
+    located = locate_all(ordered, lens)
     poses = Rigid.stacked(one.transform.rigid for one in located)
     problem = Problem(
         robot=robot,
@@ -504,12 +506,14 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
             f"expected {ADVISED_POSES} poses or more for an error that can be relied on, got "
             f"{problem.count}",
         )
-    turn = second_turn(problem.robot)
+    # a remark that one pose more or less brings or takes away helps nobody
+    turn = float(second_turns(problem.robot).max())
     if turn < ADVISED_TURN:
         yield Remark(
             Code.INSUFFICIENT_ROTATION,
             f"expected the robot to turn by {math.degrees(ADVISED_TURN):g} deg rms about a second "
-            f"axis, got {math.degrees(turn):.1f} deg: tilt it more to both sides",
+            f"axis, got {math.degrees(turn):.1f} deg, whichever pose is left out: tilt it more to "
+            "both sides",
         )
     if result.held_out_error is None:
         yield Remark(Code.NOT_HELD_OUT, "too few poses to leave one out: no held-out error")

@@ -110,13 +110,32 @@ def check_motion(robot: RobotPoses) -> None:
 
 def second_turn(robot: RobotPoses) -> float:
     """Return the rms turn of the poses against each other about the second of their axes, rad."""
+    products = _turns(robot)
+    return float(_second(products.sum(axis=(0, 1)), len(products)))
+
+
+def second_turns(robot: RobotPoses) -> Array:
+    """Return the same (V,) of the poses without each in turn; of all where they are too few."""
+    products = _turns(robot)
+    whole, count = products.sum(axis=(0, 1)), len(products)
+    if count <= LEAST_POSES:
+        return np.full(count, _second(whole, count))
+    return _second(whole - 2.0 * products.sum(axis=1), count - 1)
+
+
+def _turns(robot: RobotPoses) -> Array:
+    """Return the products b b^T of the turns b from each pose to each, (V, V, 3, 3)."""
     turns = robot.poses.rotation
-    first, later = np.triu_indices(len(turns), 1)
-    between = log_rotation(np.swapaxes(turns[first], 1, 2) @ turns[later])
-    # Rotation vectors of one axis are multiples of each other: the second singular value is 0. Over
-    # the root of their number it is an rms.
-    singular = np.asarray(np.linalg.svd(between, compute_uv=False), dtype=np.float64)
-    return float(singular[1] / math.sqrt(len(between)))
+    between = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
+    products: Array = between[..., None] * between[..., None, :]
+    return products
+
+
+def _second(products: Array, count: int) -> Array:
+    # Rotation vectors of one axis are multiples of each other: of the sum of their products the
+    # second eigenvalue is 0. Over their number it is a mean square.
+    found: Array = np.sqrt(np.maximum(np.linalg.eigvalsh(products)[..., 1], 0.0))
+    return found / math.sqrt(count * (count - 1))
 
 
 def solve_linear(

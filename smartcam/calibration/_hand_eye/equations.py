@@ -158,6 +158,10 @@ class Observations(ABC):
         """Return some of the views."""
 
     @abstractmethod
+    def settled(self, change: Array) -> Self:
+        """Return them with a change (extra,) of the other parameters, which are known then."""
+
+    @abstractmethod
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, M) and their derivatives (V, M, 6 + extra).
 
@@ -189,6 +193,11 @@ class PixelObservations(Observations):
             pixels=self.pixels[index],
             whitening=self.whitening[index],
         )
+
+    def settled(self, change: Array) -> PixelObservations:
+        """Return them with a change (extra,) of the other parameters, which are known then."""
+        points = self.scale(change) * self.points
+        return dataclasses.replace(self, model=self.camera(change), points=points, free=())
 
     def camera(self, change: Array) -> CameraModel:
         """Return the camera with some of its parameters changed, (extra,)."""
@@ -243,6 +252,10 @@ class PoseObservations(Observations):
         return dataclasses.replace(
             self, poses=self.poses.taken(index), whitening=self.whitening[index]
         )
+
+    def settled(self, change: Array) -> PoseObservations:
+        """Return them with a change (extra,) of the other parameters, which are known then."""
+        return dataclasses.replace(self, poses=self.poses.scaled(self.scale(change)), free=())
 
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, 6) and their derivatives (V, 6, 6 + extra)."""

@@ -61,7 +61,7 @@ ROBOT, REPROJECTION, BETWEEN = "robot", "reprojection", "robot and reprojection"
 METHODS = (ROBOT, REPROJECTION, *LINEAR)
 """What may be asked for beside ``auto``; the last are OpenCV's closed forms."""
 
-CHANCE = 2.0
+CHANCE = 2.5
 """Squared t of the way from one method to the other that counts as chance."""
 
 MOST_FOLDS = 20
@@ -133,7 +133,9 @@ class Problem:
             rays = np.stack([self.seen.camera(one).directions(seen) for one, seen in one_each])
         else:
             camera = self.seen.camera(change[0] if each else change)
-            rays = camera.directions(self.seen.pixels.reshape(-1, 2)).reshape(self.seen.pixels.shape)
+            rays = camera.directions(self.seen.pixels.reshape(-1, 2)).reshape(
+                self.seen.pixels.shape
+            )
         rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
         off: Array = on_plane(rays, *expected) - points
         off[~self.given] = 0.0
@@ -237,19 +239,44 @@ def candidates(
     if method in LINEAR:
         only = _by_closed_form(problem, method, begin)
         return only, [only]
+    if method == REPROJECTION and len(free) == 1:
+        ((besides, numbers),) = free.items()
+        plain = _reprojection(besides, _freed(problem, numbers), begin)
+        return plain, [plain] if plain else []
     judges = _robots(problem, free, begin)
     judge = _asked(judges)
-    besides = judge.besides if judge else next(iter(free))
-    if method == ROBOT:
+    if judge is None or method == ROBOT:
         return judge, judges
-    freed = _freed(problem, free[besides])
-    start = judge.solution if judge else begin
-    plain = _candidate(REPROJECTION, besides, freed, adjust(freed.robot, freed.seen, start))
+    plain = _reprojection_beside(judge)
     found = [*judges, *([plain] if plain else [])]
-    if method == REPROJECTION or judge is None or plain is None:
-        return (plain if method == REPROJECTION or judge is None else judge), found
+    if method == REPROJECTION or plain is None:
+        return (plain if method == REPROJECTION else judge), found
     taken = _between(judge, plain)
     return taken, found if taken in found else [*found, taken]
+
+
+def _reprojection(besides: str, problem: Problem, begin: Solution) -> Candidate | None:
+    """Return what takes the robot's poses as they are said."""
+    start = dataclasses.replace(begin, noise=None)
+    return _candidate(REPROJECTION, besides, problem, adjust(problem.robot, problem.seen, start))
+
+
+def _reprojection_beside(robot: Candidate) -> Candidate | None:
+    """Return the same with the scale and the lens that another candidate found.
+
+    How large a target is tells its distance, which pixels hardly tell.
+    """
+    change, freed = robot.solution.change, robot.problem
+    known = dataclasses.replace(freed, seen=freed.seen.settled(change))
+    start = dataclasses.replace(robot.solution, change=np.zeros(0))
+    found = _reprojection(robot.besides, known, start)
+    if found is None or not len(change):
+        return found
+    found.problem, found.solution = freed, dataclasses.replace(found.solution, change=change)
+    if found.others is not None and robot.others is not None:
+        found.others = dataclasses.replace(found.others, change=robot.others.change)
+        found.off = freed.off(found.others)
+    return found
 
 
 def _robots(
@@ -352,9 +379,7 @@ def _begin(problem: Problem) -> Solution | None:
     return min(ranked)[2] if ranked else None
 
 
-def _candidate(
-    method: str, besides: str, problem: Problem, solution: Solution
-) -> Candidate | None:
+def _candidate(method: str, besides: str, problem: Problem, solution: Solution) -> Candidate | None:
     """Return a candidate with its held-out errors; None where it does not fit."""
     scale = problem.seen.scale(solution.change)
     if not math.isfinite(solution.cost) or abs(scale - 1.0) > MOST_SCALE:
