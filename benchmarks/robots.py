@@ -8,9 +8,10 @@ may differ from what is believed, too.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from smartcam.calibration._targets import Checkerboard, resized
 from smartcam.calibration.simulation._scenes import around, view
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.calibration._views import TargetView
@@ -35,6 +38,9 @@ CAMERA = CameraModel(
 LENGTHS = np.array([0.4, 0.45, 0.45, 0.1])
 """Of the arm, metres: from the floor to the shoulder, to the elbow, to the wrist, to the flange."""
 
+GEARS = 40.0
+"""Waves of a joint's ripple in a turn."""
+
 DISTANCE = 0.4
 """From camera to sheet, metres."""
 
@@ -44,6 +50,7 @@ class Kind:
     """What is wrong with a robot; all of it standard deviations where nothing else is said."""
 
     name: str
+    seen: Literal["chosen-by", "unseen"] = "chosen-by"
     poses: int = 15
     cone: float = 30.0  # degrees
     pixels: float = 0.1
@@ -53,6 +60,8 @@ class Kind:
     offsets: float = 0.0  # of the joints, degrees
     play: float = 0.0  # between the two sides of a tooth, degrees; the joint leans to the last way
     links: float = 0.0  # of each length, mm
+    sag: float = 0.0  # of shoulder and elbow where the arm is stretched out level, degrees; fixed
+    ripple: float = 0.0  # of each joint as its gears turn, degrees; an amplitude
     drift: float = 0.0  # of the robot's base, mm between first and last pose; a tenth of it in deg
     focal: float = 0.0  # by which the focal length differs from the believed one, part of it
     scale: float = 0.0  # by which the sheet does, part of it; fixed
@@ -72,7 +81,7 @@ class Kind:
             between = place.inverse() if setup == "eye-in-hand" else place
             seen = Transform("camera", "target", *(camera.inverse() @ (between @ target)))
             shown = view(sheet, really, seen, sigma=self.pixels, random=random)
-            views.append(_of(SHEET, shown))
+            views.append(dataclasses.replace(shown, target=SHEET))
         said = [Transform("base", "flange", *one) for one in told]
         order = random.permutation(count) if not self.drift else np.arange(count)
         split = np.sort(order[: self.poses]), np.sort(order[self.poses :])
@@ -85,13 +94,14 @@ class Kind:
         offsets = math.radians(self.offsets) * random.normal(size=6)
         lengths = LENGTHS + 1e-3 * self.links * random.normal(size=4)
         away, turned = random.normal(size=3), random.normal(size=3)
+        phases = np.random.default_rng(int(1e6 * abs(away[0]))).uniform(-3, 3, size=6)
         real: list[Rigid] = []
         last = np.zeros(6)
         for number, one in enumerate(told):
             joints = inverse(one)
             lean = math.radians(self.play) / 2 * np.sign(joints - last)
             last = joints
-            place = forward(joints + offsets + lean, lengths)
+            place = forward(joints + offsets + lean + self._bent(joints, phases), lengths)
             late = number / len(told)
             moved = Rigid(
                 exp_rotation(math.radians(0.1 * self.drift) * late * turned),
@@ -101,6 +111,13 @@ class Kind:
             heavy = math.sqrt(self.tails / random.chisquare(self.tails)) if self.tails < 99 else 1.0
             real.append((moved @ place).turned_before(heavy * size * random.normal(size=6)))
         return real
+
+    def _bent(self, joints: Array, phases: Array) -> Array:
+        """Return by how much joints (6,) are off for where they are, radians."""
+        bent: Array = math.radians(self.ripple) * np.sin(GEARS * joints + phases)
+        bent[1] += math.radians(self.sag) * math.sin(joints[1])
+        bent[2] += math.radians(self.sag) * math.sin(joints[1] + joints[2])
+        return bent
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,14 +137,8 @@ class Measured:
     poses: list[Transform]
     views: list[TargetView]
     camera: Rigid
-    used: Array = field(repr=False)
-    fresh: Array = field(repr=False)
-
-
-def _of(sheet: Checkerboard, shown: TargetView) -> TargetView:
-    import dataclasses
-
-    return dataclasses.replace(shown, target=sheet)
+    used: NDArray[np.intp] = field(repr=False)
+    fresh: NDArray[np.intp] = field(repr=False)
 
 
 def _planned(
@@ -198,25 +209,27 @@ def _about(axis: int, angle: float) -> Array:
 
 
 KINDS = (
-    Kind("exact"),
+    Kind("no error"),
     Kind("noise", degrees=0.02, millimetres=0.1),
-    Kind("noise3", poses=10, degrees=0.05, millimetres=0.3, pixels=0.3),
-    Kind("noise8", poses=8, cone=20, degrees=0.02, millimetres=0.05, pixels=0.5),
-    Kind("noise6", poses=6, degrees=0.05, millimetres=0.3),
-    Kind("offsets", offsets=0.1),
-    Kind("offsets3", offsets=0.3),
-    Kind("tails3", degrees=0.02, millimetres=0.1, tails=3),
-    Kind("scale", scale=0.01, degrees=0.02, millimetres=0.1),
+    Kind("noise, 10 poses", poses=10, degrees=0.05, millimetres=0.3, pixels=0.3),
+    Kind("noise, 8 poses", poses=8, cone=20, degrees=0.02, millimetres=0.05, pixels=0.5),
+    Kind("noise, 6 poses", poses=6, degrees=0.05, millimetres=0.3),
+    Kind("noise, 5 poses", poses=5, degrees=0.02, millimetres=0.1),
+    Kind("noise, 40 poses", poses=40, degrees=0.05, millimetres=0.3),
+    Kind("noise, narrow cone", cone=8, degrees=0.02, millimetres=0.1),
+    Kind("heavy tails", degrees=0.02, millimetres=0.1, tails=3),
+    Kind("heavier tails, 10 poses", poses=10, degrees=0.02, millimetres=0.1, tails=2),
+    Kind("joint offsets of 0.1 deg", offsets=0.1),
+    Kind("joint offsets of 0.3 deg", offsets=0.3),
+    Kind("joint offsets, 6 poses", poses=6, offsets=0.1),
     Kind("play", play=0.1),
-    Kind("play30", poses=30, play=0.05, degrees=0.01, millimetres=0.05),
+    Kind("play, 30 poses", poses=30, play=0.05, degrees=0.01, millimetres=0.05),
     Kind("drift", drift=1.0, degrees=0.01, millimetres=0.05),
-    Kind("links", links=0.5),
-    Kind("focal", focal=0.005, degrees=0.02, millimetres=0.1),
-    Kind("offsets6", poses=6, offsets=0.1),
-    Kind("tails2", poses=10, degrees=0.02, millimetres=0.1, tails=2),
-    Kind("noise40", poses=40, degrees=0.05, millimetres=0.3),
+    Kind("lengths of the links", links=0.5),
+    Kind("another focal length", focal=0.005, degrees=0.02, millimetres=0.1),
+    Kind("a larger sheet", scale=0.01, degrees=0.02, millimetres=0.1),
     Kind(
-        "all",
+        "all of it, 20 poses",
         poses=20,
         offsets=0.05,
         play=0.03,
@@ -225,6 +238,11 @@ KINDS = (
         millimetres=0.05,
         drift=0.2,
     ),
-    Kind("noise5", poses=5, degrees=0.02, millimetres=0.1),
-    Kind("narrow", cone=8, degrees=0.02, millimetres=0.1),
+    Kind("sag", "unseen", sag=0.2, degrees=0.01, millimetres=0.05),
+    Kind("ripple of the gears", "unseen", ripple=0.05),
+    Kind("offsets and noise, 25", "unseen", poses=25, offsets=0.05, degrees=0.03, millimetres=0.2),
+    Kind("play, 8 poses", "unseen", poses=8, play=0.1, degrees=0.01),
+    Kind("offsets, tails, 12", "unseen", poses=12, offsets=0.05, degrees=0.02, tails=3),
+    Kind("ripple and drift, 30", "unseen", poses=30, ripple=0.03, drift=0.5, millimetres=0.05),
 )
+"""What was looked at while methods were chosen, then what was not."""
