@@ -119,7 +119,8 @@ def calibrate_hand_eye(
         camera: its lens; None: calibrated from the same views, which should then tilt the target.
             The expected errors take it as exact either way: from the same views it is not, and they
             come out up to three times too small.
-        method: ``auto``: the candidate that predicts left-out poses best; or the name of one, see
+        method: ``auto``: what lies between ``robot`` and ``reprojection`` and predicts left-out
+            poses best; or one of these, or one of OpenCV's closed forms, see
             :data:`~smartcam.calibration._hand_eye.model_selection.METHODS`.
         adjust: what is adjusted besides the poses: the target's ``scale`` (printers change it),
             the ``camera``, ``nothing``; ``auto``: what the held-out error asks for.
