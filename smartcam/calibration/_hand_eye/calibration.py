@@ -23,7 +23,7 @@ from smartcam.calibration._codes import Code, Remark
 from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._geometry.rotations import as_vector
-from smartcam.calibration._hand_eye.closed_forms import check_motion, second_turn
+from smartcam.calibration._hand_eye.closed_forms import check_motion, second_turns
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
     PoseObservations,
@@ -35,9 +35,9 @@ from smartcam.calibration._hand_eye.model_selection import (
     NOTHING,
     Problem,
     candidates,
-    choose,
 )
 from smartcam.calibration._hand_eye.result import HandEyeCalibration, as_transform
+from smartcam.calibration._hand_eye.sights import locate_all
 from smartcam.calibration._hand_eye.validation import (
     check_poses,
     expected_error,
@@ -47,7 +47,7 @@ from smartcam.calibration._hand_eye.validation import (
 )
 from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
-from smartcam.calibration._lens.poses import CAMERA, TARGET, locate
+from smartcam.calibration._lens.poses import CAMERA, TARGET
 from smartcam.calibration._lens.projection import excess, whitening
 from smartcam.calibration._lens.suspicions import without_strays
 from smartcam.calibration._views import as_list, as_views
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._hand_eye.equations import Setup, Solution
+    from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.calibration._hand_eye.model_selection import Candidate
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._lens.poses import TargetPose
@@ -67,13 +67,14 @@ if TYPE_CHECKING:
     from smartcam.models import Pose
 
 MOST_POSES = 200
-"""Of one calibration, which takes half a minute then."""
+"""Of one calibration, which takes some seconds then."""
 
 ADVISED_POSES = 8
 """Below as many, what is left over tells little of the error."""
 
 ADVISED_TURN = math.radians(8.0)
-"""Rms turn of the poses about the second of their axes that is worth its name."""
+"""Rms turn of the poses about the second of their axes that is worth its name; that of some of
+eight poses differs by two degrees or three."""
 
 SCALE_OFF = 0.005
 """Difference between the target's size and the nominal one that is worth a remark."""
@@ -122,7 +123,8 @@ def calibrate_hand_eye(
         camera: its lens; None: calibrated from the same views, which should then tilt the target.
             The expected errors take it as exact either way: from the same views it is not, and they
             come out up to three times too small.
-        method: ``auto``: the candidate that predicts left-out poses best; or the name of one, see
+        method: ``auto``: what lies between ``robot`` and ``reprojection`` and predicts left-out
+            poses best; or one of these, or one of OpenCV's closed forms, see
             :data:`~smartcam.calibration._hand_eye.model_selection.METHODS`.
         adjust: what is adjusted besides the poses: the target's ``scale`` (printers change it),
             the ``camera``, ``nothing``; ``auto``: what the held-out error asks for.
@@ -153,9 +155,9 @@ def calibrate_hand_eye(
         )
     ordered = [views[i] for i in order]
     lens = camera if camera is not None else calibrate_intrinsics(ordered, sheet="exact").camera
-    located = [locate(one, lens) for one in ordered]
+    located = locate_all(ordered, lens)
     ordered, strays = without_strays(ordered, located, lens)
-    located = [locate(one, lens) for one in ordered] if strays else located
+    located = locate_all(ordered, lens) if strays else located
     poses = Rigid.stacked(one.transform.rigid for one in located)
     problem = Problem(
         robot=robot,
@@ -428,11 +430,10 @@ def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibrat
             expected=list(METHODS),
             got=method,
         )
-    found = candidates(problem, free, method)
-    chosen = choose(found, method=method, besides=next(iter(free)) if len(free) == 1 else None)
-    if chosen is None or chosen.solution is None:
+    chosen, found = candidates(problem, free, method)
+    if chosen is None:
         raise poor_fit(f"none at all {problem.count} poses", None)
-    return _result(problem, chosen, chosen.solution, found, pose)
+    return _result(problem, chosen, found, pose)
 
 
 def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
@@ -446,11 +447,10 @@ def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
 def _result(
     problem: Problem,
     chosen: Candidate,
-    solution: Solution,
     found: Sequence[Candidate],
     pose: Transform,
 ) -> HandEyeCalibration:
-    in_hand = problem.robot.in_hand
+    in_hand, solution = problem.robot.in_hand, chosen.solution
     hand, base = pose.source, pose.target
     seen = chosen.problem.seen
     errors = chosen.problem.errors(solution)
@@ -470,14 +470,14 @@ def _result(
         mean_error=float(np.concatenate(errors).mean()),
         leave_one_out=held_out,
         held_out_error=chosen.held_out if math.isfinite(chosen.held_out) else None,
-        covariance=_covariance(problem, chosen, solution),
+        covariance=_covariance(problem, chosen),
         robot_sigmas=None if solution.noise is None else solution.noise.robot,
         robot_poses=(),
         used=(True,) * problem.count,
     )
 
 
-def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Array:
+def _covariance(problem: Problem, chosen: Candidate) -> Array:
     """Return that of the steps of camera and target (12, 12).
 
     Where the noise of the robot was part of the solution, it says; where that was estimated, the
@@ -485,7 +485,7 @@ def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Arra
     Otherwise the solutions without some of the poses say, by the jackknife. NaN where the poses are
     too few to estimate any noise.
     """
-    wider = 1.0
+    wider, solution, others = 1.0, chosen.solution, chosen.others
     if problem.sigmas is None:
         if problem.count < LEAST_KNOWN:
             return np.full((12, 12), np.nan)
@@ -495,11 +495,9 @@ def _covariance(problem: Problem, chosen: Candidate, solution: Solution) -> Arra
     if solution.information is not None and solution.noise is not None:
         joint: Array = wider * inverse_scaled(solution.information)[:12, :12]
         return joint
-    others = [other for _, other in chosen.folds]
-    if len(others) < 2:
+    if others is None:
         return np.full((12, 12), np.nan)
-    cameras = solution.camera.before(Rigid.stacked(one.camera for one in others))
-    targets = solution.target.before(Rigid.stacked(one.target for one in others))
+    cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
     steps = np.concatenate([cameras, targets], axis=1)
     # (n - 1) / n sum (x_i - mean) (x_i - mean)^T of the n solutions that leave one out.
     # Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11.
@@ -522,12 +520,14 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
             f"expected {ADVISED_POSES} poses or more for an error that can be relied on, got "
             f"{problem.count}",
         )
-    turn = second_turn(problem.robot)
+    # a remark that one pose more or less brings or takes away helps nobody
+    turn = float(second_turns(problem.robot).max())
     if turn < ADVISED_TURN:
         yield Remark(
             Code.INSUFFICIENT_ROTATION,
             f"expected the robot to turn by {math.degrees(ADVISED_TURN):g} deg rms about a second "
-            f"axis, got {math.degrees(turn):.1f} deg: tilt it more to both sides",
+            f"axis, got {math.degrees(turn):.1f} deg, whichever pose is left out: tilt it more to "
+            "both sides",
         )
     if result.held_out_error is None:
         yield Remark(Code.NOT_HELD_OUT, "too few poses to leave one out: no held-out error")

@@ -24,6 +24,9 @@ LEAST_POSES = 3
 SAME_TURN = math.radians(0.5)
 """Poses turned less against each other count as one."""
 
+MOST_PAIRED = 40
+"""Poses of which each pair is taken: time grows with the square of their number."""
+
 LEAST_TURN = math.radians(2.0)
 """Rms turn of the poses about the second of their axes; one axis alone determines nothing."""
 
@@ -107,20 +110,45 @@ def check_motion(robot: RobotPoses) -> None:
 
 def second_turn(robot: RobotPoses) -> float:
     """Return the rms turn of the poses against each other about the second of their axes, rad."""
+    products = _turns(robot)
+    return float(_second(products.sum(axis=(0, 1)), len(products)))
+
+
+def second_turns(robot: RobotPoses) -> Array:
+    """Return the same (V,) of the poses without each in turn; of all where they are too few."""
+    products = _turns(robot)
+    whole, count = products.sum(axis=(0, 1)), len(products)
+    if count <= LEAST_POSES:
+        return np.full(count, _second(whole, count))
+    return _second(whole - 2.0 * products.sum(axis=1), count - 1)
+
+
+def _turns(robot: RobotPoses) -> Array:
+    """Return the products b b^T of the turns b from each pose to each, (V, V, 3, 3)."""
     turns = robot.poses.rotation
-    first, later = np.triu_indices(len(turns), 1)
-    between = log_rotation(np.swapaxes(turns[first], 1, 2) @ turns[later])
-    # Rotation vectors of one axis are multiples of each other: the second singular value is 0. Over
-    # the root of their number it is an rms.
-    singular = np.asarray(np.linalg.svd(between, compute_uv=False), dtype=np.float64)
-    return float(singular[1] / math.sqrt(len(between)))
+    between = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
+    products: Array = between[..., None] * between[..., None, :]
+    return products
 
 
-def solve_linear(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid] | None:
+def _second(products: Array, count: int) -> Array:
+    # Rotation vectors of one axis are multiples of each other: of the sum of their products the
+    # second eigenvalue is 0. Over their number it is a mean square.
+    found: Array = np.sqrt(np.maximum(np.linalg.eigvalsh(products)[..., 1], 0.0))
+    return found / math.sqrt(count * (count - 1))
+
+
+def solve_linear(
+    name: str, robot: RobotPoses, seen: Rigid, *, exactly: bool = False
+) -> tuple[Rigid, Rigid] | None:
     """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`LINEAR`); None where it fails.
 
-    ``seen``: ``T_camera_target`` of each view.
+    ``seen``: ``T_camera_target`` of each view. ``exactly``: by all of them, however many: else a
+    method that takes them in pairs gets some of many, which is enough to begin with.
     """
+    if name in HAND_EYE and not exactly and seen.size > MOST_PAIRED:
+        some = np.linspace(0, seen.size - 1, MOST_PAIRED).round().astype(np.intp)
+        robot, seen = robot.taken(some), seen.taken(some)
     try:
         found = LINEAR[name](name, robot, seen)
     except (load("cv2").error, np.linalg.LinAlgError):

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Self, TypeAlias
 import numpy as np
 
 from smartcam.calibration._geometry.rigid import Rigid, cross_matrix, right_jacobian
-from smartcam.calibration._least_squares import Normal, minimize
+from smartcam.calibration._least_squares import Normal, minimize, solve_scaled
 from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.calibration._lens.projection import linearize, pose_changes
 
@@ -158,6 +158,10 @@ class Observations(ABC):
         """Return some of the views."""
 
     @abstractmethod
+    def settled(self, change: Array) -> Self:
+        """Return them with a change (extra,) of the other parameters, which are known then."""
+
+    @abstractmethod
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, M) and their derivatives (V, M, 6 + extra).
 
@@ -189,6 +193,11 @@ class PixelObservations(Observations):
             pixels=self.pixels[index],
             whitening=self.whitening[index],
         )
+
+    def settled(self, change: Array) -> PixelObservations:
+        """Return them with a change (extra,) of the other parameters, which are known then."""
+        points = self.scale(change) * self.points
+        return dataclasses.replace(self, model=self.camera(change), points=points, free=())
 
     def camera(self, change: Array) -> CameraModel:
         """Return the camera with some of its parameters changed, (extra,)."""
@@ -243,6 +252,10 @@ class PoseObservations(Observations):
         return dataclasses.replace(
             self, poses=self.poses.taken(index), whitening=self.whitening[index]
         )
+
+    def settled(self, change: Array) -> PoseObservations:
+        """Return them with a change (extra,) of the other parameters, which are known then."""
+        return dataclasses.replace(self, poses=self.poses.scaled(self.scale(change)), free=())
 
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, 6) and their derivatives (V, 6, 6 + extra)."""
@@ -307,30 +320,37 @@ def sums(
     return np.swapaxes(rows, 1, 2) @ rows, float((off**2).sum())
 
 
-def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> Normal:
-    """Return the equations of a step: shared are ``X``, ``Z`` and what is beside them."""
+def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float, Array, Array]:
+    """Return the cost, and each view's part of the equations of a step.
+
+    (V, 6 + P, 6 + P) and (V, 6 + P): of the correction of the robot's pose, then as :func:`sums`.
+    """
     with np.errstate(all="ignore"):
         total, squares = sums(robot, seen, at)
     cost = squares if math.isfinite(squares) else math.inf
-    own, rest = slice(0, 6 if at.noise else 0), slice(6, -1)
-    right = -total[:, :, -1] - (total[:, :, :6] @ at.corrections[..., None])[..., 0]
-    normal = Normal(
-        cost,
-        total[:, rest, rest].sum(axis=0),
-        right[:, rest].sum(axis=0),
-        total[:, own, own],
-        right[:, own],
-        total[:, own, rest],
-    )
+    matrix = total[:, :-1, :-1]
+    right = -total[:, :-1, -1] - (total[:, :-1, :6] @ at.corrections[..., None])[..., 0]
     if at.noise is None:
-        return normal
+        return cost, matrix, right
     # A correction is a residual, too, measured as 0 with the robot's variance: the mean and the
     # covariance of what its controller says.
     weights = 1.0 / np.repeat(at.noise.robot, 3) ** 2
-    return normal._replace(
-        cost=cost + float((weights * at.corrections**2).sum()),
-        own=normal.own + np.diag(weights),
-        own_right=normal.own_right - weights * at.corrections,
+    matrix[:, range(6), range(6)] += weights
+    right[:, :6] -= weights * at.corrections
+    return cost + float((weights * at.corrections**2).sum()), matrix, right
+
+
+def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> Normal:
+    """Return the equations of a step: shared are ``X``, ``Z`` and what is beside them."""
+    cost, matrix, right = _by_view(robot, seen, at)
+    own, rest = slice(0, 6 if at.noise else 0), slice(6, None)
+    return Normal(
+        cost,
+        matrix[:, rest, rest].sum(axis=0),
+        right[:, rest].sum(axis=0),
+        matrix[:, own, own],
+        right[:, own],
+        matrix[:, own, rest],
     )
 
 
@@ -371,6 +391,30 @@ def _stepped(at: Solution, step: Array, corrections: Array) -> Solution:
         target=at.target.turned_before(step[6:12]),
         change=at.change + step[12:],
         corrections=at.corrections + corrections if corrections.size else at.corrections,
+    )
+
+
+def without_each(robot: RobotPoses, seen: Observations, whole: Solution) -> Solution:
+    """Return the solutions without each view in turn, stacked (V, ...); ``whole`` is of all views.
+
+    The noise is that which all of them told.
+    """
+    # One step of Gauss and Newton from the whole, with the view's own part taken out of the sums:
+    # its normal equations are a sum over views, and only steps of second order are lost.
+    # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 5.2.
+    spread = seen if whole.noise is None else seen.spread(whole.noise.shared)
+    _, matrix, right = _by_view(robot, spread, whole)
+    own, rest = slice(0, 6 if whole.noise else 0), slice(6, None)
+    mixed = np.swapaxes(matrix[:, own, rest], 1, 2)
+    both = np.concatenate([matrix[:, own, rest], right[:, own, None]], axis=2)
+    solved = mixed @ np.linalg.solve(matrix[:, own, own], both)
+    matrices, rights = matrix[:, rest, rest] - solved[..., :-1], right[:, rest] - solved[..., -1]
+    left = zip(matrices.sum(axis=0) - matrices, rights.sum(axis=0) - rights, strict=True)
+    steps = np.stack([solve_scaled(*one) for one in left])
+    return Solution(
+        whole.camera.turned_before(steps[:, :6]),
+        whole.target.turned_before(steps[:, 6:12]),
+        whole.change + steps[:, 12:],
     )
 
 

@@ -1,8 +1,13 @@
 """Which way of solving a camera and a robot predicts poses best that it has not seen.
 
-Each candidate is solved again without one pose (of many poses, without a part of them), and says
-from the robot's pose as it was given where the camera would see the target. What lies between that
-and what it saw is the held-out error: the error of picking, on the target, in metres.
+There are two ways. ``robot`` corrects each pose of the robot as its noise allows: the best there is
+where noise is all there is. ``reprojection`` takes the robot's poses as they are said and asks for
+the smallest error of just what is judged: the best where a robot errs by more than noise (joints
+that are off, gears with play, a sheet of another size), for then no corrections of single poses are
+right. What a robot is, its poses tell: each way is solved again without one pose, and says from the
+robot's pose as it was given where the camera would see the target. What lies between that and what
+it saw is the held-out error, the error of picking, on the target, in metres. Between both ways goes
+what is taken, as far to the second as the held-out errors ask for it beyond chance.
 
 The camera's parameters and the target's scale are adjusted besides where two things hold: the
 held-out error is smaller with them, and noise alone would hardly ever make them differ as much from
@@ -18,15 +23,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._hand_eye.closed_forms import LEAST_POSES, LINEAR, solve_linear
 from smartcam.calibration._hand_eye.equations import (
-    ROUGH_GAIN,
     PixelObservations,
     PoseObservations,
     RobotNoise,
     Solution,
     adjust,
     carried,
+    without_each,
 )
 from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
 from smartcam.calibration._least_squares import solve_scaled
@@ -37,15 +43,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rigid import Rigid
     from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.equations import RobotPoses, RobotSigmas
     from smartcam.calibration._lens.model import CameraModel
 
     Seen = PixelObservations | PoseObservations
-
-MOST_FOLDS = 40
-"""Parts that poses are left out in: up to as many, each pose alone."""
 
 LEVEL = 1e-4
 """How seldom noise alone may make more parameters differ from what was given: a scale that is not
@@ -54,28 +56,17 @@ needed puts the camera up to eight times as far off."""
 MOST_SCALE = 0.2
 """Part of its size that a target may be off; what is more is a mistake of units."""
 
-JUDGE = "robot and lens"
-"""The method that tells what is to be adjusted besides: it can explain most."""
+ROBOT, REPROJECTION, BETWEEN = "robot", "reprojection", "robot and reprojection"
 
-METHODS: Mapping[str, float] = {
-    "robot": 1.0,
-    "robot and lens": 1.0 / 1.05,
-    "reprojection": 1.0 / 1.20,
-    **dict.fromkeys(LINEAR, 1.0 / 1.20),
-}
-"""Part of the first one's held-out error that each must stay below to be taken instead.
+METHODS = (ROBOT, REPROJECTION, *LINEAR)
+"""What may be asked for beside ``auto``; the last are OpenCV's closed forms."""
 
-``robot`` corrects each pose of the robot as its noise allows, and is the best there is where noise
-is all there is; ``robot and lens`` lets the points of a view share errors; ``reprojection`` takes
-the robot's poses for exact; the others are OpenCV's closed forms. The noise of the pose that is
-left out is in every candidate's error and hides the differences: 15 poses of a robot with 0.02
-degrees and 0.1 mm gave ``reprojection`` a held-out error 6 % smaller with a camera seven times
-farther off (measured in simulation).
-"""
+CHANCE = 1.0
+"""Squared t of a gain that counts as chance: less of it is kept where more errors are systematic,
+with none cameras on robots of noise alone are 1.5 times as far off (measured in simulation)."""
 
-MANY = 12
-"""Poses more than have to be, from which on the parts above hold; fewer have to show more: 1.2 of
-five poses is 3."""
+MOST_FOLDS = 20
+"""Parts of the poses that a closed form is solved without, one after the other."""
 
 NOTHING = "nothing"
 """Is adjusted besides the poses."""
@@ -100,6 +91,11 @@ class Problem:
         """V."""
         return self.poses.size
 
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """(V, N), of which points there are errors; without views of the target's origin."""
+        return np.ones((self.count, 1), dtype=bool) if self.given is None else self.given
+
     def taken(self, index: NDArray[np.intp]) -> Problem:
         """Return some of the poses."""
         given = None if self.given is None else self.given[index]
@@ -117,17 +113,34 @@ class Problem:
         Of a view: where the rays of its points pass the target's plane, from where the points are.
         Without views: where the target's origin is.
         """
-        scale = self.seen.scale(solution.change)
+        off = np.linalg.norm(self.off(solution), axis=2)
+        return [one[mask] for one, mask in zip(off, self.mask, strict=True)]
+
+    def off(self, solution: Solution) -> Array:
+        """Return these errors as vectors, (V, N, 3), metres; 0 where there is no point.
+
+        ``solution`` is one, or one for each view.
+        """
         expected = carried(solution.camera, self.robot, solution.target)
+        change = solution.change
+        each = change.ndim > 1
+        scales = [self.seen.scale(one) for one in (change if each else change[None])]
         if self.given is None or not isinstance(self.seen, PixelObservations):
-            off = expected.translation - scale * self.poses.translation
-            return [np.sqrt((one**2).sum(keepdims=True)) for one in off]
-        camera = self.seen.camera(solution.change)
-        result = []
-        for index, mask in enumerate(self.given):
-            pixels, points = self.seen.pixels[index][mask], self.seen.points[index][mask]
-            result.append(point_errors(camera, expected.taken(index), pixels, scale * points))
-        return result
+            away = expected.translation - np.reshape(scales, (-1, 1)) * self.poses.translation
+            return np.asarray(away[:, None], dtype=np.float64)
+        points = np.reshape(scales, (-1, 1, 1)) * self.seen.points
+        if each and any(self.seen.free):
+            one_each = zip(change, self.seen.pixels, strict=True)
+            rays = np.stack([self.seen.camera(one).directions(seen) for one, seen in one_each])
+        else:
+            camera = self.seen.camera(change[0] if each else change)
+            rays = camera.directions(self.seen.pixels.reshape(-1, 2)).reshape(
+                self.seen.pixels.shape
+            )
+        rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
+        off: Array = on_plane(rays, *expected) - points
+        off[~self.given] = 0.0
+        return off
 
 
 def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array) -> Array:
@@ -142,17 +155,17 @@ def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array)
 
 
 def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
-    """Return the crossings of rays (N, 3) from the origin with a plane, in its own frame, (N, 3).
+    """Return the crossings of rays (..., N, 3) from the origin with a plane, in its own frame.
 
-    Infinite where a ray does not meet it. ``turn`` (3, 3) is of the plane's frame, its third column
-    the normal, ``shift`` (3,) its origin.
+    (..., N, 3); infinite where a ray does not meet it. ``turn`` (..., 3, 3) is of the plane's
+    frame, its third column the normal, ``shift`` (..., 3) its origin.
     """
     # s r is in the plane where n (s r - o) = 0: s = n o / n r; then R^T (s r - o) is in its frame.
-    normal = turn[:, 2]
-    along = rays @ normal
+    normal = turn[..., 2]
+    along = (rays @ normal[..., None])[..., 0]
     with np.errstate(all="ignore"):
-        reach = float(shift @ normal) / along
-        found: Array = (rays * reach[:, None] - shift) @ turn
+        reach = (shift * normal).sum(axis=-1)[..., None] / along
+        found: Array = (rays * reach[..., None] - shift[..., None, :]) @ turn
     found[~(np.isfinite(reach) & (reach > 0))] = np.inf
     return found
 
@@ -161,15 +174,14 @@ def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
 class Candidate:
     """One way of solving, and how well it predicts."""
 
-    method: str  # one of :data:`METHODS`
+    method: str
     besides: str  # one of :data:`ADJUSTABLE`
     problem: Problem  # with what is adjusted besides set free
-    solution: Solution | None  # from all poses; None where it fails
-    # solutions from the other poses, by the poses left out
-    folds: list[tuple[NDArray[np.intp], Solution]] = field(default_factory=list)
-    # (V,) rms held-out error of each pose, metres; infinite where there is none
-    errors: Array = field(default_factory=lambda: np.zeros(0))
-    points: Array = field(default_factory=lambda: np.ones(1))  # how many errors each pose has
+    solution: Solution  # from all poses
+    # from the others, without each pose in turn, stacked (V, ...); None of too few poses
+    others: Solution | None = None
+    # (V, N, 3), held-out errors on the target, metres
+    off: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @property
     def name(self) -> str:
@@ -177,16 +189,24 @@ class Candidate:
         return self.method if self.besides == NOTHING else f"{self.method}, {self.besides}"
 
     @property
+    def errors(self) -> Array:
+        """(V,), rms held-out error of each pose, metres; infinite where there is none."""
+        if self.others is None:
+            return np.full(self.problem.count, np.inf)
+        squares = (self.off**2).sum(axis=(1, 2)) / self.problem.mask.sum(axis=1)
+        errors: Array = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
+        return errors
+
+    @property
     def held_out(self) -> float:
         """Rms held-out error of all points, metres; infinite where a pose has none."""
-        if not len(self.errors) or not np.isfinite(self.errors).all():
-            return math.inf
-        return math.sqrt(float((self.points * self.errors**2).sum() / self.points.sum()))
+        points = self.problem.mask.sum(axis=1)
+        return math.sqrt(float((points * self.errors**2).sum() / points.sum()))
 
     @property
     def chance(self) -> float:
         """How likely noise alone makes what is adjusted besides differ as much, 0 to 1."""
-        if self.solution is None or self.solution.information is None:
+        if self.solution.information is None:
             return 1.0
         change, whole = self.solution.change, self.solution.information
         if not len(change):
@@ -208,71 +228,135 @@ class Candidate:
 
 def candidates(
     problem: Problem, free: Mapping[str, tuple[int, ...]], method: str = "auto"
-) -> list[Candidate]:
-    """Return the candidates with their held-out errors.
-
-    Beside what :func:`choose` asks for, the methods are tried with the poses alone.
+) -> tuple[Candidate | None, list[Candidate]]:
+    """Return the candidate that is to be taken, None where nothing fits; and all, it among them.
 
     ``free``: numbers of the parameters of each of :data:`ADJUSTABLE` that may be adjusted.
-    ``method``: ``auto``, or the only one that is wanted beside the closed forms.
+    ``method``: ``auto``, or one of :data:`METHODS`.
     """
-    found = [Candidate(name, NOTHING, problem, _closed(problem, name)) for name in LINEAR]
-    begin = _begin(problem, found)
-    for one in found:
-        _leave_out(one)
-    if begin is None or method in LINEAR:
+    begin = _closed(problem, method) if method in LINEAR else _begin(problem)
+    if begin is None:
+        return None, []
+    if method in LINEAR:
+        only = _by_closed_form(problem, method, begin)
+        return only, [only]
+    if method == REPROJECTION and len(free) == 1:
+        ((besides, numbers),) = free.items()
+        plain = _reprojection(besides, _freed(problem, numbers), begin)
+        return plain, [plain] if plain else []
+    judges = _robots(problem, free, begin)
+    judge = _asked(judges)
+    if judge is None or method == ROBOT:
+        return judge, judges
+    plain = _reprojection_beside(judge)
+    found = [*judges, *([plain] if plain else [])]
+    if method == REPROJECTION or plain is None:
+        return (plain if method == REPROJECTION else judge), found
+    taken = _between(judge, plain)
+    return taken, found if taken in found else [*found, taken]
+
+
+def _reprojection(besides: str, problem: Problem, begin: Solution) -> Candidate | None:
+    """Return what takes the robot's poses as they are said."""
+    start = dataclasses.replace(begin, noise=None)
+    return _candidate(REPROJECTION, besides, problem, adjust(problem.robot, problem.seen, start))
+
+
+def _reprojection_beside(robot: Candidate) -> Candidate | None:
+    """Return the same with the scale and the lens that another candidate found.
+
+    How large a target is tells its distance, which pixels hardly tell.
+    """
+    change, freed = robot.solution.change, robot.problem
+    known = dataclasses.replace(freed, seen=freed.seen.settled(change))
+    start = dataclasses.replace(robot.solution, change=np.zeros(0))
+    found = _reprojection(robot.besides, known, start)
+    if found is None or not len(change):
         return found
-
-    def tried(name: str, besides: str) -> Candidate:
-        freed = _freed(problem, free[besides])
-        one = Candidate(name, besides, freed, _refined(freed, name, begin))
-        _leave_out(one)
-        return one
-
-    judges = []
-    asked = next(iter(free))
-    if len(free) > 1 or method in ("auto", JUDGE):
-        judges = [tried(JUDGE, besides) for besides in free]
-    if len(free) > 1:
-        asked = _asked([one for one in judges if one.solution is not None])
-    others = [name for name in METHODS if name not in (*LINEAR, JUDGE) and method in ("auto", name)]
-    for besides in dict.fromkeys((NOTHING, asked)):
-        if besides in free:
-            found += [tried(name, besides) for name in others]
-    return found + judges
+    found.problem, found.solution = freed, dataclasses.replace(found.solution, change=change)
+    if found.others is not None and robot.others is not None:
+        found.others = dataclasses.replace(found.others, change=robot.others.change)
+        found.off = freed.off(found.others)
+    return found
 
 
-def choose(
-    found: Sequence[Candidate], *, method: str = "auto", besides: str | None = None
-) -> Candidate | None:
-    """Return the candidate that is to be taken; None where none can be.
+def _robots(
+    problem: Problem, free: Mapping[str, tuple[int, ...]], begin: Solution
+) -> list[Candidate]:
+    """Return what corrects the robot's poses, by what is adjusted besides."""
+    found: list[Candidate] = []
+    for besides, numbers in free.items():
+        freed = _freed(problem, numbers)
+        start = found[0].solution if found and found[0].besides == NOTHING else begin
+        if problem.sigmas is None:
+            solution = adjust_noisy(freed.robot, freed.seen, start)
+        else:
+            solution = adjust(freed.robot, freed.seen, start, RobotNoise(problem.sigmas))
+        if (one := _candidate(ROBOT, besides, freed, solution)) is not None:
+            found.append(one)
+    return found
 
-    First what is adjusted besides, as :data:`JUDGE` says, then the method.
 
-    ``method``: ``auto``, or which it must be. ``besides``: what must be adjusted besides; None:
-    what is asked for.
+def _asked(judges: Sequence[Candidate]) -> Candidate | None:
+    """Return the one with the unknowns that are to be adjusted besides."""
+    if len(judges) < 2:
+        return judges[0] if judges else None
+    plain = next((one for one in judges if one.besides == NOTHING), None)
+    limit = plain.held_out if plain else math.inf
+    asked = [one for one in judges if one.chance < LEVEL and one.held_out < limit]
+    return min(asked, key=lambda one: one.held_out, default=plain or judges[0])
+
+
+def _between(robot: Candidate, plain: Candidate) -> Candidate:
+    """Return what lies between both candidates, or one of them."""
+    if robot.others is None or plain.others is None:
+        return robot
+    step, off = plain.off - robot.off, robot.off
+    if not (np.isfinite(off).all() and np.isfinite(step).all()):
+        return min((robot, plain), key=lambda one: one.held_out)
+    along, squares = -(off * step).sum(axis=(1, 2)), (step**2).sum(axis=(1, 2))
+    part = _part(along, squares)
+    if part in (0.0, 1.0):
+        return plain if part else robot
+    # each pose is held out with the part that the others ask for
+    parts = [_part(np.delete(along, i), np.delete(squares, i)) for i in range(len(along))]
+    others = _mixed(robot.others, plain.others, np.array(parts)[:, None])
+    found = Candidate(
+        BETWEEN, robot.besides, robot.problem, _mixed(robot.solution, plain.solution, part), others
+    )
+    found.off = found.problem.off(others)
+    return found
+
+
+def _part(along: Array, squares: Array) -> float:
+    """Return how far to go from one method to the other, 0 to 1.
+
+    ``along`` (V,): how much the held-out errors of each pose fall with the first part of the way,
+    the negative scalar product of error and way; ``squares`` (V,): of the way.
     """
-    sound = [one for one in found if one.solution is not None]
-    wanted = _asked(sound) if besides is None else besides
-    kept = [
-        one
-        for one in sound
-        if method in ("auto", one.method) and (one.method in LINEAR or one.besides == wanted)
-    ]
-    scored = [one for one in kept if math.isfinite(one.held_out)]
-    if scored:
-        caution = max(1.0, MANY / (scored[0].problem.count - LEAST_POSES))
-        return min(scored, key=lambda one: one.held_out / METHODS[one.method] ** caution)
-    order = {name: number for number, name in enumerate(METHODS)}
-    return min(kept, key=lambda one: order[one.method], default=None)
+    # Errors e + w d have their least squares at w = -sum e d / sum d^2. Of that a part is kept:
+    # robots without any error but noise make the second method look better by chance, and it puts
+    # their cameras up to five times as far off. The whole way lowers the squares of each pose by
+    # g = -2 e d - d^2; with t = sum g / (sum g^2)^(1/2), poses being independent of each other as
+    # their points are not, 1 - c / t^2 of it is kept, nothing where that is below 0.
+    # Source: James and Stein, Estimation with Quadratic Loss (1961), in its positive part; Breiman,
+    # Stacked Regressions (1996), for weights by held-out errors; White, A
+    # Heteroskedasticity-Consistent Covariance Matrix Estimator (1980), for the variance.
+    gain = 2.0 * along - squares
+    total, scatter = float(gain.sum()), float((gain**2).sum())
+    if total <= 0:
+        return 0.0
+    kept = max(0.0, 1.0 - CHANCE * scatter / total**2)
+    return min(1.0, kept * float(along.sum() / squares.sum()))
 
 
-def _asked(sound: Sequence[Candidate]) -> str:
-    """Return the unknowns that are to be adjusted besides."""
-    judges = [one for one in sound if one.method == JUDGE]
-    plain = next((one.held_out for one in judges if one.besides == NOTHING), math.inf)
-    asked = [one for one in judges if one.chance < LEVEL and one.held_out < plain]
-    return min(asked, key=lambda one: one.held_out).besides if asked else NOTHING
+def _mixed(first: Solution, other: Solution, part: Array | float) -> Solution:
+    """Return what lies between solutions, one or stacked."""
+    return Solution(
+        first.camera.turned_before(part * first.camera.before(other.camera)),
+        first.target.turned_before(part * first.target.before(other.target)),
+        first.change + part * (other.change - first.change),
+    )
 
 
 def _freed(problem: Problem, numbers: tuple[int, ...]) -> Problem:
@@ -281,55 +365,49 @@ def _freed(problem: Problem, numbers: tuple[int, ...]) -> Problem:
     return dataclasses.replace(problem, seen=dataclasses.replace(problem.seen, free=numbers))
 
 
-def _closed(problem: Problem, name: str) -> Solution | None:
-    found = solve_linear(name, problem.robot, problem.poses)
+def _closed(problem: Problem, name: str, *, exactly: bool = True) -> Solution | None:
+    found = solve_linear(name, problem.robot, problem.poses, exactly=exactly)
     return None if found is None else Solution(*found, np.zeros(problem.seen.extra))
 
 
-def _begin(problem: Problem, closed: Sequence[Candidate]) -> Solution | None:
+def _begin(problem: Problem) -> Solution | None:
     """Return the closed form that fits best."""
     ranked = []
-    for number, one in enumerate(closed):
-        if one.solution is not None:
-            errors = np.concatenate(problem.errors(one.solution))
-            ranked.append((float(np.median(errors)), number, one.solution))
+    for number, name in enumerate(LINEAR):
+        one = _closed(problem, name, exactly=False)
+        if one is not None:
+            errors = np.concatenate(problem.errors(one))
+            ranked.append((float(np.median(errors)), number, one))
     ranked = [one for one in ranked if math.isfinite(one[0])]
     return min(ranked)[2] if ranked else None
 
 
-def _refined(problem: Problem, method: str, begin: Solution) -> Solution | None:
-    robot, seen = problem.robot, problem.seen
-    if method == "reprojection":
-        found = adjust(robot, seen, begin)
-    elif problem.sigmas is not None:
-        found = adjust(robot, seen, begin, RobotNoise(problem.sigmas))
-    else:
-        found = adjust_noisy(robot, seen, begin, shared=method == "robot and lens")
-    fits = math.isfinite(found.cost) and abs(seen.scale(found.change) - 1.0) <= MOST_SCALE
-    return found if fits else None
+def _candidate(method: str, besides: str, problem: Problem, solution: Solution) -> Candidate | None:
+    """Return a candidate with its held-out errors; None where it does not fit."""
+    scale = problem.seen.scale(solution.change)
+    if not math.isfinite(solution.cost) or abs(scale - 1.0) > MOST_SCALE:
+        return None
+    found = Candidate(method, besides, problem, solution)
+    if problem.count > LEAST_POSES:
+        found.others = without_each(problem.robot, problem.seen, solution)
+        found.off = problem.off(found.others)
+    return found
 
 
-def _again(problem: Problem, method: str, whole: Solution) -> Solution | None:
-    """Return the solution of a part of the poses, with the noise that all of them told."""
-    if method in LINEAR:
-        return _closed(problem, method)
-    found = adjust(problem.robot, problem.seen, whole, whole.noise, gain=ROUGH_GAIN)
-    return found if math.isfinite(found.cost) else None
-
-
-def _leave_out(one: Candidate) -> None:
-    """Give a candidate its held-out errors."""
-    problem, count = one.problem, one.problem.count
-    one.errors = np.full(count, np.inf)
-    one.points = np.ones(count) if problem.given is None else problem.given.sum(axis=1)
-    if one.solution is None or count <= LEAST_POSES:
-        return
+def _by_closed_form(problem: Problem, name: str, whole: Solution) -> Candidate:
+    """Return a closed form with its held-out errors."""
+    found, count = Candidate(name, NOTHING, problem, whole), problem.count
+    if count <= LEAST_POSES:
+        return found
     numbers = np.arange(count)
+    part, others = numbers % MOST_FOLDS, [whole] * count
     for fold in range(min(count, MOST_FOLDS)):
-        out = numbers[numbers % MOST_FOLDS == fold] if count > MOST_FOLDS else numbers[[fold]]
-        found = _again(problem.taken(np.setdiff1d(numbers, out)), one.method, one.solution)
-        if found is None:
-            continue
-        one.folds.append((out, found))
-        errors = problem.taken(out).errors(found)
-        one.errors[out] = [math.sqrt(float((off**2).mean())) for off in errors]
+        other = _closed(problem.taken(numbers[part != fold]), name)
+        if other is None:
+            return found
+        others = [other if part[i] == fold else one for i, one in enumerate(others)]
+    found.others = Solution(
+        Rigid.stacked(one.camera for one in others), Rigid.stacked(one.target for one in others)
+    )
+    found.off = problem.off(found.others)
+    return found

@@ -67,7 +67,8 @@ class HandEyeCalibration(storage.SavedCalibration):
             the target of this size; a remark ``SCALE_MISMATCH`` says that it is more than half a
             percent off the nominal one. Where a ruler says that the target has its nominal size, it
             is the robot's or the lens' lengths that are off by this factor.
-        method: what the candidate is called that was taken.
+        method: what the candidate is called that was taken: ``robot``, ``reprojection``, or
+            ``robot and reprojection`` for what lies between them; after a comma, what was adjusted.
         candidates: rms held-out error of each candidate on the target, metres; None where a
             candidate has none.
         errors: (V,), rms error of each pose on the target, metres, with all used poses taken in;
@@ -82,7 +83,7 @@ class HandEyeCalibration(storage.SavedCalibration):
             along those of its target, m) and of ``target_pose``, the lens taken as exact unless it
             was adjusted; NaN where fewer than 5 poses told the robot's noise.
         robot_sigmas: of each axis of the robot's poses, as given or estimated; None where they were
-            taken for exact.
+            taken for exact, or the result lies between two methods.
         robot_poses: ``T_base_flange``, as given.
         used: whether each pose was used; False for a bad one.
         views: as given; empty where poses were.

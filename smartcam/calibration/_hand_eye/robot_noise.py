@@ -53,22 +53,22 @@ SETTLED = 0.02
 """Part of the estimates by which a round must change them for another one."""
 
 
-def adjust_noisy(
-    robot: RobotPoses, seen: Observations, start: Solution, *, shared: bool = False
-) -> Solution:
+def adjust_noisy(robot: RobotPoses, seen: Observations, start: Solution) -> Solution:
     """Return the adjustment with the noise that makes what was seen most likely.
 
-    ``seen`` is whitened. ``shared``: estimate the errors that the points of a view share, too.
+    ``seen`` is whitened. ``start``: where it begins; one that has a noise begins with it.
     """
-    noise = RobotNoise(FIRST, FIRST_SHARED if shared else 1.0)
+    noise = start.noise or RobotNoise(FIRST, FIRST_SHARED)
     found = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
-    settled = False
-    for _ in range(ROUNDS):
-        if settled or not math.isfinite(found.cost):
+    for number in range(ROUNDS):
+        if not math.isfinite(found.cost):
             break
-        before, noise = noise, _estimate(robot, seen, found, noise, shared=shared)
+        before = noise
+        noise = _estimate(robot, seen, found, noise, search=not number and start.noise is None)
         settled = bool(np.abs(_logs(noise) - _logs(before)).max() < SETTLED)
         found = adjust(robot, seen, found, noise, gain=ROUGH_GAIN)
+        if settled:
+            break
     return adjust(robot, seen, found, noise)
 
 
@@ -78,34 +78,35 @@ def _logs(noise: RobotNoise) -> Array:
 
 
 def _estimate(
-    robot: RobotPoses, seen: Observations, at: Solution, noise: RobotNoise, *, shared: bool
+    robot: RobotPoses, seen: Observations, at: Solution, noise: RobotNoise, *, search: bool
 ) -> RobotNoise:
-    """Return the standard deviations whose restricted likelihood is largest."""
-    total = sums(robot, seen, at, poses_only=shared)[0]
+    """Return the standard deviations whose restricted likelihood is largest.
+
+    ``search``: look for it everywhere, not only from ``noise`` on.
+    """
+    total = sums(robot, seen, at, poses_only=True)[0]
     low, high = np.log([*LEAST, 1.0]), np.log([*MOST, MOST_SHARED])
-    if not shared:
-        low, high = low[:2], high[:2]
 
     def cost(logs: Array) -> float:
         inside = np.clip(logs, low, high)
         beyond = float(((logs - inside) ** 2).sum())
         return _unlikely(total, np.exp(inside)) + 1e3 * beyond
 
-    axes = [np.linspace(a, b, COARSE) for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
-    start = min([_logs(noise)[: len(axes)], *grid], key=cost)
-    settings = {"xatol": 1e-3, "fatol": 1e-4, "maxiter": 300}
+    axes = [np.linspace(a, b, COARSE if search else 0) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    start = min([_logs(noise), *grid], key=cost)
+    settings = {"xatol": 3e-3, "fatol": 1e-3, "maxiter": 300}
     found = load("scipy.optimize").minimize(cost, start, method="Nelder-Mead", options=settings)
     values = np.exp(np.clip(found.x, low, high)).tolist()
-    return RobotNoise(RobotSigmas(values[0], values[1]), values[2] if shared else 1.0)
+    return RobotNoise(RobotSigmas(values[0], values[1]), values[2])
 
 
 def _unlikely(total: Array, values: Array) -> float:
     """Return -2 log of the restricted likelihood, without its constants.
 
     ``total`` (V, 6 + P + 1, 6 + P + 1): products of the derivatives by the robot's correction, by
-    the P other unknowns, and of the residuals without corrections. ``values``: sigmas of rotation
-    and translation, (2,), or with the shared errors' factor (3,).
+    the P other unknowns, and of the residuals without corrections. ``values`` (3,): sigmas of
+    rotation and translation, and the shared errors' factor.
     """
     # Residuals r = J x + B c + e, with corrections c of covariance D = diag(sigma^2) and noise e of
     # covariance I, have V = I + B D B^T. The restricted likelihood does not depend on x:
@@ -118,11 +119,8 @@ def _unlikely(total: Array, values: Array) -> float:
     # unequal (1971); Harville, Bayesian inference for variance components using only error
     # contrasts (1974), for the form with determinants.
     spread = np.repeat(values[:2], 3)
-    scaled = total.copy()
-    determinants = 0.0
-    if len(values) > 2:
-        scaled /= values[2] ** 2
-        determinants = 12.0 * len(total) * math.log(values[2])
+    scaled = total / values[2] ** 2
+    determinants = 12.0 * len(total) * math.log(values[2])
     # in units of its sigma a correction has a variance of 1
     scaled[:, :6] *= spread[:, None]
     scaled[:, :, :6] *= spread

@@ -25,6 +25,7 @@ from smartcam.calibration._hand_eye.equations import (
     adjust,
     carried,
     sums,
+    without_each,
 )
 from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
 from smartcam.calibration._lens.model import CameraModel
@@ -147,8 +148,7 @@ def test_adjust_corrects_a_robot_that_is_off() -> None:
     assert np.corrcoef(found.corrections[:, :3].ravel(), -off[:, :3].ravel())[0, 1] > 0.6
 
 
-@pytest.mark.parametrize("shared", [False, True])
-def test_noise_of_the_robot_is_told(*, shared: bool) -> None:
+def test_noise_of_the_robot_is_told() -> None:
     robot, camera, target, seen = problem(in_hand=True, poses=30)
     random = np.random.default_rng(3)
     sigmas = RobotSigmas(4e-4, 2e-4)
@@ -157,10 +157,45 @@ def test_noise_of_the_robot_is_told(*, shared: bool) -> None:
     observed = pixels(seen)
     noise = 0.1 * random.normal(size=observed.pixels.shape)
     blurred = dataclasses.replace(observed, pixels=observed.pixels + noise)
-    found = adjust_noisy(said, blurred, Solution(camera, target), shared=shared)
+    found = adjust_noisy(said, blurred, Solution(camera, target))
     assert found.noise is not None
     np.testing.assert_allclose(found.noise.robot, sigmas, rtol=0.3)
-    assert found.noise.shared == pytest.approx(1.0, abs=0.8 if shared else 0.0)
+    assert found.noise.shared == pytest.approx(1.0, abs=0.8)
+
+
+@pytest.mark.parametrize("free", [(), (0,), (1, 2, 3, 4)])
+@pytest.mark.parametrize("noise", [None, RobotNoise(RobotSigmas(1e-3, 3e-4), 2.0)])
+def test_without_each_view_is_what_the_others_give(
+    noise: RobotNoise | None, free: tuple[int, ...]
+) -> None:
+    robot, camera, target, seen = problem(in_hand=True, poses=9)
+    random = np.random.default_rng(6)
+    off = random.normal(scale=[1e-3] * 3 + [3e-4] * 3, size=(9, 6))
+    said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
+    observed = pixels(seen, free=free)
+    whole = adjust(said, observed, Solution(camera, target), noise)
+    found = without_each(said, observed, whole)
+    for number in (0, 4, 8):
+        some = np.delete(np.arange(9), number)
+        again = adjust(said.taken(some), observed.taken(some), whole, noise)
+        moved = float(np.linalg.norm(again.camera.translation - whole.camera.translation))
+        assert moved > 1e-5
+        left = found.camera.translation[number] - again.camera.translation
+        assert float(np.linalg.norm(left)) < 0.05 * moved
+        np.testing.assert_allclose(found.change[number], again.change, rtol=0.4, atol=1e-4)
+
+
+def test_closed_forms_of_many_poses_begin_with_some_of_them() -> None:
+    robot, camera, _, seen = problem(in_hand=True, poses=60)
+    off = np.random.default_rng(7).normal(scale=1e-4, size=(60, 6))
+    said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
+    for name in ("park", "shah"):
+        some, whole = (solve_linear(name, said, seen, exactly=one) for one in (False, True))
+        assert some is not None
+        assert whole is not None
+        same = np.array_equal(some[0].translation, whole[0].translation)
+        assert same == (name == "shah")
+        np.testing.assert_allclose(some[0].translation, camera.translation, atol=1e-3)
 
 
 def test_noise_that_a_views_points_share_is_told() -> None:
@@ -177,7 +212,7 @@ def test_noise_that_a_views_points_share_is_told() -> None:
     )
     shown = pixels(moved).pixels + 0.1 * random.normal(size=observed.pixels.shape)
     blurred = dataclasses.replace(observed, pixels=shown)
-    found = adjust_noisy(robot, blurred, Solution(camera, target), shared=True)
+    found = adjust_noisy(robot, blurred, Solution(camera, target))
     assert found.noise is not None
     assert found.noise.shared > 3.0
     assert found.noise.robot.translation < 2e-4
