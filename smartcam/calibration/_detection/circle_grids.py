@@ -67,7 +67,7 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
 
     Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
     """
-    seen = _Seen()
+    seen = _Counted()
     for inked, found, ways in _grids(image, target, seen):
         if _is_whole(inked, target, found[ways[0].order.ravel()]):
             return _view(inked, target, found, ways, name)
@@ -76,7 +76,7 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
 
 
 @dataclass
-class _Seen:
+class _Counted:
     """What a search came by, for its error."""
 
     spots: int | None = None  # how many dark ones, in the first look at the image
@@ -85,7 +85,7 @@ class _Seen:
 
 
 def _grids(
-    image: GreyImage, target: CircleGrid, seen: _Seen
+    image: GreyImage, target: CircleGrid, seen: _Counted
 ) -> Iterator[tuple[GreyImage, Array, list[Arrangement]]]:
     """Yield dots (N, 2), pixels, that stand as the target's do, and the ways to number them.
 
@@ -141,7 +141,7 @@ def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:
 
 
 def _laid_out(
-    spots: Spots, target: CircleGrid, seen: _Seen
+    spots: Spots, target: CircleGrid, seen: _Counted
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
     """Yield as many dots (N, 2) in rows and columns as the target has, and their places (N, 2)."""
     count = target.columns * target.rows
@@ -291,7 +291,7 @@ def _number(
     return marked(ways, level, f"{what}, of which the larger one is the origin")
 
 
-def _not_found(target: CircleGrid, seen: _Seen) -> CalibrationError:
+def _not_found(target: CircleGrid, seen: _Counted) -> CalibrationError:
     """Return an error that says what is seen instead."""
     count = target.columns * target.rows
     if seen.largest > count:

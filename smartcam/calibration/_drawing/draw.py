@@ -10,7 +10,7 @@ import numpy as np
 from smartcam.calibration._codes import Code
 from smartcam.calibration._drawing.bars import Chart, Series, draw_bars, short_names
 from smartcam.calibration._drawing.maps import Map, draw_maps
-from smartcam.calibration._drawing.scene import Axes, Board, DrawnCamera, DrawnScene
+from smartcam.calibration._drawing.scene import Axes, DrawnBoard, DrawnCamera, DrawnScene
 from smartcam.calibration._drawing.scene import draw_scene as _draw_scene
 from smartcam.calibration._geometry.rigid import IDENTITY
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
@@ -190,9 +190,9 @@ def _corners(target: Target | None) -> Array:
 
 def _boards(
     names: Iterable[str], poses: Iterable[Transform | None], off: Iterable[bool], target: Target
-) -> list[Board]:
+) -> list[DrawnBoard]:
     return [
-        Board(name, pose.apply(_corners(target)), left_out)
+        DrawnBoard(name, pose.apply(_corners(target)), left_out)
         for name, pose, left_out in zip(names, poses, off, strict=True)
         if pose is not None
     ]
@@ -222,14 +222,14 @@ def _robot_scene(one: HandEyeCalibration) -> DrawnScene:
     flanges = [pose.rigid for pose in one.robot_poses]
     up = (0.0, 0.0, 1.0)
     if one.setup == "eye-in-hand":
-        board = Board("target", one.target_pose.apply(corners))
+        board = DrawnBoard("target", one.target_pose.apply(corners))
         cameras = [
             DrawnCamera(name, flange @ one.camera_pose.rigid, one.camera)
             for name, flange in zip(names, flanges, strict=True)
         ]
         return DrawnScene([board], cameras, base, up)
     boards = [
-        Board(name, (flange @ one.target_pose.rigid).apply(corners), not used)
+        DrawnBoard(name, (flange @ one.target_pose.rigid).apply(corners), not used)
         for name, flange, used in zip(names, flanges, one.used, strict=True)
     ]
     return DrawnScene(boards, [DrawnCamera("camera", one.camera_pose.rigid, one.camera)], base, up)

@@ -48,7 +48,7 @@ OFFSETS: Final = [(0.0, 0.0)] + [
 """Where a label may be beside its place, pixels; the first that is free is taken."""
 
 
-class Board(NamedTuple):
+class DrawnBoard(NamedTuple):
     """A target in the scene."""
 
     name: str
@@ -74,7 +74,7 @@ class Axes(NamedTuple):
 class DrawnScene(NamedTuple):
     """What is drawn, in a frame of its own."""
 
-    boards: Sequence[Board]
+    boards: Sequence[DrawnBoard]
     cameras: Sequence[DrawnCamera]
     axes: Sequence[Axes] = ()
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # of a camera's frame; a robot's is z

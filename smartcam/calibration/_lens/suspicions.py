@@ -49,6 +49,9 @@ LEAST_KEPT: Final = 8
 MEDIAN: Final = 2.0 * math.log(2.0)
 """Of the squared length of two independent normal numbers."""
 
+LEAST_SCALE: Final = 1e-6
+"""Of the variance beside what was said: exact points have none at all."""
+
 NAMED: Final = 5
 """Points that a text names at most."""
 
@@ -170,7 +173,7 @@ def strays(fitted: Sequence[Fitted], more: float, used: Sequence[bool]) -> list[
     of_used = [one for one, good in zip(equations, used, strict=True) if good]
     squares = np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used])
     # the median stays what it is, whatever a few strays do to ``more``
-    scale = float(np.median(squares)) / MEDIAN
+    scale = max(float(np.median(squares)) / MEDIAN, LEAST_SCALE)
     found = []
     for number, (one, equation) in enumerate(zip(fitted, equations, strict=True)):
         squares = equation.stray_squares(OFF[0][0] ** 2 * scale)
@@ -381,14 +384,14 @@ class _Reduced(NamedTuple):
         return float(squares - change @ (basis.T @ right))
 
 
-class _Flip(NamedTuple):
+class _FlippedLens(NamedTuple):
     """How a flip changes the values of a lens: by ``shift``, and their changes by ``mirror``."""
 
     mirror: Array  # (L,), 1 or -1
     shift: Array  # (L,)
 
     @classmethod
-    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _Flip:
+    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
         """Return what flipping pictures along some axes does."""
         values = np.concatenate([lens_values(camera), np.zeros(DEFORMATIONS)])
         mirror, goal = np.ones(len(values)), values.copy()
@@ -434,7 +437,7 @@ def check_flips(fitted: Sequence[Fitted], more: float, free: Mask, names: Sequen
     gain = GAIN if more <= POOR**2 else GAIN_OF_POOR
     best: tuple[float, str, Mask] | None = None
     for how, axes in WAYS.items():
-        flip, places = _Flip.of(fitted[0].camera, axes), [2 + axis for axis in axes]
+        flip, places = _FlippedLens.of(fitted[0].camera, axes), [2 + axis for axis in axes]
         tried = [flip.best(reduced, free, one) for one in _guesses(reduced, places)]
         flipped, after = min(tried, key=lambda one: one[1])
         apart = before - reduced.own(places, free)

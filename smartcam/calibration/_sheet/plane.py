@@ -200,22 +200,13 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
 
     ``view`` has at least 4 points of the target that are not on a line; without a lens (``camera``,
     for images of the same size) 5 at least, so that something tells how well a homography fits.
-    Raises MIRRORED: the image shows the target as in a mirror; and as
-    :func:`~smartcam.calibration.locate`.
+    Raises as :func:`~smartcam.calibration.locate`.
     """
     check_view(view, view.size if camera is None else camera.size)
     flat = view.object_points[:, :2]
     start = fit_homography(flat, view.points)
     if start is None or not math.isfinite(float(np.abs(start).sum())):
         raise _no_fit(view)
-    if _mirrored(start, flat):
-        raise CalibrationError(
-            "sheet: expected its x to turn left to its y as one reads it, got an image that shows "
-            "it as in a mirror",
-            code=Code.MIRRORED,
-            expected="an image that is not mirrored",
-            got="a mirrored one",
-        )
     if camera is None:
         return _by_homography(view, start)
     pose = locate(view, camera)
@@ -234,16 +225,6 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
         pose.rms,
         math.sqrt(more),
     )
-
-
-def _mirrored(matrix: Array, flat: Array) -> bool:
-    """Return whether the sheet's y is to the right of its x in an image whose v points down."""
-    reach = 1e-3 * float(np.ptp(flat, axis=0).max())
-    # x cross y points to the reader of the sheet, which in an image with v down is a negative area
-    steps = local_steps(partial(apply_homography, matrix), flat.mean(axis=0, keepdims=True), reach)[
-        0
-    ]
-    return float(np.linalg.det(steps)) > 0
 
 
 def _by_homography(view: TargetView, start: Array) -> PlaneView:
