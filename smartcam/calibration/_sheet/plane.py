@@ -8,7 +8,6 @@ lens bends stays bent, least between the points and more outside of them.
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from smartcam.calibration._geometry.homography import (
     derivatives,
     element_derivatives,
     fit_homography,
-    local_steps,
 )
 from smartcam.calibration._geometry.rigid import cross_matrix
 from smartcam.calibration._geometry.rotations import (
