@@ -117,6 +117,7 @@ class Fitted(NamedTuple):
             white @ pose_changes(seen.by_point, turned),
             white @ np.concatenate([seen.by_lens, by_sheet], axis=2),
             (white @ (self.view.points - seen.pixels)[..., None])[..., 0],
+            np.sqrt(more + self.view.sigmas**2),
         )
 
 
@@ -135,11 +136,13 @@ class Equations(NamedTuple):
     by_pose: Array  # (N, 2, 6)
     by_shared: Array  # (N, 2, 4 + K + D), by the lens' values, and by deformations of the sheet
     residuals: Array  # (N, 2), seen minus projected
+    deviations: Array  # (N,), what one of them is, pixels
 
-    def stray_squares(self, limit: float) -> Array:
-        """Return the squared lengths (N,) by which points are off, 0 where that is in the limit.
+    def stray_squares(self, scale: float) -> Array:
+        """Return the squared lengths (N,) by which points are off, 0 where that is little.
 
-        That is from where the other points of the view have them.
+        That is from where the other points of the view have them. ``scale``: squared length of one
+        standard deviation along each axis.
         """
         kept = np.full(len(self.residuals), np.isfinite(self.residuals).all())
         least = max(LEAST_KEPT, (1.0 - MOST_STRAYS) * len(kept))
@@ -147,11 +150,17 @@ class Equations(NamedTuple):
             rows, right = self.by_pose[kept].reshape(-1, 6), self.residuals[kept].ravel()
             step = solve_scaled(rows.T @ rows, rows.T @ right)
             off = ((self.residuals - self.by_pose @ step) ** 2).sum(axis=1)
-            worst = int(np.argmax(np.where(kept, off, 0.0)))
-            if off[worst] <= limit:
-                return np.where(~kept & (off > limit), off, 0.0)
-            kept[worst] = False
+            far = self._far(off, scale)
+            if not (kept & far).any():
+                return np.where(~kept & far, off, 0.0)
+            kept[int(np.argmax(np.where(kept & far, off, 0.0)))] = False
         return np.zeros(len(self.residuals))
+
+    def _far(self, squares: Array, scale: float) -> Mask:
+        pixels = self.deviations * np.sqrt(squares)
+        times = np.sqrt(squares / max(scale, np.finfo(np.float64).tiny))
+        far: Mask = np.any([(times > most) & (pixels > least) for most, least in OFF], axis=0)
+        return far
 
 
 class Stray(NamedTuple):
@@ -163,26 +172,57 @@ class Stray(NamedTuple):
     off: float  # pixels
 
 
-def strays(fitted: Sequence[Fitted], more: float, used: Sequence[bool]) -> list[Stray]:
+def strays(
+    fitted: Sequence[Fitted], more: float, used: Sequence[bool], *, lens: bool = True
+) -> list[Stray]:
     """Return the points that are far off what all others say.
 
     ``more``: variance beside the points' own, pixels^2. ``used``: the views that it is of; of the
-    others, a view may be bad for a few of its points.
+    others, a view may be bad for a few of its points. ``lens``: whether the lens is fitted to the
+    views; else a point is none that one that fits the other points brings to its place.
     """
     equations = [one.equations(more) for one in fitted]
-    of_used = [one for one, good in zip(equations, used, strict=True) if good]
-    squares = np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used])
-    # the median stays what it is, whatever a few strays do to ``more``
-    scale = max(float(np.median(squares)) / MEDIAN, LEAST_SCALE)
+    off = _stray_squares(equations, used)
+    if not lens and any(one.any() for one in off):
+        equations = _with_their_lens(equations, [one == 0 for one in off])
+        off = _stray_squares(equations, used)
     found = []
-    for number, (one, equation) in enumerate(zip(fitted, equations, strict=True)):
-        squares = equation.stray_squares(OFF[0][0] ** 2 * scale)
+    for number, (one, squares) in enumerate(zip(equations, off, strict=True)):
         for row in np.flatnonzero(squares).tolist():
-            deviation = math.sqrt(more + float(np.trace(one.view.covariance[row])) / 2)
-            times, off = math.sqrt(squares[row] / scale), deviation * math.sqrt(squares[row])
-            if any(times > most and off > pixels for most, pixels in OFF):
-                found.append(Stray(number, row, int(one.view.ids[row]), off))
+            pixels = float(one.deviations[row]) * math.sqrt(squares[row])
+            found.append(Stray(number, row, int(fitted[number].view.ids[row]), pixels))
     return found
+
+
+def _with_their_lens(equations: Sequence[Equations], kept: Sequence[Mask]) -> list[Equations]:
+    """Return the equations with what the lens leaves that fits the points best that are kept."""
+    some = [
+        Equations(*(part[rows] for part in one)) for one, rows in zip(equations, kept, strict=True)
+    ]
+    change = _Reduced.of(some).best(_lens_alone(equations[0]))[0]
+    left = []
+    for one, rows in zip(equations, kept, strict=True):
+        residuals = one.residuals - one.by_shared @ change
+        by_pose, right = one.by_pose[rows].reshape(-1, 6), residuals[rows].ravel()
+        step = solve_scaled(by_pose.T @ by_pose, by_pose.T @ right)
+        left.append(one._replace(residuals=residuals - one.by_pose @ step))
+    return left
+
+
+def _stray_squares(equations: Sequence[Equations], used: Sequence[bool]) -> list[Array]:
+    """Return the squared lengths (N,) by which points of each view are off, 0 for most."""
+    of_used = itertools.compress(equations, used)
+    # the median stays what it is, whatever a few strays do to the variance of all
+    middle = np.median(np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used]))
+    scale = max(float(middle) / MEDIAN, LEAST_SCALE)
+    return [one.stray_squares(scale) for one in equations]
+
+
+def _lens_alone(equations: Equations) -> Mask:
+    """Return which of the shared unknowns are a lens' values."""
+    count = equations.by_shared.shape[2]
+    of_lens: Mask = np.arange(count) < count - DEFORMATIONS
+    return of_lens
 
 
 def without(views: Sequence[TargetView], found: Sequence[Stray]) -> list[TargetView]:
@@ -234,7 +274,7 @@ def without_strays(
         Fitted(view, camera, pose.transform.rigid, view.target.points)
         for view, pose in zip(views, poses, strict=True)
     ]
-    found = strays(fitted, more, [True] * len(fitted))
+    found = strays(fitted, more, [True] * len(fitted), lens=False)
     names = [label(view, number) for number, view in enumerate(views)]
     remarks = [*stray_remarks(found, names, "was not used"), *view_remarks(views, names)]
     return without(views, found), remarks
@@ -311,9 +351,9 @@ def lens_gain(fitted: Sequence[Fitted], more: float) -> float:
 
     1 where the lens that they have is theirs. ``more``: variance beside the points' own, pixels^2.
     """
-    reduced = _Reduced.of([one.equations(more) for one in fitted])
-    free = np.arange(reduced.right.shape[1]) < reduced.right.shape[1] - DEFORMATIONS
-    before, after = float(reduced.squares.sum()), reduced.own([], free)
+    equations = [one.equations(more) for one in fitted]
+    reduced = _Reduced.of(equations)
+    before, after = float(reduced.squares.sum()), reduced.best(_lens_alone(equations[0]))[1]
     return before / after if after > 0 else 1.0
 
 
@@ -369,19 +409,22 @@ class _Reduced(NamedTuple):
         misfits: Array = self.squares - 2.0 * self.right @ change + self.matrix @ change @ change
         return misfits
 
-    def own(self, places: Sequence[int], free: Mask) -> float:
-        """Return the least squares where each view has values of its own at some places."""
+    def best(self, free: Mask, places: Sequence[int] = ()) -> tuple[Array, float]:
+        """Return the change of the free values (L,) with the least squares, and these.
+
+        At some places each view may have a value of its own.
+        """
         # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
         matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
-        for whole, side in zip(self.matrix, self.right, strict=True):
+        for whole, side in zip(self.matrix, self.right, strict=True) if places else ():
             own = whole[np.ix_(places, places)]
             both = solve_scaled(own, np.column_stack([whole[places], side[places]]))
             matrix = matrix - whole[:, places] @ both[:, :-1]
             right = right - whole[:, places] @ both[:, -1]
             squares = squares - side[places] @ both[:, -1]
         basis = np.eye(len(right))[:, free]
-        change = solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
-        return float(squares - change @ (basis.T @ right))
+        change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
+        return change, float(squares - change @ right)
 
 
 class _FlippedLens(NamedTuple):
@@ -433,14 +476,14 @@ def check_flips(fitted: Sequence[Fitted], more: float, free: Mask, names: Sequen
         return
     reduced = _Reduced.of([one.equations(more) for one in fitted])
     free = np.concatenate([free, np.ones(DEFORMATIONS, dtype=np.bool_)])
-    before = reduced.own([], free)
+    before = reduced.best(free)[1]
     gain = GAIN if more <= POOR**2 else GAIN_OF_POOR
     best: tuple[float, str, Mask] | None = None
     for how, axes in WAYS.items():
         flip, places = _FlippedLens.of(fitted[0].camera, axes), [2 + axis for axis in axes]
         tried = [flip.best(reduced, free, one) for one in _guesses(reduced, places)]
         flipped, after = min(tried, key=lambda one: one[1])
-        apart = before - reduced.own(places, free)
+        apart = before - reduced.best(free, places)[1]
         clear = before > gain * after and before - after > EXPLAINED * apart
         if flipped.any() and not flipped.all() and clear and (best is None or after < best[0]):
             best = after, how, flipped

@@ -228,13 +228,14 @@ def test_calibrate_intrinsics_of_points_of_a_smaller_image_says_so() -> None:
 
 def test_strays_are_told_from_their_neighbours() -> None:
     random = np.random.default_rng(1)
-    residuals = random.normal(size=(40, 2))
-    by_pose = random.normal(size=(40, 2, 6))
+    residuals, by_pose = random.normal(size=(40, 2)), random.normal(size=(40, 2, 6))
     residuals[[3, 30]] += [[15, 0], [0, -20]]
-    found = Equations(by_pose, np.zeros((40, 2, 0)), residuals).stray_squares(7.0**2)
-    assert np.flatnonzero(found).tolist() == [3, 30]
+    some = Equations(by_pose, np.zeros((40, 2, 0)), residuals, np.full(40, 0.1))
+    assert np.flatnonzero(some.stray_squares(1.0)).tolist() == [3, 30]
+    assert not some.stray_squares(3.0**2).any()  # seven of these
+    assert not some._replace(deviations=np.full(40, 0.01)).stray_squares(1.0).any()  # 0.2 pixels
     many = residuals + 30 * (np.arange(40) % 3 == 0)[:, None]
-    assert not Equations(by_pose, np.zeros((40, 2, 0)), many).stray_squares(49.0).any()
+    assert not some._replace(residuals=many).stray_squares(1.0).any()
 
 
 @pytest.mark.parametrize(
