@@ -65,6 +65,9 @@ CHANCE = 1.0
 """Squared t of a gain that counts as chance: less of it is kept where more errors are systematic,
 with none cameras on robots of noise alone are 1.5 times as far off (measured in simulation)."""
 
+CERTAIN = 9.0
+"""Squared t of a gain that is none of chance: t = 3."""
+
 MOST_FOLDS = 20
 """Parts of the poses that a closed form is solved without, one after the other."""
 
@@ -346,8 +349,8 @@ def _part(along: Array, squares: Array) -> float:
     total, scatter = float(gain.sum()), float((gain**2).sum())
     if total <= 0:
         return 0.0
-    kept = max(0.0, 1.0 - CHANCE * scatter / total**2)
-    return min(1.0, kept * float(along.sum() / squares.sum()))
+    kept = (1.0 - CHANCE * scatter / total**2) / (1.0 - CHANCE / CERTAIN)
+    return min(1.0, min(1.0, max(0.0, kept)) * float(along.sum() / squares.sum()))
 
 
 def _mixed(first: Solution, other: Solution, part: Array | float) -> Solution:
