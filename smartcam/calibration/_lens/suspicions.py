@@ -49,9 +49,6 @@ LEAST_KEPT: Final = 8
 MEDIAN: Final = 2.0 * math.log(2.0)
 """Of the squared length of two independent normal numbers."""
 
-LEAST_SCALE: Final = 1e-6
-"""Of the variance beside what was said: exact points have none at all."""
-
 NAMED: Final = 5
 """Points that a text names at most."""
 
@@ -214,8 +211,7 @@ def _stray_squares(equations: Sequence[Equations], used: Sequence[bool]) -> list
     of_used = itertools.compress(equations, used)
     # the median stays what it is, whatever a few strays do to the variance of all
     middle = np.median(np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used]))
-    scale = max(float(middle) / MEDIAN, LEAST_SCALE)
-    return [one.stray_squares(scale) for one in equations]
+    return [one.stray_squares(float(middle) / MEDIAN) for one in equations]
 
 
 def _lens_alone(equations: Equations) -> Mask:
