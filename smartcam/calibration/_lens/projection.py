@@ -81,8 +81,8 @@ def smooth_changes(pixels: Array, size: tuple[int, int]) -> Array:
     """Return the derivatives of pixels (N, 2) by smooth changes of their image (N, 2, SMOOTH)."""
     x, y = (2.0 * pixels / max(size) - np.array(size) / max(size)).T
     powers = [x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
-    changes: Array = np.kron(np.eye(2), np.stack(powers, axis=1)[:, None])
-    return changes
+    changes = np.kron(np.eye(2), np.stack(powers, axis=1)[:, None])
+    return np.asarray(changes, dtype=np.float64)
 
 
 def whitening(covariance: Array, more: float) -> Array:

@@ -446,6 +446,7 @@ class _FlippedLens(NamedTuple):
         # Lens and flips are chosen in turn, which only lowers the squares.
         # Source: Lloyd, Least Squares Quantization in PCM (1982).
         basis = np.eye(len(self.mirror))[:, free]
+        as_is = mirrored = reduced.squares
         for _ in range(TURNS):
             plain, other = (reduced.matrix[one].sum(axis=0) for one in (~flipped, flipped))
             back = self.mirror * (reduced.right[flipped].sum(axis=0) - other @ self.shift)
