@@ -130,7 +130,7 @@ def test_sheet_without_a_lens_says_what_is_lost() -> None:
 def test_sheet_in_a_mirror_is_refused() -> None:
     view = seen()
     flipped = replace(view, points=np.array([799.0, 0.0]) + view.points * [-1.0, 1.0])
-    with refused("MIRRORED", "shows it as in a mirror"):
+    with refused("MIRRORED", "a view as in a mirror"):
         calibrate_sheet(flipped, touched(), camera=CAMERA)
 
 

@@ -423,14 +423,14 @@ class _Reduced(NamedTuple):
         return change, float(squares - change @ right)
 
 
-class _Flip(NamedTuple):
+class _Flipping(NamedTuple):
     """How a flip changes the values of a lens: by ``shift``, and their changes by ``mirror``."""
 
     mirror: Array  # (L,), 1 or -1
     shift: Array  # (L,)
 
     @classmethod
-    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _Flip:
+    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _Flipping:
         """Return what flipping pictures along some axes does."""
         values = np.concatenate([lens_values(camera), np.zeros(DEFORMATIONS)])
         mirror, goal = np.ones(len(values)), values.copy()
@@ -476,7 +476,7 @@ def check_flips(fitted: Sequence[Fitted], more: float, free: Mask, names: Sequen
     gain = GAIN if more <= POOR**2 else GAIN_OF_POOR
     best: tuple[float, str, Mask] | None = None
     for how, axes in WAYS.items():
-        flip, places = _Flip.of(fitted[0].camera, axes), [2 + axis for axis in axes]
+        flip, places = _Flipping.of(fitted[0].camera, axes), [2 + axis for axis in axes]
         tried = [flip.best(reduced, free, one) for one in _guesses(reduced, places)]
         flipped, after = min(tried, key=lambda one: one[1])
         apart = before - reduced.best(free, places)[1]

@@ -8,7 +8,6 @@ lens bends stays bent, least between the points and more outside of them.
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from smartcam.calibration._geometry.homography import (
     derivatives,
     element_derivatives,
     fit_homography,
-    local_steps,
 )
 from smartcam.calibration._geometry.rigid import cross_matrix
 from smartcam.calibration._geometry.rotations import (
@@ -208,14 +206,6 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
     start = fit_homography(flat, view.points)
     if start is None or not math.isfinite(float(np.abs(start).sum())):
         raise _no_fit(view)
-    if _mirrored(start, flat):
-        raise CalibrationError(
-            "sheet: expected its x to turn left to its y as one reads it, got an image that shows "
-            "it as in a mirror",
-            code=Code.MIRRORED,
-            expected="an image that is not mirrored",
-            got="a mirrored one",
-        )
     if camera is None:
         return _by_homography(view, start)
     pose = locate(view, camera)
@@ -234,16 +224,6 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
         pose.rms,
         math.sqrt(more),
     )
-
-
-def _mirrored(matrix: Array, flat: Array) -> bool:
-    """Return whether the sheet's y is to the right of its x in an image whose v points down."""
-    reach = 1e-3 * float(np.ptp(flat, axis=0).max())
-    # x cross y points to the reader of the sheet, which in an image with v down is a negative area
-    steps = local_steps(partial(apply_homography, matrix), flat.mean(axis=0, keepdims=True), reach)[
-        0
-    ]
-    return float(np.linalg.det(steps)) > 0
 
 
 def _by_homography(view: TargetView, start: Array) -> PlaneView:
