@@ -158,7 +158,7 @@ def examined(
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *said))
 
 
-class _Seen(NamedTuple):
+class _SeenFrom(NamedTuple):
     """One view of a calibration."""
 
     side: int
@@ -167,7 +167,7 @@ class _Seen(NamedTuple):
     fitted: Fitted
 
 
-def _seen(found: StereoCalibration) -> Iterator[_Seen]:
+def _seen(found: StereoCalibration) -> Iterator[_SeenFrom]:
     for number, pair in enumerate(found.pairs):
         if pair.transform is None:
             continue
@@ -176,7 +176,7 @@ def _seen(found: StereoCalibration) -> Iterator[_Seen]:
             if view is not None:
                 points = view.target.points + (0.0 if found.sheet is None else found.sheet)
                 camera = (found.left, found.right)[side]
-                yield _Seen(
+                yield _SeenFrom(
                     side, number, pair.used[side], Fitted(view, camera, poses[side].rigid, points)
                 )
 
