@@ -270,7 +270,9 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
         known = np.isfinite(off)
         if np.count_nonzero(known) < len(known) / 2:
             break
-        step = np.asarray(np.linalg.lstsq(by_motion[known], off[known])[0], dtype=np.float64)
+        step = np.asarray(
+            np.linalg.lstsq(by_motion[known], off[known], rcond=None)[0], dtype=np.float64
+        )
         motion = motion.turned_after(step)
         if np.abs(by_motion[known] @ step).max() < SETTLED:
             return motion

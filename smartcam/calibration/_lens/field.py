@@ -51,7 +51,9 @@ class Sensitivity(NamedTuple):
         # Pixels move by B d with the lens and by A m with the motion: at the gauge m = -A_g^+ B_g d
         # leaves the least squares, so B d + A m = (B - A A_g^+ B_g) d.
         count = self.by_lens.shape[2]
-        motion = np.linalg.lstsq(gauge.by_motion.reshape(-1, 6), gauge.by_lens.reshape(-1, count))
+        motion = np.linalg.lstsq(
+            gauge.by_motion.reshape(-1, 6), gauge.by_lens.reshape(-1, count), rcond=None
+        )
         freed: Array = self.by_lens - self.by_motion @ motion[0]
         return freed
 
