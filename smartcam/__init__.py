@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam import emulator, exceptions, interpreters, layout, models, protocols
+    from smartcam import emulator, exceptions, frames, interpreters, layout, models, protocols
     from smartcam.backoff import Backoff
     from smartcam.camera import Camera
     from smartcam.client import SmartCamera
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
         ConnectionLostError,
         ConnectionTakenError,
         FrameError,
+        FrameFormatError,
+        FrameSourceError,
+        FrameTimeoutError,
         InputContainerError,
         InterpretationError,
         LayoutError,
@@ -90,6 +93,9 @@ __all__ = [
     "ConnectionTakenError",
     "Disconnected",
     "FrameError",
+    "FrameFormatError",
+    "FrameSourceError",
+    "FrameTimeoutError",
     "Header",
     "Histogram",
     "InputContainerError",
@@ -128,6 +134,7 @@ __all__ = [
     "connect",
     "emulator",
     "exceptions",
+    "frames",
     "interpreters",
     "layout",
     "models",
@@ -138,7 +145,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "": "emulator exceptions interpreters layout models protocols",
+            "": "emulator exceptions frames interpreters layout models protocols",
             "backoff": "Backoff",
             "camera": "Camera",
             "client": "SmartCamera",

@@ -17,6 +17,9 @@
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── CameraFaultError                       the camera reports System Error
     ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
+    ├── FrameSourceError (OSError)             a source of pictures: gone, in use, stuck
+    │   ├── FrameFormatError                   pixels that it has not, or that are none
+    │   └── FrameTimeoutError (TimeoutError)   no picture in time
     ├── RecordingError (OSError)               a recording that could not be written, or read
     ├── SubscriberOverflowError                a stream's reader was too slow, and wanted to know
     ├── TriggerError                           a trigger that gave no result, and why
@@ -50,6 +53,9 @@ __all__ = [
     "ConnectionLostError",
     "ConnectionTakenError",
     "FrameError",
+    "FrameFormatError",
+    "FrameSourceError",
+    "FrameTimeoutError",
     "InputContainerError",
     "InterpretationError",
     "LayoutError",
@@ -233,6 +239,28 @@ class CalibrationError(SmartCamError, ValueError):
         self.code = code
         self.expected = expected
         self.got = got
+
+
+class FrameSourceError(SmartCamError, OSError):
+    """A source of pictures cannot be opened, is in use, is stuck, or is gone.
+
+    Attributes:
+        source: its name.
+        available: what it has instead, in words: formats, devices, controls.
+    """
+
+    def __init__(self, message: str, *, source: str = "", available: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.source = source
+        self.available = available
+
+
+class FrameFormatError(FrameSourceError):
+    """A source has no such pixels, or bytes are no picture of the format they are said to have."""
+
+
+class FrameTimeoutError(FrameSourceError, TimeoutError):
+    """No picture came in time."""
 
 
 class RecordingError(SmartCamError, OSError):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from importlib.metadata import Distribution, EntryPoint
 
-__all__ = ["GENERATORS", "INTERPRETERS", "PROTOCOLS"]
+__all__ = ["FRAMES", "GENERATORS", "INTERPRETERS", "PROTOCOLS"]
 
 _log = logging.getLogger(__name__)
 
@@ -211,4 +211,18 @@ GENERATORS = Registry(
         "tangram": "smartcam.emulator._generators:_tangram",
         "tangram_pixels": "smartcam.emulator._generators:_tangram_pixels",
     },
+)
+
+FRAMES = Registry(
+    "smartcam.frames",
+    {
+        "file": "smartcam.frames._video:VideoDriver",
+        "gige": "smartcam.frames._gige.driver:GigEDriver",
+        "http": "smartcam.frames._video:VideoDriver",
+        "insight": "smartcam.frames._insight:InSightDriver",
+        "rtsp": "smartcam.frames._video:VideoDriver",
+        "synthetic": "smartcam.frames._synthetic:SyntheticDriver",
+        "v4l2": "smartcam.frames._v4l2.driver:V4L2Driver",
+    },
+    aliases={"https": "http", "rtsps": "rtsp"},
 )

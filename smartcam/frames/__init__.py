@@ -1,0 +1,61 @@
+"""Pictures of any camera, the newest first.
+
+::
+
+    async with smartcam.frames.open("v4l2:///dev/video0?format=YUYV&size=640x480&fps=30") as source:
+        async for frame in source:
+            show(frame.grey())
+
+Nothing streams until somebody reads. A slow reader gets the newest frame, and a count of what it
+skipped and of what was lost before it came. The extra ``frames`` brings the codecs.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.frames._address import FrameAddress
+    from smartcam.frames._driver import FoundSource, FrameDriver, FrameSink, StreamFormat
+    from smartcam.frames._frame import Frame, Moment
+    from smartcam.frames._opening import discover, open
+    from smartcam.frames._pixels import PixelFormat, find_format
+    from smartcam.frames._source import (
+        FrameReader,
+        FrameSource,
+        ReaderStatistics,
+        SourceStatistics,
+    )
+
+__all__ = [
+    "FoundSource",
+    "Frame",
+    "FrameAddress",
+    "FrameDriver",
+    "FrameReader",
+    "FrameSink",
+    "FrameSource",
+    "Moment",
+    "PixelFormat",
+    "ReaderStatistics",
+    "SourceStatistics",
+    "StreamFormat",
+    "discover",
+    "find_format",
+    "open",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_address": "FrameAddress",
+            "_driver": "FoundSource FrameDriver FrameSink StreamFormat",
+            "_frame": "Frame Moment",
+            "_opening": "discover open",
+            "_pixels": "PixelFormat find_format",
+            "_source": "FrameReader FrameSource ReaderStatistics SourceStatistics",
+        },
+    )

@@ -1,0 +1,134 @@
+"""URLs of frame sources."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["FrameAddress"]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAddress:
+    """Where frames come from.
+
+    Attributes:
+        url: as it was given.
+        scheme: before ``://``, in small letters; ``file`` for a bare path.
+        host: name or address, "" where there is none.
+        port: None: the scheme's own.
+        path: what stands behind the host, with its first slash; of a bare path the path.
+        query: what stands behind ``?``.
+        user: before the host, or "".
+        password: the same; it stands in no text.
+    """
+
+    url: str
+    scheme: str
+    host: str
+    port: int | None
+    path: str
+    query: str
+    user: str
+    password: str
+
+    @classmethod
+    def parse(cls, url: str) -> FrameAddress:
+        """Read a URL, or the path of a file.
+
+        Raises:
+            ConfigurationError: it is none.
+        """
+        given = str(url).strip()
+        if not given:
+            raise ConfigurationError("frame source: expected a URL or a path, got ''")
+        if "://" not in given:
+            return cls(given, "file", "", None, str(Path(given)), "", "", "")
+        try:
+            parts = urlsplit(given)
+            port = parts.port
+        except ValueError as exc:
+            raise ConfigurationError(f"frame source {_masked(given)!r}: {exc}") from exc
+        return cls(
+            given,
+            parts.scheme,
+            parts.hostname or "",
+            port,
+            unquote(parts.path),
+            parts.query,
+            unquote(parts.username or ""),
+            unquote(parts.password or ""),
+        )
+
+    @property
+    def shown(self) -> str:
+        """The URL without a password."""
+        return _masked(self.url)
+
+    def __repr__(self) -> str:
+        """Return it without the password."""
+        return f"FrameAddress({self.shown!r})"
+
+    def parameters(self, known: Sequence[str]) -> dict[str, str]:
+        """Return what the query says.
+
+        Raises:
+            ConfigurationError: it has a name that is not known, or one twice.
+        """
+        said: dict[str, str] = {}
+        for name, value in parse_qsl(self.query, keep_blank_values=True):
+            if name not in known:
+                raise ConfigurationError(
+                    f"frame source {self.shown!r}: unknown parameter {name!r}; known are "
+                    f"{', '.join(known)}{did_you_mean(name, known)}"
+                )
+            if name in said:
+                raise ConfigurationError(
+                    f"frame source {self.shown!r}: parameter {name!r} stands there twice"
+                )
+            said[name] = value
+        return said
+
+    def size(self, text: str) -> tuple[int, int]:
+        """Return ``WIDTHxHEIGHT`` as two numbers.
+
+        Raises:
+            ConfigurationError: it is something else.
+        """
+        found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+        if found is None:
+            raise self.wrong("size", "WIDTHxHEIGHT, such as 640x480", text)
+        return int(found[1]), int(found[2])
+
+    def number(self, name: str, text: str, least: float, most: float) -> float:
+        """Return a parameter's number.
+
+        Raises:
+            ConfigurationError: it is none, or not from ``least`` to ``most``.
+        """
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            raise self.wrong(name, f"a number from {least:g} to {most:g}", text)
+        return value
+
+    def wrong(self, name: str, expected: str, got: str) -> ConfigurationError:
+        """Return the error of a parameter that is wrong."""
+        return ConfigurationError(
+            f"frame source {self.shown!r}: {name}: expected {expected}, got {got!r}"
+        )
+
+
+def _masked(url: str) -> str:
+    return re.sub(r"(//[^/?#@:]*):[^/?#@]*@", r"\1:***@", url)

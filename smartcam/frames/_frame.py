@@ -1,0 +1,108 @@
+"""One picture of a camera, with when it was taken and what was lost before it."""
+
+from __future__ import annotations
+
+import enum
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.frames._pixels import PixelFormat
+
+__all__ = ["Frame", "Moment"]
+
+
+class Moment(enum.Enum):
+    """Which moment a frame's capture time is."""
+
+    EXPOSURE_START = "start of exposure"
+    """The sensor began to see."""
+    FRAME_END = "end of frame"
+    """The last pixel was there: exposure and readout are over."""
+    ARRIVAL = "arrival"
+    """The frame was here; when it was taken nobody said."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """One picture as its camera gave it.
+
+    Attributes:
+        data: its bytes, as they came: nothing is converted, and nobody else writes into them.
+        format: how they are to be read.
+        width: pixels.
+        height: pixels.
+        stride: bytes from one row to the next one; 0 where the format is compressed.
+        captured: when, seconds of ``time.monotonic()``.
+        utc: the same, seconds since 1970.
+        moment: which moment these are.
+        duration: longest time from the start of the exposure to ``captured``, seconds: 0 where
+            that is the start; else what the source knows of its frame time and of its way here.
+        device_time: what the camera's own clock said, seconds; None: it has none, or said nothing.
+        sequence: the camera's number of the frame; it counts lost ones, too.
+        lost: frames that were lost between the last one and this one, on the way or in the camera.
+        source: name of the camera.
+        camera_info: its lens, as it was told; None: nobody said.
+    """
+
+    data: bytes | bytearray | memoryview
+    format: PixelFormat
+    width: int
+    height: int
+    stride: int
+    captured: float
+    utc: float
+    moment: Moment
+    duration: float = 0.0
+    device_time: float | None = None
+    sequence: int
+    lost: int = 0
+    source: str
+    camera_info: CameraModel | None = None
+
+    @property
+    def age(self) -> float:
+        """Seconds since ``captured``."""
+        return time.monotonic() - self.captured
+
+    @property
+    def began(self) -> float:
+        """When the exposure began at the earliest, seconds of ``time.monotonic()``."""
+        return self.captured - self.duration
+
+    def array(self) -> NDArray[Any]:
+        """Return the pixels as the format has them; nothing is converted, and copied only to unpack.
+
+        Returns:
+            (H, W) or (H, W, C), uint8 or uint16, read-only; of a format of several planes, such as
+            NV12, and of a compressed one the bytes, (N,).
+
+        Raises:
+            FrameFormatError: there are fewer bytes than the format asks for.
+        """
+        return self.format.array(self.data, self.width, self.height, self.stride)
+
+    def grey(self) -> NDArray[Any]:
+        """Return the brightness: the plane that the camera sent, where it sent one.
+
+        Returns:
+            (H, W), uint8 or uint16, read-only where it is the camera's own plane.
+
+        Raises:
+            FrameFormatError: the format has no brightness, or its bytes are wrong.
+            MissingExtraError: a compressed format, and its codec is not installed.
+        """
+        return self.format.grey(self.data, self.width, self.height, self.stride)
+
+    def rgb(self) -> NDArray[Any]:
+        """Return the colours, (H, W, 3), red first; Bayer patterns are demosaiced.
+
+        Raises:
+            FrameFormatError: the format has no colours, or its bytes are wrong.
+            MissingExtraError: a compressed format, and its codec is not installed.
+        """
+        return self.format.rgb(self.data, self.width, self.height, self.stride)

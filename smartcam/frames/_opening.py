@@ -1,0 +1,68 @@
+"""Sources of frames by their URLs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError
+from smartcam.frames._address import FrameAddress
+from smartcam.frames._source import FRAME_TIMEOUT, FrameSource
+from smartcam.registry import FRAMES
+
+if TYPE_CHECKING:
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.frames._driver import FoundSource, FrameDriver
+
+__all__ = ["discover", "open"]
+
+
+def open(
+    url: str,
+    *,
+    camera_info: CameraModel | None = None,
+    timeout: float | None = FRAME_TIMEOUT,
+    stall: float | None = 5.0,
+    linger: float = 0.0,
+) -> FrameSource:
+    """Return a source of frames; ``async with`` opens it.
+
+    Args:
+        url: ``v4l2:///dev/video0?format=YUYV&size=640x480&fps=30``, ``gige://HOST``,
+            ``rtsp://...``, ``http://...``, ``synthetic://``, ``insight://...``, or the path of a
+            file.
+        camera_info: the lens, which every frame gets.
+        timeout: seconds that an iteration waits for a frame; None: as long as it takes.
+        stall: seconds without a frame after which a streaming device counts as stuck; None: never.
+        linger: seconds that it goes on streaming after the last reader.
+
+    Raises:
+        ConfigurationError: the URL is wrong; the text says what is known.
+    """
+    address = FrameAddress.parse(url)
+    driver = _driver(address.scheme, address.shown)(address)
+    return FrameSource(driver, camera_info=camera_info, timeout=timeout, stall=stall, linger=linger)
+
+
+async def discover(scheme: str | None = None) -> list[FoundSource]:
+    """Return the sources that are found on this machine and its network.
+
+    Args:
+        scheme: of those that are looked for; None: all.
+
+    Raises:
+        ConfigurationError: no such scheme.
+    """
+    schemes = [info.name for info in FRAMES.available()] if scheme is None else [scheme]
+    kinds = dict.fromkeys(_driver(one, one) for one in schemes)
+    return [found for kind in kinds for found in await kind.discover()]
+
+
+def _driver(scheme: str, url: str) -> type[FrameDriver]:
+    if scheme not in FRAMES:
+        known = [info.name for info in FRAMES.available()]
+        raise ConfigurationError(
+            f"frame source {url!r}: unknown scheme {scheme!r}; known are "
+            f"{', '.join(f'{one}://' for one in known)}{did_you_mean(scheme, known)}"
+        )
+    return cast("type[FrameDriver]", FRAMES.load(scheme))

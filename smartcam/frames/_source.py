@@ -1,0 +1,482 @@
+"""A source of frames: lazy, latest-only for each of its readers, with an account for each."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import math
+import time
+import weakref
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameSourceError,
+    FrameTimeoutError,
+    LocalProtocolError,
+)
+from smartcam.frames._driver import FrameSink
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import EllipsisType, TracebackType
+    from typing import Self
+
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.frames._driver import FrameDriver, StreamFormat
+    from smartcam.frames._frame import Frame
+
+__all__ = ["FrameReader", "FrameSource", "ReaderStatistics", "SourceStatistics"]
+
+FRAME_TIMEOUT = 5.0
+"""Seconds that a frame is waited for, unless one says otherwise."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReaderStatistics:
+    """What became of the frames that came while a reader was there.
+
+    Attributes:
+        offered: came since it began; always delivered + skipped + waiting.
+        delivered: it took them.
+        skipped: a newer one came before it took them.
+        waiting: 1 where one is there that it has not taken, else 0.
+        lost: never came: lost in the camera or on the way.
+    """
+
+    offered: int
+    delivered: int
+    skipped: int
+    waiting: int
+    lost: int
+
+
+@dataclass(frozen=True, slots=True)
+class SourceStatistics:
+    """What a source did since it was opened.
+
+    Attributes:
+        streaming: whether the device streams now.
+        readers: who reads now.
+        started: how often the device began to stream.
+        frames: came, for readers or not.
+        lost: never came: lost in the camera or on the way.
+    """
+
+    streaming: bool
+    readers: int
+    started: int
+    frames: int
+    lost: int
+
+
+class FrameReader:
+    """One reader of a source: an iterator that gives the newest frame, and skips what it missed.
+
+    The device streams while there is a reader. One that is closed, or that nobody holds any
+    longer, is none.
+    """
+
+    def __init__(self, source: FrameSource, timeout: float | None) -> None:
+        self._source: FrameSource | None = source
+        self._timeout = timeout
+        self._next: Frame | None = None
+        self._last: Frame | None = None  # the last one that was taken
+        self._ended = False
+        self._error: FrameSourceError | None = None
+        self._came = asyncio.Event()
+        self._offered = self._delivered = self._skipped = self._lost = 0
+
+    def statistics(self) -> ReaderStatistics:
+        """Return the account as it is now."""
+        return ReaderStatistics(
+            self._offered,
+            self._delivered,
+            self._skipped,
+            int(self._next is not None),
+            self._lost,
+        )
+
+    def close(self) -> None:
+        """Read no longer; a frame that waits counts as skipped. Idempotent."""
+        if self._next is not None:
+            self._skipped += 1
+            self._next = None
+        self._last = None
+        self._end(None)
+        if self._source is not None:
+            self._source._forget(self)  # noqa: SLF001 - the two are one
+            self._source = None
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Frame:
+        """Return the newest frame that was not returned yet.
+
+        Raises:
+            FrameTimeoutError: none came in time; it may be waited for again.
+            FrameSourceError: the source ended with it.
+
+        Cancellation: safe; the frame is there for the next one.
+        """
+        frame = await self._take(self._deadline(self._timeout), "the next frame")
+        if frame is None:
+            raise StopAsyncIteration
+        return frame
+
+    async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
+        """Return the newest frame; one that is older than ``max_age`` is waited past.
+
+        Args:
+            max_age: seconds since it was captured; ``inf``: any.
+            timeout: seconds; None: as long as it takes.
+
+        Raises:
+            FrameTimeoutError: none came in time.
+            FrameSourceError: the source ended.
+
+        Cancellation: safe.
+        """
+        what = f"a frame of the last {max_age:g} s"
+        held = self._next or self._last
+        if held is not None and held.age <= max_age:
+            return self._taken(held)
+        return await self._first(what, timeout, lambda frame: frame.age <= max_age)
+
+    async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
+        """Return the first frame that is here, or comes, whose exposure began after a moment.
+
+        Where the source does not tell when the exposure began, it is the first one of which that is
+        sure: see :attr:`Frame.began`.
+
+        Args:
+            moment: of ``time.monotonic()``.
+            timeout: seconds; None: as long as it takes.
+
+        Raises:
+            FrameTimeoutError: none came in time.
+            FrameSourceError: the source ended.
+
+        Cancellation: safe; frames that came before are skipped.
+        """
+        for held in (self._last, self._next):
+            if held is not None and held.began >= moment:
+                return self._taken(held)
+        what = "a frame exposed after the moment that was given"
+        return await self._first(what, timeout, lambda frame: frame.began >= moment)
+
+    async def _first(
+        self, what: str, timeout: float | None, wanted: Callable[[Frame], bool]
+    ) -> Frame:
+        """Return the first frame that comes and is wanted."""
+        end = self._deadline(timeout)
+        while (frame := await self._take(end, what)) is not None:
+            if wanted(frame):
+                return frame
+        raise FrameSourceError(f"{self._name}: expected {what}, it ended", source=self._name)
+
+    @property
+    def _name(self) -> str:
+        return self._source.name if self._source is not None else "a closed reader"
+
+    @staticmethod
+    def _deadline(timeout: float | None) -> float | None:
+        return None if timeout is None else asyncio.get_running_loop().time() + timeout
+
+    async def _take(self, end: float | None, what: str) -> Frame | None:
+        """Return the next frame as soon as there is one; None at the end of the source."""
+        try:
+            async with asyncio.timeout_at(end):
+                while self._next is None and not self._ended:
+                    self._came.clear()
+                    await self._came.wait()
+        except TimeoutError:
+            raise FrameTimeoutError(
+                f"{self._name}: expected {what}, got none in time", source=self._name
+            ) from None
+        if self._next is not None:
+            return self._taken(self._next)
+        if self._error is not None:
+            raise self._error
+        return None
+
+    def _offer(self, frame: Frame) -> None:
+        self._offered += 1
+        if self._next is not None:
+            self._skipped += 1
+        self._next = frame
+        self._came.set()
+
+    def _miss(self, count: int) -> None:
+        self._lost += count
+
+    def _end(self, error: FrameSourceError | None) -> None:
+        if not self._ended:
+            self._ended, self._error = True, error
+        self._came.set()
+
+    def _taken(self, frame: Frame) -> Frame:
+        if frame is self._next:
+            self._next = None
+            self._delivered += 1
+        self._last = frame
+        return frame
+
+
+class FrameSource(FrameSink):
+    """Frames of one camera, for any number of readers; ``async with`` opens and closes it.
+
+    The device streams while somebody reads, and does nothing otherwise. Made by
+    :func:`smartcam.frames.open`.
+
+    Args:
+        driver: of the device; it is the source's from now on.
+        camera_info: the lens, which every frame gets; None: as the driver has it.
+        timeout: seconds that an iteration waits for a frame; None: as long as it takes.
+        stall: seconds without a frame after which a streaming device counts as stuck: readers get a
+            :exc:`~smartcam.FrameSourceError`. None: never, as with a camera that waits for triggers.
+        linger: seconds that it goes on streaming after the last reader, for one that comes back.
+
+    Raises:
+        ConfigurationError: a time that is none.
+    """
+
+    def __init__(
+        self,
+        driver: FrameDriver,
+        *,
+        camera_info: CameraModel | None = None,
+        timeout: float | None = FRAME_TIMEOUT,
+        stall: float | None = 5.0,
+        linger: float = 0.0,
+    ) -> None:
+        for name, value in (("timeout", timeout), ("stall", stall)):
+            if value is not None and not 0 < value < math.inf:
+                raise ConfigurationError(f"{name}: expected seconds above 0 or None, got {value!r}")
+        if not 0 <= linger <= 3600:
+            raise ConfigurationError(f"linger: expected 0 to 3600 seconds, got {linger!r}")
+        self._driver = driver
+        self._camera_info = camera_info
+        self._timeout, self._stall, self._linger = timeout, stall, linger
+        self._readers: set[weakref.ref[FrameReader]] = set()
+        self._format: StreamFormat | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._changed = asyncio.Event()  # readers came or went, or the driver ended
+        self._streaming = False
+        self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
+        self._frames = self._lost = self._started = 0
+        self._newest: Frame | None = None
+        self._last_came = 0.0
+
+    @property
+    def name(self) -> str:
+        """The camera's name."""
+        return self._driver.name
+
+    @property
+    def format(self) -> StreamFormat:
+        """What it streams.
+
+        Raises:
+            LocalProtocolError: it is not open.
+        """
+        if self._format is None:
+            raise LocalProtocolError(f"{self.name} is not open: async with it")
+        return self._format
+
+    def statistics(self) -> SourceStatistics:
+        """Return what it did since it was opened."""
+        return SourceStatistics(
+            self._streaming, len(self._readers), self._started, self._frames, self._lost
+        )
+
+    async def __aenter__(self) -> Self:
+        """Open the device; it does not stream yet.
+
+        Raises:
+            FrameSourceError: it is not there, in use, or cannot do what it is asked for.
+
+        Cancellation: nothing stays open.
+        """
+        if self._task is not None:
+            raise LocalProtocolError(f"{self.name} is open already")
+        try:
+            self._format = await self._driver.open()
+        except BaseException:
+            await self._driver.close()
+            raise
+        self._task = asyncio.create_task(self._run(), name=f"frames of {self.name}")
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Stop streaming and give the device back; readers end. Idempotent.
+
+        Cancellation: the device is given back all the same.
+        """
+        task, self._task, self._format = self._task, None, None
+        for reader in self._alive():
+            reader.close()
+        if task is None:
+            return
+        task.cancel()
+        await asyncio.wait([task])
+        if not task.cancelled() and (error := task.exception()) is not None:
+            raise error
+
+    def reader(self, *, timeout: float | EllipsisType | None = ...) -> FrameReader:
+        """Begin to read; the device streams from now on.
+
+        Args:
+            timeout: seconds that an iteration waits for a frame; None: as long as it takes; left
+                out: the source's.
+
+        Raises:
+            LocalProtocolError: the source is not open.
+        """
+        if self._task is None:
+            raise LocalProtocolError(f"{self.name} is not open: async with it, then read")
+        reader = FrameReader(self, self._timeout if timeout is ... else timeout)
+        self._readers.add(weakref.ref(reader, self._dropped))
+        self._changed.set()
+        return reader
+
+    def __aiter__(self) -> FrameReader:
+        return self.reader()
+
+    async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
+        """Return the newest frame, as :meth:`FrameReader.newest` does for a reader of its own.
+
+        Who asks often keeps a reader, or opens the source with ``linger``: without either the
+        device begins to stream for each.
+        """
+        async with self.reader() as reader:
+            if self._newest is not None and self._newest.age <= max_age:
+                return self._newest
+            return await reader.newest(max_age=max_age, timeout=timeout)
+
+    async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
+        """Return the first frame exposed after a moment, as :meth:`FrameReader.after` does."""
+        async with self.reader() as reader:
+            if self._newest is not None and self._newest.began >= moment:
+                return self._newest
+            return await reader.after(moment, timeout=timeout)
+
+    # what the driver says
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame from the driver."""
+        if frame.lost:
+            self.lost(frame.lost)
+        if self._camera_info is not None and frame.camera_info is None:
+            frame = dataclasses.replace(frame, camera_info=self._camera_info)
+        self._frames += 1
+        self._newest = frame
+        self._last_came = time.monotonic()
+        for reader in self._alive():
+            reader._offer(frame)  # noqa: SLF001 - the two are one
+
+    def lost(self, count: int) -> None:
+        """Take from the driver that frames were lost."""
+        self._lost += count
+        for reader in self._alive():
+            reader._miss(count)  # noqa: SLF001
+
+    def ended(self, error: FrameSourceError | None) -> None:
+        """Take from the driver that nothing more comes."""
+        self._over = (error,)
+        self._changed.set()
+
+    def _alive(self) -> list[FrameReader]:
+        return [reader for one in self._readers if (reader := one()) is not None]
+
+    def _dropped(self, one: weakref.ref[FrameReader]) -> None:
+        self._readers.discard(one)
+        self._changed.set()
+
+    def _forget(self, reader: FrameReader) -> None:
+        self._dropped(weakref.ref(reader))
+
+    async def _run(self) -> None:
+        """Stream while somebody reads."""
+        try:
+            while True:
+                await self._until_changed(lambda: bool(self._readers))
+                try:
+                    await self._stream()
+                except FrameSourceError as error:
+                    self._tell(error)
+        finally:
+            self._newest = None
+            await self._driver.close()
+
+    async def _stream(self) -> None:
+        """Have the device stream until nobody reads, or it ends."""
+        self._over = None
+        self._newest = None
+        try:
+            await self._driver.start(self)
+            self._streaming = True
+            self._started += 1
+            self._last_came = time.monotonic()
+            await self._while_read()
+        finally:
+            self._streaming = False
+            await self._driver.stop()
+            self._newest = None
+        if self._over is not None:
+            self._tell(self._over[0])
+
+    async def _while_read(self) -> None:
+        while self._over is None:
+            idle = not self._readers
+            wait = self._linger if idle else self._stall
+            try:
+                async with asyncio.timeout(self._left(wait, idle=idle)):
+                    await self._until_changed(
+                        lambda idle=idle: self._over is not None or idle == bool(self._readers)
+                    )
+            except TimeoutError:
+                if idle:
+                    return
+                if self._stall is not None and self._left(self._stall, idle=False) <= 0:
+                    raise FrameSourceError(
+                        f"{self.name}: it streams, but gave no frame for {self._stall:g} s",
+                        source=self.name,
+                    ) from None
+
+    def _left(self, wait: float | None, *, idle: bool) -> float | None:
+        if wait is None or idle:
+            return wait
+        return self._last_came + wait - time.monotonic()
+
+    async def _until_changed(self, reached: Callable[[], bool]) -> None:
+        while not reached():
+            self._changed.clear()
+            await self._changed.wait()
+
+    def _tell(self, error: FrameSourceError | None) -> None:
+        """End all readers; one that comes later has the device tried again."""
+        for reader in self._alive():
+            reader._end(error)  # noqa: SLF001
+            self._forget(reader)

@@ -1,0 +1,149 @@
+"""Frames that nobody has to have a camera for, with number and time drawn into the picture."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from smartcam.frames._driver import FrameDriver, StreamFormat
+from smartcam.frames._frame import Frame, Moment
+from smartcam.frames._pixels import find_format
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.frames._address import FrameAddress
+    from smartcam.frames._driver import FrameSink
+
+__all__ = ["SyntheticDriver", "read_stamp"]
+
+BITS: Final = 64
+"""Of each of the two rows of a stamp."""
+
+CELL: Final = 4
+"""Pixels along a side of a bit."""
+
+LEAST: Final = (BITS * CELL, 4 * CELL)
+"""Pixels of the smallest picture that a stamp has room in."""
+
+
+class SyntheticDriver(FrameDriver):
+    """Moving stripes with a stamp: ``synthetic://?size=640x480&fps=30&format=Mono8``.
+
+    The stamp is two rows of cells in the upper left corner: the frame's number, and the nanoseconds
+    of ``time.monotonic_ns()`` at its capture. :func:`read_stamp` reads it at the far end, also
+    behind a lossy codec.
+    """
+
+    def __init__(self, address: FrameAddress) -> None:
+        super().__init__(address)
+        said = address.parameters(["size", "fps", "name"])
+        self._size = address.size(said.get("size", "640x480"))
+        if self._size[0] < LEAST[0] or self._size[1] < LEAST[1]:
+            raise address.wrong(
+                "size", f"{LEAST[0]}x{LEAST[1]} or more, room for the stamp", said["size"]
+            )
+        self._rate = address.number("fps", said.get("fps", "30"), 0.01, 10_000)
+        self._name = said.get("name", "synthetic")
+        self._task: asyncio.Task[None] | None = None
+        self._number = 0
+
+    @property
+    def name(self) -> str:
+        """As the URL says."""
+        return self._name
+
+    async def open(self) -> StreamFormat:
+        """Return what it draws."""
+        return StreamFormat(find_format("Mono8"), *self._size, (self._rate,))
+
+    async def start(self, sink: FrameSink) -> None:
+        """Begin to draw."""
+        self._task = asyncio.create_task(self._draw(sink), name=f"frames drawn for {self.name}")
+
+    async def stop(self) -> None:
+        """Draw no longer."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def close(self) -> None:
+        """Have nothing left."""
+        await self.stop()
+
+    async def _draw(self, sink: FrameSink) -> None:
+        width, height = self._size
+        picture = stripes(width, height)
+        grey = find_format("Mono8")
+        began, drawn = time.monotonic(), 0
+        while True:
+            drawn += 1
+            await asyncio.sleep(began + drawn / self._rate - time.monotonic())
+            self._number += 1
+            late = int((time.monotonic() - began) * self._rate) - drawn  # those nobody had time for
+            if late > 0:
+                drawn += late
+                self._number += late
+            now = time.monotonic_ns()
+            shown = np.roll(picture, self._number % width, axis=1)
+            write_stamp(shown, self._number, now)
+            sink.frame(
+                Frame(
+                    data=shown.tobytes(),
+                    format=grey,
+                    width=width,
+                    height=height,
+                    stride=width,
+                    captured=now / 1e9,
+                    utc=time.time() - (time.monotonic_ns() - now) / 1e9,
+                    moment=Moment.EXPOSURE_START,
+                    sequence=self._number,
+                    lost=max(0, late),
+                    source=self.name,
+                )
+            )
+
+
+def stripes(width: int, height: int) -> NDArray[np.uint8]:
+    """Return a picture of soft stripes, (height, width)."""
+    row = 128 + 80 * np.sin(np.arange(width) * (2 * np.pi * 8 / width))
+    fade = np.linspace(1.0, 0.4, height)[:, None]
+    return (row * fade).astype(np.uint8)
+
+
+def write_stamp(picture: NDArray[np.uint8], number: int, nanoseconds: int) -> None:
+    """Draw a stamp into the upper left corner of (H, W) or (H, W, C)."""
+    for row, value in enumerate((number, nanoseconds)):
+        for half, shown in enumerate((value, ~value)):  # its complement tells a torn or damaged one
+            bits = (shown >> np.arange(BITS, dtype=object)) & 1
+            cells = np.repeat(np.array(bits, np.uint8) * 219 + 16, CELL)
+            top = (2 * row + half) * CELL
+            band = picture[top : top + CELL, : BITS * CELL]
+            band[...] = cells if picture.ndim == 2 else cells[:, None]
+
+
+def read_stamp(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
+    """Return the number and the ``time.monotonic_ns()`` that a picture was stamped with.
+
+    Args:
+        picture: (H, W) or (H, W, C), also after a lossy codec.
+
+    Returns:
+        None where there is no stamp, or it is damaged.
+    """
+    if picture.shape[0] < LEAST[1] or picture.shape[1] < LEAST[0]:
+        return None
+    grey = picture if picture.ndim == 2 else picture.mean(axis=2)
+    cells = grey[: 4 * CELL, : BITS * CELL].reshape(4, CELL, BITS, CELL)
+    bits = cells[:, 1:-1, :, 1:-1].mean(axis=(1, 3)) > 127
+    if (bits[0::2] == bits[1::2]).any():
+        return None
+    weights = [1 << place for place in range(BITS)]
+    number, nanoseconds = (
+        sum(weight for weight, one in zip(weights, row, strict=True) if one) for row in bits[0::2]
+    )
+    return number, nanoseconds
