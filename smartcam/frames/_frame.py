@@ -75,7 +75,7 @@ class Frame:
         return self.captured - self.duration
 
     def array(self) -> NDArray[Any]:
-        """Return the pixels as the format has them; nothing is converted, and copied only to unpack.
+        """Return the pixels as the format has them; nothing is converted, only unpacked.
 
         Returns:
             (H, W) or (H, W, C), uint8 or uint16, read-only; of a format of several planes, such as

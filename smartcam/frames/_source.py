@@ -246,8 +246,8 @@ class FrameSource(FrameSink):
         driver: of the device; it is the source's from now on.
         camera_info: the lens, which every frame gets; None: as the driver has it.
         timeout: seconds that an iteration waits for a frame; None: as long as it takes.
-        stall: seconds without a frame after which a streaming device counts as stuck: readers get a
-            :exc:`~smartcam.FrameSourceError`. None: never, as with a camera that waits for triggers.
+        stall: seconds without a frame after which a streaming device counts as stuck: readers get
+            a :exc:`~smartcam.FrameSourceError`. None: never, as with one that waits for triggers.
         linger: seconds that it goes on streaming after the last reader, for one that comes back.
 
     Raises:
@@ -442,36 +442,40 @@ class FrameSource(FrameSink):
             await self._while_read()
         finally:
             self._streaming = False
-            await self._driver.stop()
             self._newest = None
-        if self._over is not None:
-            self._tell(self._over[0])
+            await self._driver.stop()
+        over, self._over = self._over, None
+        if over is not None:
+            self._tell(over[0])
 
     async def _while_read(self) -> None:
+        """Wait until the driver ended, it is stuck, or nobody reads for as long as it lingers."""
         while self._over is None:
-            idle = not self._readers
-            wait = self._linger if idle else self._stall
-            try:
-                async with asyncio.timeout(self._left(wait, idle=idle)):
-                    await self._until_changed(
-                        lambda idle=idle: self._over is not None or idle == bool(self._readers)
-                    )
-            except TimeoutError:
-                if idle:
+            if not self._readers:
+                if not await self._within(self._linger, lambda: bool(self._readers)):
                     return
-                if self._stall is not None and self._left(self._stall, idle=False) <= 0:
+            elif self._stall is None:
+                await self._until_changed(lambda: not self._readers)
+            else:
+                left = self._last_came + self._stall - time.monotonic()
+                if left <= 0:
                     raise FrameSourceError(
                         f"{self.name}: it streams, but gave no frame for {self._stall:g} s",
                         source=self.name,
-                    ) from None
+                    )
+                await self._within(left, lambda: not self._readers)
 
-    def _left(self, wait: float | None, *, idle: bool) -> float | None:
-        if wait is None or idle:
-            return wait
-        return self._last_came + wait - time.monotonic()
+    async def _within(self, seconds: float, reached: Callable[[], bool]) -> bool:
+        """Wait for a change; return whether it came in time."""
+        try:
+            async with asyncio.timeout(seconds):
+                await self._until_changed(reached)
+        except TimeoutError:
+            return False
+        return True
 
     async def _until_changed(self, reached: Callable[[], bool]) -> None:
-        while not reached():
+        while not (reached() or self._over is not None):
             self._changed.clear()
             await self._changed.wait()
 

@@ -31,7 +31,7 @@ LEAST: Final = (BITS * CELL, 4 * CELL)
 
 
 class SyntheticDriver(FrameDriver):
-    """Moving stripes with a stamp: ``synthetic://?size=640x480&fps=30&format=Mono8``.
+    """Moving stripes with a stamp: ``synthetic://?size=640x480&fps=30``.
 
     The stamp is two rows of cells in the upper left corner: the frame's number, and the nanoseconds
     of ``time.monotonic_ns()`` at its capture. :func:`read_stamp` reads it at the far end, also
@@ -112,7 +112,8 @@ def stripes(width: int, height: int) -> NDArray[np.uint8]:
     """Return a picture of soft stripes, (height, width)."""
     row = 128 + 80 * np.sin(np.arange(width) * (2 * np.pi * 8 / width))
     fade = np.linspace(1.0, 0.4, height)[:, None]
-    return (row * fade).astype(np.uint8)
+    shown: NDArray[np.uint8] = (row * fade).astype(np.uint8)
+    return shown
 
 
 def write_stamp(picture: NDArray[np.uint8], number: int, nanoseconds: int) -> None:
