@@ -64,6 +64,9 @@ class FrameSink(ABC):
     def lost(self, count: int) -> None:
         """Take that frames were lost; the next frame does not count them again."""
 
+    def skipped(self, count: int) -> None:  # noqa: B027 - most drivers have none
+        """Take that frames came to the far end of a link, where newer ones took their place."""
+
     @abstractmethod
     def ended(self, error: FrameSourceError | None) -> None:
         """Take that nothing more comes: None at the end of a file. Readers get the error."""

@@ -223,6 +223,10 @@ class FrameReader:
     def _miss(self, count: int) -> None:
         self._lost += count
 
+    def _skip(self, count: int) -> None:
+        self._offered += count
+        self._skipped += count
+
     def _end(self, error: FrameSourceError | None) -> None:
         if not self._ended:
             self._ended, self._error = True, error
@@ -401,6 +405,12 @@ class FrameSource(FrameSink):
         self._lost += count
         for reader in self._alive():
             reader._miss(count)  # noqa: SLF001
+
+    def skipped(self, count: int) -> None:
+        """Take from the driver that frames were skipped before they came here."""
+        self._frames += count
+        for reader in self._alive():
+            reader._skip(count)  # noqa: SLF001
 
     def ended(self, error: FrameSourceError | None) -> None:
         """Take from the driver that nothing more comes."""
