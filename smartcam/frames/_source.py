@@ -291,7 +291,7 @@ class FrameSource(FrameSink):
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
         self._newest: Frame | None = None
-        self._last_came = 0.0
+        self._last_came = self._idle_since = 0.0  # on the loop's clock
 
     @property
     def name(self) -> str:
@@ -421,8 +421,8 @@ class FrameSource(FrameSink):
         """Take a frame from the driver."""
         if frame.lost:
             self.lost(frame.lost)
-        now = self._last_came = time.monotonic()
-        frame = self._timed(frame, now)
+        self._last_came = asyncio.get_running_loop().time()
+        frame = self._timed(frame, time.monotonic())
         if self._camera_info is not None and frame.camera_info is None:
             frame = dataclasses.replace(frame, camera_info=self._camera_info)
         self._frames += 1
@@ -466,6 +466,8 @@ class FrameSource(FrameSink):
 
     def _dropped(self, one: weakref.ref[FrameReader]) -> None:
         self._readers.discard(one)
+        if not self._readers and self._task is not None:
+            self._idle_since = self._task.get_loop().time()
         self._changed.set()
 
     def _forget(self, reader: FrameReader) -> None:
@@ -480,7 +482,7 @@ class FrameSource(FrameSink):
                     await self._stream()
                 except FrameSourceError as error:
                     self._tell(error)
-                except Exception as error:
+                except Exception as error:  # noqa: BLE001 - a driver may be anybody's
                     _log.exception("%s: its driver failed", self.name)
                     self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
         finally:
@@ -495,7 +497,7 @@ class FrameSource(FrameSink):
             await self._driver.start(self)
             self._streaming = True
             self._started += 1
-            self._last_came = time.monotonic()
+            self._last_came = asyncio.get_running_loop().time()
             await self._while_read()
         finally:
             self._streaming = False
@@ -509,12 +511,13 @@ class FrameSource(FrameSink):
         """Wait until the driver ended, it is stuck, or nobody reads for as long as it lingers."""
         while self._over is None:
             if not self._readers:
-                if not await self._within(self._linger, lambda: bool(self._readers)):
+                left = self._idle_since + self._linger - asyncio.get_running_loop().time()
+                if not await self._within(left, lambda: bool(self._readers)) and left <= 0:
                     return
             elif self._stall is None:
                 await self._until_changed(lambda: not self._readers)
             else:
-                left = self._last_came + self._stall - time.monotonic()
+                left = self._last_came + self._stall - asyncio.get_running_loop().time()
                 if left <= 0:
                     raise FrameSourceError(
                         f"{self.name}: it streams, but gave no frame for {self._stall:g} s",

@@ -79,12 +79,13 @@ class SyntheticDriver(FrameDriver):
         width, height = self._size
         picture = stripes(width, height)
         grey = find_format("Mono8")
-        began, drawn = time.monotonic(), 0
+        loop = asyncio.get_running_loop()
+        began, drawn = loop.time(), 0
         while True:
             drawn += 1
-            await asyncio.sleep(began + drawn / self._rate - time.monotonic())
+            await asyncio.sleep(began + drawn / self._rate - loop.time())
             self._number += 1
-            late = int((time.monotonic() - began) * self._rate) - drawn  # those nobody had time for
+            late = int((loop.time() - began) * self._rate) - drawn  # those nobody had time for
             if late > 0:
                 drawn += late
                 self._number += late
