@@ -6,8 +6,6 @@ import collections
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["ClockStatistics", "DeviceClock"]
-
 WINDOW: Final = 40
 """Pieces of time that are remembered."""
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.frames._pixels import PixelFormat
 
-__all__ = ["Frame", "Moment"]
-
 
 class Moment(enum.Enum):
     """Which moment a frame's capture time is."""

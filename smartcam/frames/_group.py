@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from smartcam.frames._frame import Frame
     from smartcam.frames._source import FrameSource
 
-__all__ = ["FrameGroup", "FrameSet", "GroupStatistics"]
 
 KEPT: Final = 8
 """Frames of each camera that wait for those of the others."""
@@ -113,7 +112,7 @@ class FrameGroup:
                 raise ConfigurationError(f"{name}: expected seconds above 0 or None, got {value!r}")
         self._sources = dict(sources)
         self._within, self._timeout = within, timeout
-        self._readers: dict[str, _Member] = {}
+        self._readers: dict[str, _GroupReader] = {}
         self._open = False
         self._kept: dict[str, collections.deque[Frame]] = {
             name: collections.deque() for name in sources
@@ -231,7 +230,7 @@ class FrameGroup:
         if not self._readers and self._over is None:
             # all in one turn of the loop, so that each begins when the others do
             self._readers = {
-                name: _Member(source, self, name) for name, source in self._sources.items()
+                name: _GroupReader(source, self, name) for name, source in self._sources.items()
             }
 
     def _silence(self) -> str:
@@ -282,7 +281,7 @@ class FrameGroup:
         self._came.set()
 
 
-class _Member(FrameReader):
+class _GroupReader(FrameReader):
     """A reader that gives each frame to its group at once."""
 
     def __init__(self, source: FrameSource, group: FrameGroup, name: str) -> None:

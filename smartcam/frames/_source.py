@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from smartcam.frames._driver import FrameDriver, StreamFormat
     from smartcam.frames._frame import Frame
 
-__all__ = ["FrameReader", "FrameSource", "ReaderStatistics", "SourceStatistics"]
 
 _log = logging.getLogger(__name__)
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from smartcam.frames._frame import Frame
     from smartcam.frames._group import FrameSet
 
-__all__ = ["Rectifier", "Undistorter"]
-
 
 class Undistorter:
     """Pictures as a lens without distortion would show them; its maps are made once.

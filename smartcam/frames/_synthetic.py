@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
 
-__all__ = ["SyntheticDriver", "read_stamp"]
 
 BITS: Final = 64
 """Of each of the two rows of a stamp."""

@@ -64,7 +64,7 @@ def test_points_are_where_a_lens_without_distortion_has_them(model: DistortionMo
 
 
 def test_rows_of_a_rectified_pair_show_the_same_points() -> None:
-    turn = cv2.Rodrigues(np.array([0.03, -0.05, 0.04]))[0]
+    turn = np.array(cv2.Rodrigues(np.array([0.03, -0.05, 0.04]))[0], dtype=np.float64)
     right_left = Transform("right", "left", turn, np.array([-0.1, 0.005, 0.0]))
     camera = lens("plumb_bob")
     points = np.array([[-0.2, 0.15, 1.1], [-0.02, -0.2, 0.9], [0.1, 0.05, 1.3], [0.3, -0.1, 1.0]])
