@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._frame_wire import Encoding
-from smartcam.fleet._frames import Asked
+from smartcam.fleet._frames import FrameOrder
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Carrier, Owner
 from smartcam.fleet._wire import TriggerOrder, encode_runs
@@ -212,17 +212,17 @@ async def _request(call: ProgramCall) -> Answer:
     return {}, [] if answer is None else [answer]
 
 
-def _asked(call: ProgramCall) -> Asked:
+def _frame_order(call: ProgramCall) -> FrameOrder:
     name = call.host.name
     encoding = Encoding.checked(
         call.argument("encoding", str) or "raw", call.argument("quality", int), name
     )
-    return Asked(call.program, call.owner.call, encoding, call.timeout)
+    return FrameOrder(call.program, call.owner.call, encoding, call.timeout)
 
 
 async def _frame(call: ProgramCall) -> Answer:
     return await call.host.frames.one(
-        _asked(call),
+        _frame_order(call),
         max_age=call.argument("max_age", int, float),
         after=call.argument("after", int, float),
         fresh=bool(call.argument("fresh", bool)),
@@ -230,7 +230,7 @@ async def _frame(call: ProgramCall) -> Answer:
 
 
 async def _next_frame(call: ProgramCall) -> Answer:
-    return await call.host.frames.next(_asked(call), call.wanted("stream", int)), []
+    return await call.host.frames.next(_frame_order(call), call.wanted("stream", int)), []
 
 
 async def _leave_frames(call: ProgramCall) -> Answer:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
     from smartcam.camera import FrameEncoding
-    from smartcam.fleet._frame_driver import FrameCaller
+    from smartcam.fleet._frame_caller import FrameCaller
     from smartcam.fleet._program import Program
     from smartcam.fleet._wire import BusMessage
     from smartcam.frames import Frame, FrameReader
@@ -678,7 +678,7 @@ class FleetCamera(Camera[ValueT]):
     @functools.cached_property
     def frame_caller(self) -> FrameCaller:
         """What asks the camera's agent for frames."""
-        from smartcam.fleet._frame_driver import FrameCaller
+        from smartcam.fleet._frame_caller import FrameCaller
 
         return FrameCaller(self.name, self._caller)
 
@@ -690,7 +690,7 @@ class FleetCamera(Camera[ValueT]):
         quality: int | None = None,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> AsyncGenerator[FrameReader]:
-        from smartcam.fleet._frame_driver import SharedFrameDriver
+        from smartcam.fleet._frame_caller import SharedFrameDriver
         from smartcam.frames import FrameAddress, FrameSource
 
         wanted = Encoding.checked(encoding, quality, self.name)

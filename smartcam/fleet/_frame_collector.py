@@ -13,7 +13,7 @@ from smartcam.fleet._frame_wire import decode_part
 if TYPE_CHECKING:
     from smartcam.fleet._bus import Data, Handle
     from smartcam.fleet._caller import Caller
-    from smartcam.fleet._frame_wire import Part
+    from smartcam.fleet._frame_wire import FramePart
     from smartcam.fleet._program import Program
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -39,7 +39,7 @@ class Incoming:
         self._wanted = False
         self._stirred = asyncio.Event()
 
-    def take(self, part: Part, data: Data) -> None:
+    def take(self, part: FramePart, data: Data) -> None:
         """Take a part; what does not follow what is there ends it."""
         if self._torn or self.complete:
             return

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from smartcam.fleet._frame_wire import Part, encode_part
+from smartcam.fleet._frame_wire import FramePart, encode_part
 
 if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus, Data
@@ -80,11 +81,21 @@ class FrameSender:
         self._bus, self._keys = bus, keys
         self._windows: dict[str, _Window] = {}
 
+    @property
+    def ahead(self) -> float:
+        """How far the agent's clock is ahead of the one that frames are timed by, seconds.
+
+        Where all ends are in one process, frames keep the time that they have.
+        """
+        if self._bus.local:
+            return 0.0
+        return asyncio.get_running_loop().time() - time.monotonic()
+
     def send(self, program: str, call: int, data: Data) -> None:
         """Send a frame's bytes as the answer to a call: what there is room for now."""
         total = len(data)
         if self._bus.local or total <= SMALL:
-            self._put(program, Part(call, 0, total), data)
+            self._put(program, FramePart(call, 0, total), data)
             return
         window = self._windows.setdefault(program, _Window())
         now = asyncio.get_running_loop().time()
@@ -126,8 +137,8 @@ class FrameSender:
                 if len(part) > room:
                     return
                 room -= len(part)
-                self._put(program, Part(one.call, one.sent, len(one.data)), part)
+                self._put(program, FramePart(one.call, one.sent, len(one.data)), part)
                 one.sent += len(part)
 
-    def _put(self, program: str, part: Part, data: Data) -> None:
+    def _put(self, program: str, part: FramePart, data: Data) -> None:
         self._bus.put_part(self._keys.frames(program), encode_part(part), data)

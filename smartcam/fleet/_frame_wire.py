@@ -160,7 +160,7 @@ _PART = struct.Struct("<4sQQQ")
 _IS_PART = b"scf1"
 
 
-class Part(NamedTuple):
+class FramePart(NamedTuple):
     """Which part of which frame.
 
     Attributes:
@@ -174,12 +174,12 @@ class Part(NamedTuple):
     total: int
 
 
-def encode_part(part: Part) -> bytes:
+def encode_part(part: FramePart) -> bytes:
     """Return it as bytes."""
     return _PART.pack(_IS_PART, *part)
 
 
-def decode_part(head: bytes) -> Part:
+def decode_part(head: bytes) -> FramePart:
     """Return which part this is.
 
     Raises:
@@ -191,4 +191,4 @@ def decode_part(head: bytes) -> Part:
         raise RemoteProtocolError(f"a part of a frame is broken: {exc}") from exc
     if magic != _IS_PART or total > MOST_FRAME:
         raise RemoteProtocolError(f"a part of a frame of {total} bytes begins with {magic!r}")
-    return Part(call, offset, total)
+    return FramePart(call, offset, total)

@@ -65,7 +65,7 @@ class FramesOf(NamedTuple):
 NO_FRAMES = FramesOf(None, None)
 
 
-class Asked(NamedTuple):
+class FrameOrder(NamedTuple):
     """Who wants a frame, and how.
 
     Attributes:
@@ -206,51 +206,51 @@ class SharedFrames:
         }
 
     async def one(
-        self, asked: Asked, *, max_age: float | None, after: float | None, fresh: bool
+        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> dict[str, Any]:
         """Send one frame, as :meth:`get` has it."""
         came = asyncio.get_running_loop().time()
-        frame, took = await self.get(asked, max_age=max_age, after=after, fresh=fresh)
-        return {"came": came, "frame": self._send(frame, asked, took)}
+        frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
+        return {"came": came, "frame": self._send(frame, order, took)}
 
     async def get(
-        self, asked: Asked, *, max_age: float | None, after: float | None, fresh: bool
+        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> tuple[Frame, float]:
         """Return one frame, and the seconds that it took to encode it.
 
         Args:
-            asked: by whom, and how.
+            order: by whom, and how.
             max_age: seconds since it was captured at most; None: any.
             after: it was exposed after this time of the agent's clock.
             fresh: it was exposed after this request came.
         """
-        now = asyncio.get_running_loop().time()
-        with self._counted(asked), self._within(asked.timeout, "a frame"):
-            async with asyncio.timeout(asked.timeout):
+        now = time.monotonic() + self.sender.ahead
+        with self._counted(order), self._within(order.timeout, "a frame"):
+            async with asyncio.timeout(order.timeout):
                 source = await self.source()
                 if fresh or after is not None:
-                    moment = now if after is None else max(now, after) if fresh else after
-                    frame = await source.after(moment - _ahead(), timeout=None)
+                    moment = now if after is None else after
+                    frame = await source.after(moment - self.sender.ahead, timeout=None)
                 else:
                     age = math.inf if max_age is None else max_age
                     frame = await source.newest(max_age=age, timeout=None)
-                return await self._encode(frame, asked.encoding)
+                return await self._encode(frame, order.encoding)
 
-    async def next(self, asked: Asked, stream: int) -> dict[str, Any]:
+    async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
         """Send the newest frame that a stream has not had; say that there is none after a while."""
         came = asyncio.get_running_loop().time()
-        key = asked.program, stream
-        with self._counted(asked):
+        key = order.program, stream
+        with self._counted(order):
             viewer = self._viewers.get(key)
             if viewer is None:
-                viewer = await self._view(key, asked.timeout)
+                viewer = await self._view(key, order.timeout)
             if viewer.busy:
                 raise LocalProtocolError(f"{self.name}: two requests for the frames of one stream")
             viewer.wake()
             try:
-                async with asyncio.timeout(min(asked.timeout, HOLD)):
+                async with asyncio.timeout(min(order.timeout, HOLD)):
                     frame = await anext(viewer.reader)
-                sent, took = await self._encode(frame, asked.encoding)
+                sent, took = await self._encode(frame, order.encoding)
             except FrameTimeoutError:
                 raise
             except TimeoutError:
@@ -271,7 +271,7 @@ class SharedFrames:
             "skipped": account.skipped,
             "lost": account.lost,
         }
-        return {"came": came, "frame": self._send(sent, asked, took), **counts}
+        return {"came": came, "frame": self._send(sent, order, took), **counts}
 
     async def _view(self, key: tuple[str, int], timeout: float) -> _Viewer:
         """Begin a stream."""
@@ -305,10 +305,10 @@ class SharedFrames:
 
     # ------------------------------------------------------------------ a frame
 
-    def _send(self, frame: Frame, asked: Asked, took: float) -> dict[str, Any]:
+    def _send(self, frame: Frame, order: FrameOrder, took: float) -> dict[str, Any]:
         """Send a frame's bytes, and return what there is to say of it."""
-        self.sender.send(asked.program, asked.call, frame.data)
-        return to_fields(frame, _ahead(), took, self._lens_number(frame.camera_info))
+        self.sender.send(order.program, order.call, frame.data)
+        return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
 
     async def _encode(self, frame: Frame, encoding: Encoding) -> tuple[Frame, float]:
         """Return a frame encoded, once for all who want the same, and how long that took."""
@@ -351,22 +351,22 @@ class SharedFrames:
         return number
 
     @contextlib.contextmanager
-    def _counted(self, asked: Asked) -> Iterator[None]:
+    def _counted(self, order: FrameOrder) -> Iterator[None]:
         """Count the calls of a program that are under way."""
-        under_way = self._asking.get(asked.program, 0)
+        under_way = self._asking.get(order.program, 0)
         if under_way >= MOST_ASKED:
             raise LocalProtocolError(
                 f"{self.name}: {under_way} calls of this program for frames are under way"
             )
-        self._asking[asked.program] = under_way + 1
+        self._asking[order.program] = under_way + 1
         try:
             yield
         finally:
-            left = self._asking[asked.program] - 1
+            left = self._asking[order.program] - 1
             if left:
-                self._asking[asked.program] = left
+                self._asking[order.program] = left
             else:
-                del self._asking[asked.program]
+                del self._asking[order.program]
 
     @contextlib.contextmanager
     def _within(self, seconds: float, what: str) -> Iterator[None]:
@@ -379,8 +379,3 @@ class SharedFrames:
             raise FrameTimeoutError(
                 f"{self.name}: waited {seconds:.3g} s for {what}, in vain", source=self.name
             ) from None
-
-
-def _ahead() -> float:
-    """Return how far this loop's clock, which is the agent's, is ahead of the frames' clock."""
-    return asyncio.get_running_loop().time() - time.monotonic()

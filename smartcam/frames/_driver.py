@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 if TYPE_CHECKING:
     from smartcam.exceptions import FrameSourceError
@@ -80,7 +80,13 @@ class FrameDriver(ABC):
     Args:
         address: what the URL says. A wrong parameter is a
             :exc:`~smartcam.ConfigurationError` that names the known ones.
+
+    Attributes:
+        times_frames: ``captured`` of its frames is their time on our clock, also where they have a
+            ``device_time``; else the source finds it out.
     """
+
+    times_frames: ClassVar[bool] = False
 
     def __init__(self, address: FrameAddress) -> None:
         self.address = address

@@ -436,7 +436,7 @@ class FrameSource(FrameSink):
     def _timed(self, frame: Frame, now: float) -> Frame:
         """Return a frame with its time on our clock, not later than now."""
         captured = frame.captured
-        if frame.device_time is not None:
+        if frame.device_time is not None and not self._driver.times_frames:
             if self._clock is None:
                 self._clock = DeviceClock()
             jumps = self._clock.statistics().jumps
