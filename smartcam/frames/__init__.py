@@ -18,8 +18,10 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
+    from smartcam.frames._codecs import Codecs
     from smartcam.frames._driver import FoundSource, FrameDriver, FrameSink, StreamFormat
     from smartcam.frames._frame import Frame, Moment
+    from smartcam.frames._h264 import H264Decoder, H264Encoder
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
     from smartcam.frames._source import (
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "Codecs",
     "FoundSource",
     "Frame",
     "FrameAddress",
@@ -37,6 +40,8 @@ __all__ = [
     "FrameReader",
     "FrameSink",
     "FrameSource",
+    "H264Decoder",
+    "H264Encoder",
     "Moment",
     "PixelFormat",
     "ReaderStatistics",
@@ -52,8 +57,10 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_address": "FrameAddress",
+            "_codecs": "Codecs",
             "_driver": "FoundSource FrameDriver FrameSink StreamFormat",
             "_frame": "Frame Moment",
+            "_h264": "H264Decoder H264Encoder",
             "_opening": "discover open",
             "_pixels": "PixelFormat find_format",
             "_source": "FrameReader FrameSource ReaderStatistics SourceStatistics",
