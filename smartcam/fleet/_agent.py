@@ -22,6 +22,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._calls import ACTIONS, PASSES_GATE, ProgramCall, now
 from smartcam.fleet._errors import late, to_fields
+from smartcam.fleet._frame_encoding import FrameEncoder
 from smartcam.fleet._frame_sender import FrameSender
 from smartcam.fleet._frames import NO_FRAMES, SharedFrames
 from smartcam.fleet._host import Host
@@ -125,7 +126,8 @@ class Agent:
         frames: Mapping[str, FramesOf] | None = None,
     ) -> None:
         self.name = name
-        self._frames, self._sender = dict(frames or {}), FrameSender(bus, keys)
+        self._frames = dict(frames or {})
+        self._sender, self._encoder = FrameSender(bus, keys), FrameEncoder()
         self.epoch: int = time.time_ns()
         self._keys, self._bus = keys, bus
         self._cameras, self._history, self._on_event = cameras, history, on_event
@@ -181,6 +183,7 @@ class Agent:
             await asyncio.gather(*self._tasks, return_exceptions=True)
             closing = (host.close() for host in self.hosts.values())
             await asyncio.gather(*closing, return_exceptions=True)
+            await self._encoder.close()
         finally:
             self._sender.close()
             await self._bus.close()
@@ -193,7 +196,7 @@ class Agent:
         """
         bus, keys, topics = self._bus, self._keys, self._plain.topics
         found = self._frames.get(name, NO_FRAMES)
-        frames = SharedFrames(name, found.make, self._sender, found.url)
+        frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
         events = self._on_event
         host = Host(name, settings, bus, keys, self.epoch, self._history, events, topics, frames)
         host.numbers = self._numbers_at.pop(name, host.numbers)

@@ -18,6 +18,7 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
+from smartcam.fleet._frame_encoding import FORMATS
 from smartcam.fleet._frame_wire import Encoding, from_fields
 from smartcam.fleet._frames import HOLD
 from smartcam.frames import FrameDriver, StreamFormat, find_format
@@ -72,8 +73,8 @@ class FrameCaller:
         self.name, self._caller = name, caller
         self._lenses: dict[tuple[int, int], CameraModel | None] = {}
 
-    async def about(self) -> StreamFormat:
-        """Return what the frames are, as the device says; it is opened for that.
+    async def about(self, encoding: Encoding) -> StreamFormat:
+        """Return what frames come, as the device says; it is opened for that.
 
         Raises:
             SmartCamError: as the agent says.
@@ -84,7 +85,8 @@ class FrameCaller:
         try:
             rates = tuple(float(rate) for rate in said["rates"])
             size = int(said["width"]), int(said["height"])
-            return StreamFormat(find_format(str(said["format"])), *size, rates)
+            pixels = FORMATS.get(encoding.name, str(said["format"]))
+            return StreamFormat(find_format(pixels), *size, rates)
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"{self.name}: what the agent says of it: {exc!r}") from exc
 
@@ -237,7 +239,7 @@ class SharedFrameDriver(FrameDriver):
             UnsupportedError: the camera has no frames.
         """
         try:
-            return await self._frames.about()
+            return await self._frames.about(self._encoding)
         except (FrameSourceError, UnsupportedError, ConfigurationError):
             raise
         except SmartCamError as exc:

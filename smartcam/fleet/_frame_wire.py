@@ -31,7 +31,7 @@ class Encoding(NamedTuple):
 
     Attributes:
         name: one of :data:`ENCODINGS`.
-        quality: of JPEG and JPEG XL, 1 to 100; None: the codec's own.
+        quality: of JPEG, 1 to 100; None: the codec's own.
     """
 
     name: str = "raw"
@@ -50,7 +50,7 @@ class Encoding(NamedTuple):
             )
         if quality is None:
             return cls(str(name))
-        if name not in {"jpeg", "jpegxl"}:
+        if name != "jpeg":
             raise ConfigurationError(f"{who}: quality: {name} has none, got {quality!r:.40}")
         if isinstance(quality, bool) or not isinstance(quality, int) or not 1 <= quality <= 100:
             raise ConfigurationError(f"{who}: quality: expected 1 to 100, got {quality!r:.40}")

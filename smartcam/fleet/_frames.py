@@ -17,13 +17,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from smartcam.exceptions import FrameTimeoutError, LocalProtocolError, UnsupportedError
-from smartcam.fleet._frame_encoding import encoded
 from smartcam.fleet._frame_wire import Encoding, to_fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
 
     from smartcam.calibration._lens.model import CameraModel
+    from smartcam.fleet._frame_encoding import FrameEncoder
     from smartcam.fleet._frame_sender import FrameSender
     from smartcam.frames import Frame, FrameReader, FrameSource
 
@@ -122,12 +122,14 @@ class SharedFrames:
         name: of the camera.
         make: returns its source; None: it has none.
         sender: sends their bytes.
+        encoder: makes them small before.
         url: where they come from, without a password; for people.
     """
 
     name: str
     make: Callable[[], FrameSource] | None
     sender: FrameSender
+    encoder: FrameEncoder
     url: str | None = None
     _source: FrameSource | None = None
     _opening: asyncio.Task[FrameSource] | None = None
@@ -316,7 +318,9 @@ class SharedFrames:
             return frame, 0.0
         last = self._encoded.pop(encoding, None)
         if last is None or last.frame is not frame:
-            last = _Encoded(frame, self._begin(encoded(frame, encoding), encoding.name))
+            last = _Encoded(
+                frame, self._begin(self.encoder.encoded(frame, encoding), encoding.name)
+            )
         self._encoded[encoding] = last
         if len(self._encoded) > MOST_ENCODINGS:
             del self._encoded[next(iter(self._encoded))]
