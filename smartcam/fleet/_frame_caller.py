@@ -35,7 +35,10 @@ ANSWER = 4.0
 encode it, and for the way."""
 
 MOST_SILENT = 3
-"""Requests in a row whose answer, or frame, did not come, after which a stream has ended."""
+"""Requests in a row without an answer after which a stream has ended."""
+
+MOST_TORN = 10
+"""Frames in a row that did not come whole after which it has ended, too."""
 
 OPEN_TIMEOUT = 15.0
 """Seconds for an agent to open its device."""
@@ -276,7 +279,7 @@ class SharedFrameDriver(FrameDriver):
         """Take frames until there will be none, and return why."""
         loop = asyncio.get_running_loop()
         arguments = {**self._encoding.fields(), "stream": stream}
-        counts, silent = _StreamCounts(), 0
+        counts, silent, torn = _StreamCounts(), 0, 0
         while True:
             try:
                 deadline = loop.time() + HOLD + ANSWER
@@ -290,22 +293,21 @@ class SharedFrameDriver(FrameDriver):
                 continue
             except SmartCamError as exc:
                 return as_source_error(self.name, exc)
+            silent = 0
             if frame is not None:
-                silent = 0
+                torn = 0
                 if answer["skipped"]:
                     sink.skipped(answer["skipped"])
                 sink.frame(frame)
             elif answer.get("ended"):
                 return None
             elif "frame" in answer:
-                silent += 1
-                if silent >= MOST_SILENT:
+                torn += 1
+                if torn >= MOST_TORN:
                     return FrameSourceError(
-                        f"{self.name}: {silent} frames in a row did not come here whole",
+                        f"{self.name}: {torn} frames in a row did not come here whole",
                         source=self.name,
                     )
-            else:
-                silent = 0  # it has none: whether that is wrong, the agent knows
 
 
 def as_source_error(name: str, error: SmartCamError) -> FrameSourceError:

@@ -31,7 +31,8 @@ SMALL = 1 << 16
 """Bytes of a frame that is one packet, and not counted: nobody says that it has come."""
 
 MOST_WAITING = 1 << 26
-"""Bytes of frames that one program may have begun and not taken; the oldest are given up."""
+"""Bytes of frames that may wait for one program; the oldest of which nothing is under way are given
+up."""
 
 STALE = 10.0
 """Seconds after which a frame of which nothing came there is given up."""
@@ -100,7 +101,9 @@ class FrameSender:
         window = self._windows.setdefault(program, _Window())
         now = asyncio.get_running_loop().time()
         for one in [*window.transfers.values()]:
-            if now - one.moved_at > STALE or window.waiting + total > MOST_WAITING:
+            # what is under way stays so, unless it is long ago
+            full = window.waiting + total > MOST_WAITING and not one.under_way
+            if full or now - one.moved_at > STALE:
                 del window.transfers[one.call]
         window.transfers[call] = _Transfer(call, memoryview(data), now)
         self._push(program, window)
