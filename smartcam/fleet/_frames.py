@@ -326,7 +326,7 @@ class SharedFrames:
             del self._encoded[next(iter(self._encoded))]
         began = time.perf_counter()
         made = await asyncio.shield(last.task)
-        return made, time.perf_counter() - began
+        return made, 0.0 if made is frame else time.perf_counter() - began
 
     def _begin(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
         """Have something done for whoever waits for it; it ends with the agent."""
