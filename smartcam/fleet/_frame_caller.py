@@ -147,6 +147,7 @@ class FrameCaller:
             counts: of the stream.
         """
         caller = self._caller
+        caller.require()
         number = caller.program.next_call()
         incoming = caller.program.frames.expect(caller, number)
         said_at = asyncio.get_running_loop().time()

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from smartcam.frames import Codecs
-
 if TYPE_CHECKING:
     from smartcam.fleet._frame_wire import Encoding
-    from smartcam.frames import Frame
+    from smartcam.frames import Codecs, Frame
 
 FORMATS = {"jpeg": "MJPEG", "png": "PNG", "jpegxl": "JPEGXL"}
 """Pixel formats of what is encoded."""
@@ -30,6 +28,8 @@ class FrameEncoder:
         if frame.format.name == FORMATS[encoding.name] and encoding.quality is None:
             return frame
         if self._codecs is None:
+            from smartcam.frames import Codecs  # with numpy, which not every agent needs
+
             self._codecs = Codecs()
             await self._codecs.__aenter__()
         codecs = self._codecs

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, RemoteProtocolError
-from smartcam.frames import Frame, Moment, find_format
+from smartcam.frames import Frame, Moment
 
 if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
@@ -126,6 +126,8 @@ def from_fields(
         RemoteProtocolError: it is no frame.
         FrameFormatError: pixels that this version does not know.
     """
+    from smartcam.frames import find_format  # with numpy, which not everybody needs
+
     try:
         width, height, stride = int(said["width"]), int(said["height"]), int(said["stride"])
         duration, device = float(said["duration"]), said["device_time"]

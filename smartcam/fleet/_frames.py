@@ -16,8 +16,13 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from smartcam.exceptions import FrameTimeoutError, LocalProtocolError, UnsupportedError
-from smartcam.fleet._frame_wire import Encoding, to_fields
+from smartcam.exceptions import (
+    FrameFormatError,
+    FrameTimeoutError,
+    LocalProtocolError,
+    UnsupportedError,
+)
+from smartcam.fleet._frame_wire import MOST_FRAME, Encoding, to_fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
@@ -252,7 +257,8 @@ class SharedFrames:
             try:
                 async with asyncio.timeout(min(order.timeout, HOLD)):
                     frame = await anext(viewer.reader)
-                sent, took = await self._encode(frame, order.encoding)
+                async with asyncio.timeout(order.timeout):
+                    sent, took = await self._encode(frame, order.encoding)
             except FrameTimeoutError:
                 raise
             except TimeoutError:
@@ -299,6 +305,8 @@ class SharedFrames:
         if self._viewers.get(key) is viewer:
             del self._viewers[key]
         viewer.close()
+        if not self._viewers:
+            self._encoded.clear()
 
     def lens(self, number: int) -> dict[str, Any]:
         """Return a lens that frames have named by its number, and where they name another."""
@@ -308,7 +316,16 @@ class SharedFrames:
     # ------------------------------------------------------------------ a frame
 
     def _send(self, frame: Frame, order: FrameOrder, took: float) -> dict[str, Any]:
-        """Send a frame's bytes, and return what there is to say of it."""
+        """Send a frame's bytes, and return what there is to say of it.
+
+        Raises:
+            FrameFormatError: there are more of them than a frame may have.
+        """
+        if len(frame.data) > MOST_FRAME:
+            raise FrameFormatError(
+                f"{self.name}: a frame of {len(frame.data)} bytes, expected {MOST_FRAME} at most",
+                source=self.name,
+            )
         self.sender.send(order.program, order.call, frame.data)
         return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
 
