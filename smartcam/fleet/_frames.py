@@ -286,6 +286,8 @@ class SharedFrames:
         with self._within(timeout, "the device"):
             async with asyncio.timeout(timeout):
                 source = await self.source()
+        if key in self._viewers:
+            return self._viewers[key]
         theirs = sum(program == key[0] for program, _ in self._viewers)
         if len(self._viewers) >= MOST_VIEWERS or theirs >= MOST_OF_PROGRAM:
             raise LocalProtocolError(

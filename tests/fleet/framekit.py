@@ -60,7 +60,12 @@ class FramePlant(Plant):
 
     async def waits(self) -> None:
         """Wait until a program waits for the next frame."""
-        await until(lambda: any(one.busy for one in self.shared._viewers.values()))
+        await until(
+            lambda: (
+                self.driver.sink is not None
+                and any(one.busy for one in self.shared._viewers.values())
+            )
+        )
 
 
 @contextlib.asynccontextmanager

@@ -77,8 +77,9 @@ async def test_no_more_is_under_way_than_the_window() -> None:
 async def test_program_that_takes_nothing_holds_up_no_other() -> None:
     wire = Wire()
     sender = FrameSender(wire, Keys(FLEET))
+    data = bytes(2 * WINDOW)
     for call in range(200):
-        sender.send("dead", call, bytes(2 * WINDOW))
+        sender.send("dead", call, data)
     assert wire.bytes_of("dead") <= WINDOW
     assert sender._windows["dead"].waiting <= MOST_WAITING + 2 * WINDOW
     sender.send("other", 1, bytes(WINDOW))
@@ -262,20 +263,19 @@ async def test_way_that_loses_all_parts_ends_with_an_error() -> None:
             assert "did not come here whole" in str(await gone(anext(frames)))
 
 
+SIZES = [0, 1, SMALL, SMALL + 1, PART, WINDOW, WINDOW + 1, 5_000_000]
+
+
 @pytest.mark.real_time
-@pytest.mark.parametrize("size", [0, 1, SMALL, SMALL + 1, PART, WINDOW, WINDOW + 1, 5_000_000])
-async def test_frames_of_any_size_arrive(size: int) -> None:
-    data = noise(size, size)
-    async with looking(source={"linger": 60.0}) as (plant, camera):
-        about = {"width": 1, "height": 1, "stride": 1, "data": data}
-        async with camera.frames(timeout=PATIENCE) as frames:
-            for number in range(1, 4):
-                await plant.waits()
-                plant.driver.give(frame(number, **about))
-                got = await anext(frames)
-                assert bytes(got.data) == data
-                again = await camera.newest_frame(max_age=3600.0, timeout=PATIENCE)
-                assert (bytes(again.data), again.sequence) == (data, number)
+async def test_frames_of_any_size_arrive() -> None:
+    async with looking() as (plant, camera), camera.frames(timeout=PATIENCE) as frames:
+        for number, size in enumerate([*SIZES, *reversed(SIZES)]):
+            data = noise(size, size)
+            await plant.waits()
+            plant.driver.give(frame(number, width=1, height=1, stride=1, data=data))
+            assert bytes((await anext(frames)).data) == data
+            again = await camera.newest_frame(max_age=3600.0, timeout=PATIENCE)
+            assert (bytes(again.data), again.sequence) == (data, number)
 
 
 @pytest.mark.real_time

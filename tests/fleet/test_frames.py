@@ -18,11 +18,13 @@ from smartcam import (
     FrameFormatError,
     FrameSourceError,
     FrameTimeoutError,
+    RemoteProtocolError,
     UnsupportedError,
 )
 from smartcam.calibration import CameraModel
 from smartcam.fleet import _frame_caller, _frames
-from smartcam.fleet._frame_wire import FleetFrame
+from smartcam.fleet._frame_wire import FleetFrame, to_fields
+from smartcam.fleet._frames import SharedFrames
 from smartcam.frames import Moment
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, PATIENCE, Plant, end_of, until
@@ -365,6 +367,74 @@ async def test_wrong_order_is_refused_before_anything_is_asked() -> None:
 
 def _any(value: Any) -> Any:
     return value
+
+
+# ---------------------------------------------------------------------- an agent that errs
+
+
+@pytest.mark.parametrize(
+    ("wrong", "kind"),
+    [
+        ({"width": 0}, RemoteProtocolError),
+        ({"height": "x"}, RemoteProtocolError),
+        ({"duration": -1.0}, RemoteProtocolError),
+        ({"moment": "SOME"}, RemoteProtocolError),
+        ({"captured": None}, RemoteProtocolError),
+        ({"size": 7}, FrameTimeoutError),
+        ({"lens": 99}, None),  # one that it has forgotten
+        ({"format": "Mono9"}, FrameFormatError),
+    ],
+)
+async def test_frame_that_is_none_is_told(
+    monkeypatch: pytest.MonkeyPatch, wrong: dict[str, Any], kind: type[Exception] | None
+) -> None:
+    said = to_fields
+    monkeypatch.setattr(_frames, "to_fields", lambda *args: said(*args) | wrong)
+    async with looking() as (plant, camera), plant.streaming(every=0.5):
+        if kind is None:
+            assert (await camera.newest_frame()).camera_info is None
+            return
+        assert isinstance(await gone(camera.newest_frame(timeout=2.0)), kind)
+        async with camera.frames(timeout=PATIENCE) as frames:
+            error = await gone(anext(frames))
+            assert isinstance(error, FrameSourceError)
+            assert isinstance(error.__cause__, kind) or kind in {type(error), FrameTimeoutError}
+
+
+async def test_device_that_is_none_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def about(*_: object) -> dict[str, Any]:
+        return {"format": "Mono8"}
+
+    monkeypatch.setattr(SharedFrames, "about", about)
+    async with looking() as (_, camera):
+        error = await gone(camera.frames().__aenter__())
+        assert isinstance(error, FrameSourceError)
+        assert isinstance(error.__cause__, RemoteProtocolError)
+
+
+async def test_what_fails_in_a_stream_ends_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with looking() as (plant, camera), plant.streaming():
+        async with camera.frames() as frames:
+            await anext(frames)
+            monkeypatch.setattr(_frame_caller, "from_fields", lambda *_, **__: 1 // 0)
+            with pytest.raises(FrameSourceError, match="ZeroDivisionError"):
+                async for _ in frames:
+                    pass
+        assert "its frames end" in caplog.text
+        caplog.clear()
+
+
+async def test_one_stream_asks_once_at_a_time() -> None:
+    async with looking() as (_, camera):
+        ask, loop = camera.frame_caller.ask, asyncio.get_running_loop()
+        arguments = {"stream": 1, "encoding": "raw", "quality": None}
+        counts = _frame_caller._StreamCounts()
+        asked = [ask("next_frame", loop.time() + 1, arguments, counts) for _ in range(2)]
+        first, second = await asyncio.gather(*asked, return_exceptions=True)
+        assert first == ({"came": pytest.approx(loop.time(), abs=2)}, None)
+        assert "two requests" in str(second)
 
 
 # ---------------------------------------------------------------------- cameras without frames
