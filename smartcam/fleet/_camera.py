@@ -49,9 +49,10 @@ if TYPE_CHECKING:
     from smartcam._client.triggering import TriggerRequest
     from smartcam.camera import FrameEncoding
     from smartcam.fleet._frame_caller import FrameCaller
+    from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._program import Program
     from smartcam.fleet._wire import BusMessage
-    from smartcam.frames import Frame, FrameReader
+    from smartcam.frames import FrameReader
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
@@ -708,7 +709,7 @@ class FleetCamera(Camera[ValueT]):
         encoding: FrameEncoding = "raw",
         quality: int | None = None,
         timeout: float = FRAME_TIMEOUT,
-    ) -> Frame:
+    ) -> FleetFrame:
         self._deadline(timeout)
         if not max_age >= 0:
             raise ConfigurationError(f"{self.name}: max_age: expected seconds, got {max_age!r}")
@@ -723,7 +724,7 @@ class FleetCamera(Camera[ValueT]):
         encoding: FrameEncoding = "raw",
         quality: int | None = None,
         timeout: float = FRAME_TIMEOUT,
-    ) -> Frame:
+    ) -> FleetFrame:
         self._deadline(timeout)
         wanted = Encoding.checked(encoding, quality, self.name)
         if moment is None:

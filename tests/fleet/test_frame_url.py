@@ -18,8 +18,7 @@ from smartcam import (
     UnsupportedError,
 )
 from smartcam.camera import FrameEncoding
-from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._frame_wire import FleetFrame
+from smartcam.fleet import FleetFile, FleetFrame, FleetServer
 from smartcam.fleet._zenoh import with_ports
 from smartcam.frames._synthetic import read_stamp
 from tests.client.clientkit import gone

@@ -22,8 +22,8 @@ from smartcam import (
     UnsupportedError,
 )
 from smartcam.calibration import CameraModel
-from smartcam.fleet import _frame_caller, _frames
-from smartcam.fleet._frame_wire import FleetFrame, to_fields
+from smartcam.fleet import FleetFrame, _frame_caller, _frames
+from smartcam.fleet._frame_wire import to_fields
 from smartcam.fleet._frames import SharedFrames
 from smartcam.frames import Moment
 from tests.client.clientkit import gone
