@@ -9,7 +9,6 @@ the device does not stream.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import logging
 import time
@@ -17,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMsgType, web
 
 from smartcam.backoff import Backoff
 from smartcam.exceptions import (
@@ -28,7 +27,6 @@ from smartcam.exceptions import (
     LocalProtocolError,
 )
 from smartcam.web._errors import RefusedError, shown
-from smartcam.web._guard import BEARER
 from smartcam.web._jpeg import encoded, jpeg
 from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._site import API, FAREWELL, Site
@@ -213,14 +211,13 @@ class Viewer:
 
         Cancellation: ends it.
         """
-        await self._socket.prepare(request)
         self._site.viewers.add(self)
         try:
+            await self._socket.prepare(request)
             await self._first(self._listen(), self._show(), self._ending.wait())
-            async with asyncio.timeout(FAREWELL):
-                await self._socket.close(code=1001)
+            await self._close()
         except TimeoutError:
-            _log.info("= %s: a page that shows nothing more was disconnected", request.remote)
+            _log.info("= %s: a page that takes no picture was disconnected", request.remote)
             if request.transport is not None:
                 request.transport.abort()
         except ConnectionError:
@@ -230,6 +227,11 @@ class Viewer:
             if not any(one.place == self.place for one in self._site.viewers):
                 self._site.press(self.place).forget()
         return self._socket
+
+    async def _close(self) -> None:
+        """Say good-bye; TimeoutError: the page does not even read it."""
+        async with asyncio.timeout(2 * FAREWELL):
+            await self._socket.close(code=WSCloseCode.GOING_AWAY)
 
     @staticmethod
     async def _first(*jobs: Coroutine[Any, Any, object]) -> None:
@@ -377,12 +379,11 @@ async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
 )
 async def _pictures(site: FramesSite, call: CallRequest) -> web.StreamResponse:
     place = _place(site, call)
-    if not web.WebSocketResponse().can_prepare(call.request).ok:
-        raise RefusedError(
-            400, "a request without Upgrade", f"a WebSocket of {PROTOCOL}, with {BEARER}TOKEN"
-        )
+    headers = call.request.headers
+    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", PROTOCOL).split(",")]
+    if headers.get("Upgrade", "").lower() != "websocket" or PROTOCOL not in offered:
+        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
     if len(site.viewers) >= MAX_VIEWERS:
         raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
-    with contextlib.suppress(ConnectionResetError):
-        return await Viewer(site, place).serve(call.request)
-    raise RefusedError(400, "a connection that ended", "a WebSocket")
+    return await Viewer(site, place).serve(call.request)
