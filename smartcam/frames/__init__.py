@@ -18,8 +18,10 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
+    from smartcam.frames._clocks import ClockStatistics
     from smartcam.frames._driver import FoundSource, FrameDriver, FrameSink, StreamFormat
     from smartcam.frames._frame import Frame, Moment
+    from smartcam.frames._group import FrameGroup, FrameSet, GroupStatistics
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
     from smartcam.frames._source import (
@@ -28,20 +30,27 @@ if TYPE_CHECKING:
         ReaderStatistics,
         SourceStatistics,
     )
+    from smartcam.frames._stages import Rectifier, Undistorter
 
 __all__ = [
+    "ClockStatistics",
     "FoundSource",
     "Frame",
     "FrameAddress",
     "FrameDriver",
+    "FrameGroup",
     "FrameReader",
+    "FrameSet",
     "FrameSink",
     "FrameSource",
+    "GroupStatistics",
     "Moment",
     "PixelFormat",
     "ReaderStatistics",
+    "Rectifier",
     "SourceStatistics",
     "StreamFormat",
+    "Undistorter",
     "discover",
     "find_format",
     "open",
@@ -52,10 +61,13 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_address": "FrameAddress",
+            "_clocks": "ClockStatistics",
             "_driver": "FoundSource FrameDriver FrameSink StreamFormat",
             "_frame": "Frame Moment",
+            "_group": "FrameGroup FrameSet GroupStatistics",
             "_opening": "discover open",
             "_pixels": "PixelFormat find_format",
             "_source": "FrameReader FrameSource ReaderStatistics SourceStatistics",
+            "_stages": "Rectifier Undistorter",
         },
     )

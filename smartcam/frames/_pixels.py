@@ -13,8 +13,6 @@ from smartcam.exceptions import FrameFormatError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["PIXEL_FORMATS", "PixelFormat", "find_format"]
-
 
 @dataclass(frozen=True, slots=True)
 class PixelFormat:
