@@ -60,13 +60,18 @@ def frames() -> None:
     """Have the commands of frames."""
 
 
-def opened(url: str, options: Options) -> FrameSource:
+def is_source(text: str) -> bool:
+    """Tell whether a text is the URL of a source, and no file or folder."""
+    return "://" in text
+
+
+def opened(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
     """Return an unopened source; one without a frame for ``--timeout`` counts as stuck.
 
     Raises ConfigurationError: the URL is wrong.
     """
     seconds = options.step(FRAME_TIMEOUT)
-    return open_frames(url, timeout=seconds, stall=seconds)
+    return open_frames(url, timeout=seconds, stall=seconds, linger=linger)
 
 
 # ---------------------------------------------------------------------- list
