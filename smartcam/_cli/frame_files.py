@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.web._jpeg import encoded, is_whole_jpeg, picture, significant_bits
+from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -62,7 +62,7 @@ def numbered(file: str, count: int) -> list[str]:
 def _levels(frame: Frame, how: Encoding) -> NDArray[Any]:
     seen = picture(frame, grey=how.grey)
     if how.eight and seen.dtype != np.uint8:
-        seen = (seen >> (significant_bits(frame.format) - 8)).astype(np.uint8)
+        seen = (seen >> (frame.format.depth - 8)).astype(np.uint8)
     return seen
 
 

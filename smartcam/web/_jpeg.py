@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import re
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -13,7 +12,7 @@ from smartcam.exceptions import FrameFormatError, MissingExtraError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.frames import Frame, PixelFormat
+    from smartcam.frames import Frame
 
 START: Final = b"\xff\xd8"
 TABLES: Final = b"\xff\xc4"
@@ -21,9 +20,6 @@ TABLES: Final = b"\xff\xc4"
 
 HEAD: Final = 4096
 """Bytes in which the tables are looked for: they stand in front of the picture."""
-
-COLOURLESS: Final = ("Mono", "Coord3D", "Confidence", "Z16", "Y16", "R8", "R10", "R12", "R16")
-"""How the names of formats begin that have one value for a pixel, and no colour."""
 
 
 def jpeg(frame: Frame, quality: int, *, grey: bool = False) -> bytes:
@@ -48,24 +44,19 @@ def jpeg(frame: Frame, quality: int, *, grey: bool = False) -> bytes:
 def is_whole_jpeg(frame: Frame) -> bool:
     """Tell whether a frame came as a JPEG that any program can read."""
     head = bytes(frame.data[:HEAD])
-    return frame.format.bits == 0 and head.startswith(START) and TABLES in head
+    return frame.format.compressed and head.startswith(START) and TABLES in head
 
 
 def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
     """Return what is to be seen: (H, W, 3), red first; (H, W) where there is no colour.
 
     Raises:
-        FrameFormatError: its bytes are wrong.
-        MissingExtraError: a compressed format, and its codec is not installed.
+        FrameFormatError: its bytes are wrong, or it has no brightness, which ``grey`` asks for.
+        MissingExtraError: a compressed format or a Bayer pattern, and its codec is not installed.
     """
-    return frame.grey() if grey or frame.format.name.startswith(COLOURLESS) else frame.rgb()
-
-
-def significant_bits(format: PixelFormat) -> int:
-    """Return how many bits of a uint16 a format uses, by its name: 12 of ``Mono12p``."""
-    found = re.search(r"\d+", format.name)
-    bits = int(found[0]) if found is not None else 16
-    return bits if 8 < bits <= 16 else 16
+    if frame.format.name.startswith("Coord3D") and not grey:
+        return frame.array()
+    return frame.grey() if grey or frame.format.name.startswith("Mono") else frame.rgb()
 
 
 def stretched(levels: NDArray[Any]) -> NDArray[np.uint8]:
