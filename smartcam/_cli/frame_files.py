@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.exceptions import ConfigurationError
+from smartcam.frames._optional_imports import load
 from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
 
 if TYPE_CHECKING:
@@ -87,25 +87,22 @@ def _jpeg(frame: Frame, how: Encoding) -> bytes:
             "that ends with .png, .jxl, .npy or .raw, which keep all bits, or --8-bit, which keeps "
             "the upper 8"
         )
-    return encoded(levels, how.quality)
+    return encoded(frame, levels, how.quality)
 
 
 def _png(frame: Frame, how: Encoding) -> bytes:
-    return _codec("png_encode", _levels(frame, how))
+    return _lossless(frame, how, "PNG", "png_encode")
 
 
 def _jxl(frame: Frame, how: Encoding) -> bytes:
-    return _codec("jpegxl_encode", _levels(frame, how), lossless=True)
+    return _lossless(frame, how, "JPEGXL", "jpegxl_encode", lossless=True)
 
 
-def _codec(name: str, levels: NDArray[Any], **options: Any) -> bytes:
-    try:
-        codecs = importlib.import_module("imagecodecs")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'PNG and JPEG XL need imagecodecs: pip install "smartcam[frames]"', extra="frames"
-        ) from exc
-    made: bytes = getattr(codecs, name)(np.ascontiguousarray(levels), **options)
+def _lossless(frame: Frame, how: Encoding, format: str, encode: str, **options: Any) -> bytes:
+    if frame.format.name == format and not (how.grey or how.eight):
+        return bytes(frame.data)
+    levels = np.ascontiguousarray(_levels(frame, how))
+    made: bytes = getattr(load("imagecodecs"), encode)(levels, **options)
     return made
 
 

@@ -15,7 +15,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from smartcam.backoff import Backoff
@@ -27,7 +26,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
 )
 from smartcam.web._errors import RefusedError, shown
-from smartcam.web._jpeg import encoded, jpeg
+from smartcam.web._jpeg import jpeg, require_encoder
 from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._site import API, FAREWELL, Site
 from smartcam.web._streams import SLOW
@@ -100,7 +99,7 @@ class FramesSite(Site):
         super().__init__(CALLS, "frames", host=host, port=port, token=token)
         if not 1 <= quality <= 100:
             raise ConfigurationError(f"quality: expected 1 to 100, got {quality!r}")
-        encoded(np.zeros((8, 8), np.uint8), quality)  # whether there is what makes JPEGs
+        require_encoder()
         self.sources: tuple[FrameSource, ...] = tuple(sources)
         self.failures: dict[int, str] = {}
         self.viewers: set[Viewer] = set()

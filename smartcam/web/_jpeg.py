@@ -1,13 +1,15 @@
-"""A frame as a JPEG, for pages and files; the one place here that knows how one is made."""
+"""A frame as people look at it: its colours, at 8 bits, as a JPEG."""
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.exceptions import FrameFormatError, MissingExtraError
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames._layouts import Planes, YuvPairs
+from smartcam.frames._optional_imports import load
+from smartcam.frames._pictures import decoded, to_jpeg, with_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,8 +23,11 @@ TABLES: Final = b"\xff\xc4"
 HEAD: Final = 4096
 """Bytes in which the tables are looked for: they stand in front of the picture."""
 
+READY: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
+"""Formats that become a JPEG without being made another one first; those of Y, U and V do, too."""
 
-def jpeg(frame: Frame, quality: int, *, grey: bool = False) -> bytes:
+
+def jpeg(frame: Frame, quality: int) -> bytes:
     """Return a frame as a JPEG; one that is a whole JPEG already as it came, its quality too.
 
     More than 8 bits are scaled, so that the brightest pixel becomes white: to be looked at.
@@ -30,21 +35,41 @@ def jpeg(frame: Frame, quality: int, *, grey: bool = False) -> bytes:
     Args:
         frame: it; it takes milliseconds, and belongs into a thread.
         quality: 1 to 100.
-        grey: the brightness alone.
 
     Raises:
-        FrameFormatError: its bytes are wrong.
+        FrameFormatError: its bytes are wrong, or a JPEG cannot be so large.
+        MissingExtraError: what reads or makes it is not installed.
+    """
+    if is_whole_jpeg(frame):
+        return bytes(frame.data)
+    if not _is_ready(frame):
+        return encoded(frame, stretched(picture(frame)), quality)
+    return _jpeg(frame, quality)
+
+
+def encoded(frame: Frame, pixels: NDArray[np.uint8], quality: int) -> bytes:
+    """Return pixels of a frame, (H, W) or (H, W, 3) with red first, as a JPEG.
+
+    Raises:
+        FrameFormatError: a JPEG cannot be so large.
         MissingExtraError: the extra ``frames`` is not installed.
     """
-    if not grey and is_whole_jpeg(frame):
-        return bytes(frame.data)
-    return encoded(stretched(picture(frame, grey=grey)), quality)
+    return _jpeg(with_pixels(frame, pixels, "Mono8" if pixels.ndim == 2 else "RGB8"), quality)
+
+
+def require_encoder() -> None:
+    """See that JPEGs can be made.
+
+    Raises:
+        MissingExtraError: the extra ``frames`` is not installed.
+    """
+    load("simplejpeg")
 
 
 def is_whole_jpeg(frame: Frame) -> bool:
     """Tell whether a frame came as a JPEG that any program can read."""
     head = bytes(frame.data[:HEAD])
-    return frame.format.compressed and head.startswith(START) and TABLES in head
+    return frame.format.name == "MJPEG" and head.startswith(START) and TABLES in head
 
 
 def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
@@ -54,6 +79,8 @@ def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
         FrameFormatError: its bytes are wrong, or it has no brightness, which ``grey`` asks for.
         MissingExtraError: a compressed format or a Bayer pattern, and its codec is not installed.
     """
+    if frame.format.name in {"PNG", "JPEGXL"}:
+        frame = decoded(frame, "")
     if frame.format.name.startswith("Coord3D") and not grey:
         return frame.array()
     return frame.grey() if grey or frame.format.name.startswith("Mono") else frame.rgb()
@@ -67,29 +94,15 @@ def stretched(levels: NDArray[Any]) -> NDArray[np.uint8]:
     return (levels.astype(np.uint32) * 255 // top).astype(np.uint8)
 
 
-def encoded(levels: NDArray[np.uint8], quality: int) -> bytes:
-    """Return (H, W) or (H, W, 3), red first, as a JPEG.
+def _is_ready(frame: Frame) -> bool:
+    return frame.format.name in READY or isinstance(frame.format.layout, YuvPairs | Planes)
 
-    Raises:
-        FrameFormatError: a JPEG cannot be so large.
-        MissingExtraError: the extra ``frames`` is not installed.
-    """
+
+def _jpeg(frame: Frame, quality: int) -> bytes:
     try:
-        simplejpeg = importlib.import_module("simplejpeg")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'a JPEG needs simplejpeg: pip install "smartcam[frames]"', extra="frames"
-        ) from exc
-    space = "GRAY" if levels.ndim == 2 else "RGB"
-    shaped = np.ascontiguousarray(levels[..., None] if levels.ndim == 2 else levels)
-    try:
-        made: bytes = simplejpeg.encode_jpeg(
-            shaped,
-            quality=quality,
-            colorspace=space,
-            colorsubsampling="Gray" if space == "GRAY" else "420",
-        )
+        return bytes(to_jpeg(frame, quality).data)
     except ValueError as exc:
-        height, width = levels.shape[:2]
-        raise FrameFormatError(f"no JPEG of {width}x{height} pixels: {exc}") from exc
-    return made
+        raise FrameFormatError(
+            f"{frame.source}: no JPEG of {frame.width}x{frame.height} pixels: {exc}",
+            source=frame.source,
+        ) from exc

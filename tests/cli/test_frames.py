@@ -10,7 +10,7 @@ import re
 import signal
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +108,7 @@ Puts = Callable[..., None]
 
 
 @pytest.fixture
-def shelf(monkeypatch: pytest.MonkeyPatch) -> Iterator[Puts]:
+def shelf(monkeypatch: pytest.MonkeyPatch) -> Puts:
     """Have ``shelf://``; gives what puts frames there."""
     monkeypatch.setattr(FRAMES, "_registered", {"shelf": Shelf})
     monkeypatch.setattr(FRAMES, "_loaded", {})

@@ -5,21 +5,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import sys
 import threading
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import aiohttp
 import numpy as np
 import pytest
 
-from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.exceptions import ConfigurationError, FrameFormatError, MissingExtraError
 from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import FramesSite
 from smartcam.web import _frames as frames_module
-from smartcam.web import _jpeg as jpeg_module
 from smartcam.web._frames import CALLS, MAX_VIEWERS, PROTOCOL, Press
-from smartcam.web._jpeg import encoded, jpeg, picture
+from smartcam.web._jpeg import TABLES, is_whole_jpeg, jpeg, picture
 from smartcam.web._streams import SLOW
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.web.sitekit import TOKEN, Caller, Raw, until
@@ -370,7 +371,7 @@ async def test_press_makes_a_frame_once_for_all_and_a_cancelled_one_spoils_nothi
         return b"jpeg"
 
     monkeypatch.setattr(frames_module, "jpeg", slow)
-    with frames_module.ThreadPoolExecutor(1) as threads:
+    with ThreadPoolExecutor(1) as threads:
         press, one = Press(threads, 80), plain(1)
         waiting = [asyncio.create_task(press.jpeg(one)) for _ in range(3)]
         await asyncio.sleep(0)
@@ -382,10 +383,27 @@ async def test_press_makes_a_frame_once_for_all_and_a_cancelled_one_spoils_nothi
 
 
 def test_jpeg_of_a_camera_stays_as_it_came() -> None:
-    data = encoded(np.full((16, 16), 100, np.uint8), 60)
+    data = jpeg(plain(1, 100), 60)
     mjpeg = plain(1, data=data, format=find_format("MJPEG"), stride=0)
     assert jpeg(mjpeg, 90) == data
-    assert jpeg(mjpeg, 90, grey=True) != data
+
+
+def test_jpeg_that_browsers_cannot_read_is_made_anew() -> None:
+    data = jpeg(plain(1, 100), 60)
+    begin = data.index(TABLES)
+    end = data.index(b"\xff\xda")
+    bare = data[:begin] + data[end:]  # as webcams send it
+    mjpeg = plain(1, data=bare, format=find_format("MJPEG"), stride=0)
+    assert not is_whole_jpeg(mjpeg)
+    made = jpeg(mjpeg, 90)
+    assert TABLES in made
+    assert abs(int(simplejpeg.decode_jpeg(made, colorspace="GRAY").mean()) - 100) <= 2
+
+
+def test_jpeg_that_would_be_too_large_is_refused() -> None:
+    wide = plain(1, data=bytes(70_000), width=70_000, height=1, stride=70_000)
+    with pytest.raises(FrameFormatError, match="no JPEG of 70000x1 pixels"):
+        jpeg(wide, 80)
 
 
 def test_more_than_eight_bits_are_stretched_to_be_seen() -> None:
@@ -413,10 +431,7 @@ def test_colours_stay_colours() -> None:
 
 
 def test_site_without_what_makes_jpegs_says_which_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> Any:
-        raise ModuleNotFoundError(name)
-
-    monkeypatch.setattr(jpeg_module.importlib, "import_module", missing)
+    monkeypatch.setitem(sys.modules, "simplejpeg", None)
     with pytest.raises(MissingExtraError, match=r"smartcam\[frames\]"):
         FramesSite([scripted()[1]])
 
