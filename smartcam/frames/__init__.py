@@ -26,12 +26,7 @@ if TYPE_CHECKING:
     from smartcam.frames._h264 import H264Decoder, H264Encoder
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
-    from smartcam.frames._source import (
-        FrameReader,
-        FrameSource,
-        ReaderStatistics,
-        SourceStatistics,
-    )
+    from smartcam.frames._source import FrameReader, FrameSource, ReaderStatistics, SourceStatistics
     from smartcam.frames._stages import Rectifier, Undistorter
 
 __all__ = [

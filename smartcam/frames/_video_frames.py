@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from smartcam.frames._frame import Frame
     from smartcam.frames._pixels import PixelFormat
 
-__all__ = ["Pixels", "colour_properties", "format_of", "from_video", "to_video"]
 
 _SAMPLES: Final = {
     "gray": "Mono8",
