@@ -19,6 +19,7 @@ from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, run
 from smartcam._cli.page import PageOptions, page_options
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import CalibrationError, ConfigurationError, UnsupportedError
+from smartcam.frames import FrameAddress
 from smartcam.models import Localization
 from smartcam.registry import FRAMES, PROTOCOLS
 
@@ -147,9 +148,10 @@ async def wizard_command(
     if wizard is not None and check is not None:
         raise click.UsageError("--check asks for touches of marks: no --wizard beside it")
     if url is not None and _only_frames(url):
+        said = FrameAddress.parse(url).shown
         raise click.UsageError(
-            f"{url} gives frames, no localizations: expected --pictures {url}, with --wizard sheet "
-            "or --wizard hand-eye"
+            f"{said} gives frames, no localizations: expected --pictures {said}, with --wizard "
+            "sheet or --wizard hand-eye"
         )
     if url is None and (pictures is None or wizard in {None, "plane"}):
         raise click.UsageError(
