@@ -232,6 +232,8 @@ class FrameReader:
         if frame is self._next:
             self._next = None
             self._delivered += 1
+            if self._source is not None:
+                self._source._took.set()  # noqa: SLF001 - the two are one
         self._last = frame
         return frame
 
@@ -275,6 +277,8 @@ class FrameSource(FrameSink):
         self._format: StreamFormat | None = None
         self._task: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()  # readers came or went, or the driver ended
+        self._took = asyncio.Event()  # a reader took a frame, or went
+        self._held_up = False  # the driver waits for readers
         self._streaming = False
         self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
         self._frames = self._lost = self._started = 0
@@ -407,12 +411,24 @@ class FrameSource(FrameSink):
         self._over = (error,)
         self._changed.set()
 
+    async def taken(self) -> None:
+        """Wait until every reader has taken the last frame; meanwhile nothing is stuck."""
+        self._held_up = True
+        try:
+            while any(reader._next is not None for reader in self._alive()):  # noqa: SLF001
+                self._took.clear()
+                await self._took.wait()
+        finally:
+            self._held_up = False
+            self._last_came = time.monotonic()
+
     def _alive(self) -> list[FrameReader]:
         return [reader for one in self._readers if (reader := one()) is not None]
 
     def _dropped(self, one: weakref.ref[FrameReader]) -> None:
         self._readers.discard(one)
         self._changed.set()
+        self._took.set()
 
     def _forget(self, reader: FrameReader) -> None:
         self._dropped(weakref.ref(reader))
@@ -458,6 +474,8 @@ class FrameSource(FrameSink):
                 await self._until_changed(lambda: not self._readers)
             else:
                 left = self._last_came + self._stall - time.monotonic()
+                if left <= 0 and self._held_up:
+                    left = self._stall
                 if left <= 0:
                     raise FrameSourceError(
                         f"{self.name}: it streams, but gave no frame for {self._stall:g} s",
