@@ -60,7 +60,7 @@ FOLDER = os.environ.get("SMARTCAM_DATA")
 RUNS = 12
 """Robots of one mix in a round."""
 
-KIND_RUNS = 4
+KIND_RUNS = 2
 """Robots of one kind in a round."""
 
 MOST_BEHIND = 1.03

@@ -14,8 +14,6 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["FrameAddress"]
-
 
 @dataclass(frozen=True, slots=True)
 class FrameAddress:
@@ -88,7 +86,9 @@ class FrameAddress:
             ConfigurationError: it has a name that is not known, or one twice.
         """
         said: dict[str, str] = {}
-        for name, value in parse_qsl(self.query if said_in is None else said_in, keep_blank_values=True):
+        for name, value in parse_qsl(
+            self.query if said_in is None else said_in, keep_blank_values=True
+        ):
             if name not in known:
                 raise ConfigurationError(
                     f"frame source {self.shown!r}: unknown parameter {name!r}; known are "

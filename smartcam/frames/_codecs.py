@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames._frame import Frame
 
-__all__ = ["Codecs"]
 
 T = TypeVar("T")
 

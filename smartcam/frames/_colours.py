@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["COLOURS", "MATRICES", "Colours", "Matrix", "yuv_to_rgb"]
 
 FRACTION: Final = 16
 """Bits behind the point of the sums below."""

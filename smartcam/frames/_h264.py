@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames._frame import Frame
 
-__all__ = ["H264Decoder", "H264Encoder"]
 
 T = TypeVar("T")
 

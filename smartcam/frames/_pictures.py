@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from smartcam.frames._frame import Frame
     from smartcam.frames._pixels import PixelFormat
 
-__all__ = ["converted", "decoded", "to_jpeg", "to_jpegxl", "to_png", "with_pixels"]
-
 
 def with_pixels(frame: Frame, pixels: NDArray[Any], name: str) -> Frame:
     """Return the frame with other pixels; all that is known of it stays."""

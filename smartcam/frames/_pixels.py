@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["PIXEL_FORMATS", "PixelFormat", "find_format"]
-
 
 @dataclass(frozen=True, slots=True)
 class PixelFormat:
