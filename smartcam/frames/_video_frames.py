@@ -51,6 +51,9 @@ _OF_OURS: Final = {
 }
 """What FFmpeg calls ours; the range and the matrix stand beside it there."""
 
+CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
+"""Formats that FFmpeg converts to for who asks, and what it calls them."""
+
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
 BT709, BT601 = 1, 6  # AVCOL_SPC_BT709, AVCOL_SPC_SMPTE170M
 
