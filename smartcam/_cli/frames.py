@@ -22,7 +22,7 @@ from smartcam.exceptions import (
     FrameSourceError,
     SmartCamError,
 )
-from smartcam.frames import discover
+from smartcam.frames import FrameDriver, discover
 from smartcam.frames import open as open_frames
 from smartcam.frames._source import FRAME_TIMEOUT
 from smartcam.models import jsonable
@@ -90,7 +90,10 @@ async def list_(scheme: str | None, options: Options) -> None:
     schemes = known if scheme is None else [scheme]
     looks = await asyncio.gather(*(_look(one, options.step(FRAME_TIMEOUT)) for one in schemes))
     shown: set[str] = set()
+    searched = [name for name, look in zip(schemes, looks, strict=True) if look is not None]
     for name, look in zip(schemes, looks, strict=True):
+        if look is None:
+            continue
         if isinstance(look, Exception):
             if isinstance(look, ConfigurationError) and scheme is not None:
                 raise look
@@ -101,18 +104,31 @@ async def list_(scheme: str | None, options: Options) -> None:
                 shown.add(one.url)
                 options.show(_found(one), _found_text)
     if not shown and not options.as_json:
-        click.echo(f"nothing found; looked for: {', '.join(schemes)}")
+        click.echo(
+            f"nothing found; looked for: {', '.join(searched)}"
+            if searched
+            else f"{scheme}:// is not looked for: its sources are opened by their URLs"
+        )
 
 
-async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception:
-    """Return what is found by a scheme; a broken one costs only its own line."""
+async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
+    """Return what is found by a scheme, None where its driver does not look for anything.
+
+    A broken one costs only its own line.
+    """
     try:
+        if scheme in FRAMES and _usual_discover(FRAMES.load(scheme)):
+            return None
         async with asyncio.timeout(seconds):
             return await discover(scheme)
     except TimeoutError:
         return FrameSourceError(f"the search took longer than {seconds:g} s")
     except Exception as exc:  # noqa: BLE001 - a plug-in's, whatever it is
         return exc
+
+
+def _usual_discover(driver: Any) -> bool:
+    return bool(driver.discover.__func__ is FrameDriver.discover.__func__)
 
 
 def _show_broken(scheme: str, error: Exception, options: Options) -> None:

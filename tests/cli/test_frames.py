@@ -152,6 +152,12 @@ def test_list_of_nothing_says_what_was_looked_for(shelf: Puts) -> None:
     assert run("frames", "list", "--scheme", "shelf", "--json").done().out == ""
 
 
+def test_list_of_what_is_not_looked_for_says_so() -> None:
+    done = run("frames", "list", "--scheme", "synthetic").done()
+    assert done.out == "synthetic:// is not looked for: its sources are opened by their URLs\n"
+    assert "synthetic" not in run("frames", "list").done().out
+
+
 def test_list_goes_on_behind_a_driver_that_fails(shelf: Puts) -> None:
     shelf(fails=RuntimeError("broken"))
     done = run("frames", "list").done()
