@@ -128,7 +128,7 @@ async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | 
 
 
 def _usual_discover(driver: Any) -> bool:
-    return bool(driver.discover.__func__ is FrameDriver.discover.__func__)
+    return next(kind for kind in driver.__mro__ if "discover" in vars(kind)) is FrameDriver
 
 
 def _show_broken(scheme: str, error: Exception, options: Options) -> None:
