@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ import click
 
 from smartcam._cli.calibrate_files import OWN, OwnContext, WithFiles, compare, draw
 from smartcam._cli.calibrate_lens import lens as calibrate_lens
+from smartcam._cli.calibrate_lens import read_target
 from smartcam._cli.calibrate_terminal import drive, listing_text
 from smartcam._cli.frames import is_source, opened
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._files.directory import Folder
     from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration._targets import Target
     from smartcam.calibration.wizards._sequence import Wizard
     from smartcam.calibration.wizards._services import CalibrationService
     from smartcam.frames import FrameSource
@@ -42,10 +41,6 @@ STALE = 7
 LINGER = 30.0
 """Seconds that a source of frames streams on after a picture: the next one needs no new start, and
 finds exposure and white balance as they were."""
-
-MAX_DESCRIPTION = 65_536
-"""Bytes of a target's description."""
-
 
 HELP = "Calibrate a camera against a robot: where its localizations lie in the robot's space. "
 
@@ -149,9 +144,9 @@ async def wizard_command(
         raise click.UsageError("--check asks for touches of marks: no --wizard beside it")
     if url is not None and _only_frames(url):
         said = FrameAddress.parse(url).shown
-        raise click.UsageError(
-            f"{said} gives frames, no localizations: expected --pictures {said}, with --wizard "
-            "sheet or --wizard hand-eye"
+        raise ConfigurationError(
+            f"{said} gives frames, and no localizations: expected the URL of a camera that does, or "
+            f"--pictures {said} with --wizard sheet or --wizard hand-eye"
         )
     if url is None and (pictures is None or wizard in {None, "plane"}):
         raise click.UsageError(
@@ -372,25 +367,6 @@ class _Sources:
                 data = await camera.read_image(timeout=wait)
                 name = camera.name
         return await asyncio.to_thread(decode_picture, data, name)
-
-
-def read_target(path: str) -> Target:
-    from smartcam.calibration._targets import target_from_data
-
-    try:
-        with Path(path).open("rb") as stream:
-            data: object = json.loads(stream.read(MAX_DESCRIPTION))
-    except OSError as exc:
-        raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
-    except (ValueError, RecursionError) as exc:
-        raise ConfigurationError(f"--target {path}: no JSON: {exc}") from exc
-    if not isinstance(data, dict):
-        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
-    described: dict[str, Any] = data
-    try:
-        return target_from_data(described)
-    except CalibrationError as exc:
-        raise ConfigurationError(f"--target {path}: {exc}") from exc
 
 
 def _read_lens(path: str) -> CameraModel:

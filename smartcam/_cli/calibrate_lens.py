@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -30,6 +31,9 @@ MOVED: Final = 0.05
 """Of the image's width: by how much points are elsewhere, on average, in a view that is another."""
 
 MOST_VIEWS: Final = 200
+
+MAX_DESCRIPTION: Final = 65_536
+"""Bytes of a target's description."""
 
 
 @dataclass(slots=True)
@@ -110,7 +114,6 @@ async def lens(
     pictures: tuple[str, ...], target: str, output: str, force: bool, model: Any, options: Options
 ) -> None:
     """Calibrate a lens."""
-    from smartcam._cli.calibrate import read_target
     from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 
     sources = [one for one in pictures if is_source(one)]
@@ -131,6 +134,26 @@ async def lens(
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
     options.show(_value(output, found), _text(output, found))
+
+
+def read_target(path: str) -> Target:
+    """Return the target that a file describes; ConfigurationError: it does not."""
+    from smartcam.calibration._targets import target_from_data
+
+    try:
+        with Path(path).open("rb") as stream:
+            data: object = json.loads(stream.read(MAX_DESCRIPTION))
+    except OSError as exc:
+        raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
+    except (ValueError, RecursionError) as exc:
+        raise ConfigurationError(f"--target {path}: no JSON: {exc}") from exc
+    if not isinstance(data, dict):
+        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
+    described: dict[str, Any] = data
+    try:
+        return target_from_data(described)
+    except CalibrationError as exc:
+        raise ConfigurationError(f"--target {path}: {exc}") from exc
 
 
 def _check_free(file: str, force: bool) -> None:
