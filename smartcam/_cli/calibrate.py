@@ -145,7 +145,7 @@ async def wizard_command(
     if url is not None and _only_frames(url):
         said = FrameAddress.parse(url).shown
         raise ConfigurationError(
-            f"{said} gives frames, and no localizations: expected the URL of a camera that does, or "
+            f"{said} gives frames, no localizations: expected the URL of a camera that does, or "
             f"--pictures {said} with --wizard sheet or --wizard hand-eye"
         )
     if url is None and (pictures is None or wizard in {None, "plane"}):
