@@ -200,6 +200,7 @@ class Viewer:
         )
         self._shown = asyncio.Event()  # the page has shown the last picture
         self._ending = asyncio.Event()
+        self._sent = 0
 
     def end(self) -> None:
         """Have it end."""
@@ -255,22 +256,32 @@ class Viewer:
             self._shown.set()
 
     async def _show(self) -> None:
-        """Show frames, and read the source again where it ended."""
-        for delay in AGAIN.delays():
+        """Show frames, and read the source again where it ended.
+
+        One that is lost stays so for the page until a picture of it comes.
+        """
+        delays, lost = AGAIN.delays(), False
+        while True:
+            before = self._sent
             try:
                 async with self._source.reader(timeout=ACCOUNT_PERIOD) as reader:
-                    await self._tell({"state": "live", **self._site.state(self.place)})
+                    if not lost:
+                        await self._tell({"state": "waiting", **self._site.state(self.place)})
                     await self._show_frames(reader)
             except LocalProtocolError:
                 await self._tell(
                     {"state": "awaited", "text": self._site.state(self.place)["failure"]}
                 )
+                lost = False
             except (FrameSourceError, ConfigurationError) as exc:
                 await self._tell({"state": "lost", "text": str(exc)})
+                lost = True
             else:
                 await self._tell({"state": "ended", "text": f"{self._source.name} has ended."})
                 await asyncio.Event().wait()  # a page that hears it twice would play it again
-            await asyncio.sleep(delay)
+            if self._sent > before:
+                delays = AGAIN.delays()
+            await asyncio.sleep(next(delays))
 
     async def _show_frames(self, reader: FrameReader) -> None:
         """Show frames until the source ends."""
@@ -299,6 +310,7 @@ class Viewer:
         self._shown.clear()
         async with asyncio.timeout(SLOW):
             await self._socket.send_bytes(len(said).to_bytes(4, "little") + said + picture)
+            self._sent += 1
             await self._shown.wait()
 
     async def _tell(self, value: dict[str, Any]) -> None:

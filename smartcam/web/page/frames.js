@@ -73,7 +73,7 @@ class Source {
 
   told(state, text) {
     this.panel.dataset.state = state;
-    this.state.textContent = { live: "live", awaited: "awaited", lost: "no frames", ended: "ended", wait: "connecting" }[state];
+    this.state.textContent = { live: "live", waiting: "waiting for a frame", awaited: "awaited", lost: "lost", ended: "ended", wait: "connecting" }[state];
     if (this.why.textContent !== text) this.why.textContent = text;
     this.age();
   }
