@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames._pixels import PixelFormat
 
-__all__ = ["PictureFiles", "Read", "Reading", "VideoPlan", "VideoReading"]
 
 PICTURES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
