@@ -124,6 +124,7 @@ class VideoReading(Reading):
     def __init__(self, plan: VideoPlan) -> None:
         super().__init__(plan)
         self._given_any = False
+        self._start_codes: Any = None
         self._container = self._opened()
         try:
             self._stream = self._first_stream()
@@ -163,6 +164,9 @@ class VideoReading(Reading):
             comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
             if comes != wanted.name:
                 raise self.plan.wrong(f"expected {wanted.name}, got {comes}")
+            if comes == "H264":  # files have lengths where V4L2, and our H264, has start codes
+                bitstream = load("av.bitstream").BitStreamFilterContext
+                self._start_codes = bitstream("h264_mp4toannexb", stream)
         return stream
 
     @property
@@ -203,8 +207,11 @@ class VideoReading(Reading):
     def _take(self, packet: Any, arrived: float) -> None:
         """Decode what came, or hand it on."""
         if self.plan.format is not None and self.plan.format.compressed:
-            if packet.size and not packet.is_corrupt:
-                self._pictures.append((packet, arrived))
+            if packet.is_corrupt:
+                self._lost += 1
+            elif packet.size:
+                filtered = self._start_codes.filter(packet) if self._start_codes else [packet]
+                self._pictures.extend((one, arrived) for one in filtered)
             return
         damaged = bool(packet.is_corrupt)
         try:
