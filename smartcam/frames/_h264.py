@@ -204,7 +204,11 @@ class H264Decoder:
         codec.thread_count = 1
         self._size = (frame.width, frame.height)
         room = (frame.width + 64) * (frame.height + 64)
-        codec.options = {"flags": "low_delay", "max_pixels": str(room)}
+        codec.options = {
+            "flags": "low_delay",
+            "max_pixels": str(room),
+            "err_detect": "explode",  # half a picture is none
+        }
         self._held.clear()
         self._missing, self._begun = None, False
 

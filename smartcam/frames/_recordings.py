@@ -159,6 +159,7 @@ class VideoReading(Reading):
             raise self.plan.wrong(f"expected video, got {self._container.format.long_name}")
         stream = streams[0]
         stream.codec_context.thread_count = 1  # more of them hold frames back
+        stream.codec_context.options = {"err_detect": "explode"}  # half a picture is none
         wanted = self.plan.format
         if wanted is not None and wanted.compressed:
             comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
@@ -208,7 +209,7 @@ class VideoReading(Reading):
         """Decode what came, or hand it on."""
         if self.plan.format is not None and self.plan.format.compressed:
             if packet.is_corrupt:
-                self._lost += 1
+                self._lost += self._given_any
             elif packet.size:
                 filtered = self._start_codes.filter(packet) if self._start_codes else [packet]
                 self._pictures.extend((one, arrived) for one in filtered)
@@ -220,7 +221,7 @@ class VideoReading(Reading):
             damaged, pictures = True, []
         whole = [picture for picture in pictures if not picture.is_corrupt]
         if damaged or len(whole) < len(pictures):
-            self._lost += 1
+            self._lost += self._given_any  # before the first one it may have come in midway
             if self._stream.codec_context.name not in _ONE_BY_ONE:
                 whole = []
                 self._stream.codec_context.flush_buffers()  # what follows rests on what is damaged
