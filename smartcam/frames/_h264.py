@@ -32,6 +32,7 @@ class Runs(Protocol):
 
     def __call__(self, work: Callable[[], T], /) -> Awaitable[T]:
         """Return what it returns."""
+        ...
 
 
 class H264Encoder:
@@ -181,7 +182,7 @@ class H264Decoder:
 
     def _decode(self, frame: Frame, losses: int) -> Frame | None:
         with self._one:
-            if self._codec is None or self._size != (frame.width, frame.height):
+            if self._size != (frame.width, frame.height):
                 self._begin(frame)
             if losses != self._losses_seen:
                 self._losses_seen, self._missing = losses, None
