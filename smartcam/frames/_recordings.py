@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames._pixels import PixelFormat
 
-__all__ = ["PictureFiles", "Read", "Reading", "VideoPlan", "VideoReading"]
 
 PICTURES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
@@ -125,6 +124,7 @@ class VideoReading(Reading):
     def __init__(self, plan: VideoPlan) -> None:
         super().__init__(plan)
         self._given_any = False
+        self._start_codes: Any = None
         self._container = self._opened()
         try:
             self._stream = self._first_stream()
@@ -159,11 +159,15 @@ class VideoReading(Reading):
             raise self.plan.wrong(f"expected video, got {self._container.format.long_name}")
         stream = streams[0]
         stream.codec_context.thread_count = 1  # more of them hold frames back
+        stream.codec_context.options = {"err_detect": "explode"}  # half a picture is none
         wanted = self.plan.format
         if wanted is not None and wanted.compressed:
             comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
             if comes != wanted.name:
                 raise self.plan.wrong(f"expected {wanted.name}, got {comes}")
+            if comes == "H264":  # files have lengths where V4L2, and our H264, has start codes
+                bitstream = load("av.bitstream").BitStreamFilterContext
+                self._start_codes = bitstream("h264_mp4toannexb", stream)
         return stream
 
     @property
@@ -204,8 +208,11 @@ class VideoReading(Reading):
     def _take(self, packet: Any, arrived: float) -> None:
         """Decode what came, or hand it on."""
         if self.plan.format is not None and self.plan.format.compressed:
-            if packet.size and not packet.is_corrupt:
-                self._pictures.append((packet, arrived))
+            if packet.is_corrupt:
+                self._lost += self._given_any
+            elif packet.size:
+                filtered = self._start_codes.filter(packet) if self._start_codes else [packet]
+                self._pictures.extend((one, arrived) for one in filtered)
             return
         damaged = bool(packet.is_corrupt)
         try:
@@ -214,7 +221,7 @@ class VideoReading(Reading):
             damaged, pictures = True, []
         whole = [picture for picture in pictures if not picture.is_corrupt]
         if damaged or len(whole) < len(pictures):
-            self._lost += 1
+            self._lost += self._given_any  # before the first one it may have come in midway
             if self._stream.codec_context.name not in _ONE_BY_ONE:
                 whole = []
                 self._stream.codec_context.flush_buffers()  # what follows rests on what is damaged

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from smartcam.frames._pixels import PixelFormat
     from smartcam.frames._recordings import Read
 
-__all__ = ["VideoDriver"]
 
 T = TypeVar("T")
 
