@@ -135,6 +135,7 @@ async def test_source_that_dies_is_said_and_comes_back(page: Page) -> None:
         driver.sink.ended(GoneError("scripted: it was unplugged <b>"))
         await see(page, ".source[data-state=lost] .why", "it was unplugged <b>")
         await see(page, ".source.old")
+        assert await page.inner_text("[data-count=camera]") == "-"
         del driver.fails["start"]
         await driver.streams()
         driver.give(stamped(2))

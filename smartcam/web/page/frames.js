@@ -75,6 +75,7 @@ class Source {
     this.panel.dataset.state = state;
     this.state.textContent = { live: "live", waiting: "waiting for a frame", awaited: "awaited", lost: "lost", ended: "ended", wait: "connecting" }[state];
     if (this.why.textContent !== text) this.why.textContent = text;
+    if (state !== "live") for (const key of ["shown", "camera"]) this.count(key, "-");
     this.age();
   }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,8 @@ def shot(data: bytes, format: str, stride: int) -> Frame:
 
 @pytest.mark.parametrize("format", ["Mono8", "YUYV", "Mono12"])
 def test_target_in_a_frame_is_where_it_is_in_its_brightness(format: str) -> None:
-    levels, stride = IMAGE, 320
+    levels: Any = IMAGE
+    stride = 320
     if format == "YUYV":  # U and V of strong colours, which the brightness does not have
         levels, stride = np.dstack([IMAGE, np.full_like(IMAGE, 230)]), 640
     if format == "Mono12":

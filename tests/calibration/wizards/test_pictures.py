@@ -168,9 +168,12 @@ async def test_picture_of_a_source_is_the_first_exposed_after_it_was_wanted() ->
         await driver.streams()
         driver.give(frame(1))
         assert (await anext(reader)).sequence == 1  # here before the button
-        taking = asyncio.create_task(take())
+        taking = asyncio.ensure_future(take())
         await until(lambda: source.statistics().readers == 2)
-        driver.give(frame(2, captured=time.monotonic() - 1.0), frame(3))
+        driver.give(frame(2, captured=time.monotonic() - 1.0))  # exposed before, here after it
+        await asyncio.sleep(1.0)
+        assert not taking.done()
+        driver.give(frame(3))
         picture = await taking
         assert picture.shape == (2, 4)
         assert (picture == 3).all()
@@ -183,7 +186,7 @@ async def test_picture_of_a_source_that_dies_or_is_silent_is_its_error() -> None
         with pytest.raises(FrameTimeoutError):
             await take()
         await driver.rests()
-        taking = asyncio.create_task(take())
+        taking = asyncio.ensure_future(take())
         await driver.streams()
         assert driver.sink is not None
         driver.sink.ended(GoneError("scripted: it was unplugged"))
