@@ -72,6 +72,7 @@ def test_lens_of_a_folder_leaves_out_what_shows_no_target(tmp_path: Path, target
     assert written.matrix[0, 0] == pytest.approx(told["lens"]["fx"])
 
 
+@pytest.mark.long
 def test_lens_of_files_has_its_views_in_json(tmp_path: Path, target: str) -> None:
     folder = write(tmp_path / "pictures", IMAGES)
     files = [str(one) for one in sorted(folder.glob("*.png"))]
