@@ -266,8 +266,8 @@ class VideoReading(Reading):
     def _error(self, failure: Exception, took: float) -> FrameSourceError:
         """Return the error of what FFmpeg could not do; its own text has the password in it."""
         name, limit = self.plan.name, self.plan.timeout
-        late = self.plan.network and took >= limit  # which FFmpeg's RTSP calls invalid data
-        if late or isinstance(failure, load("av").ExitError):
+        late = self.plan.network and took >= limit and isinstance(failure, ValueError)
+        if late or isinstance(failure, load("av").ExitError):  # the first is RTSP's way to say it
             text = f"{name}: expected an answer, got none within {limit:g} s"
             return FrameSourceError(text, source=name)
         kind = FrameFormatError if isinstance(failure, ValueError) else FrameSourceError
