@@ -81,7 +81,7 @@ class Read(NamedTuple):
     clock: bool = False
 
 
-class Reading(ABC):
+class PictureReading(ABC):
     """Something that pictures are read from; its methods block, and one thread calls them.
 
     Attributes:
@@ -115,7 +115,7 @@ class Reading(ABC):
         """Give it back. Idempotent."""
 
 
-class VideoReading(Reading):
+class VideoReading(PictureReading):
     """A stream or file, opened.
 
     Raises:
@@ -206,7 +206,8 @@ class VideoReading(Reading):
         picture, arrived = self._pictures.popleft()
         lost, self._lost = self._lost, 0
         self._given_any = True
-        at = None if picture.pts is None else float(picture.pts * picture.time_base)
+        base = picture.time_base or self._stream.time_base
+        at = None if picture.pts is None else float(picture.pts * base)
         clock = at is not None and self._container.format.name == "rtsp" and arrived > self._began
         return Read(self._pixels(picture), at, arrived, lost, clock)
 
@@ -283,7 +284,7 @@ def _plain(failure: Exception) -> OSError:
     return OSError(getattr(failure, "errno", None) or errno.EIO, _reason(failure))
 
 
-class PictureFiles(Reading):
+class PictureFiles(PictureReading):
     """Pictures in files, by their names' order, each as a source of one picture."""
 
     def __init__(self, plan: VideoPlan) -> None:

@@ -14,7 +14,13 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._pixels import find_format
-from smartcam.frames._recordings import PictureFiles, Reading, VideoPlan, VideoReading, is_pictures
+from smartcam.frames._recordings import (
+    PictureFiles,
+    PictureReading,
+    VideoPlan,
+    VideoReading,
+    is_pictures,
+)
 from smartcam.frames._video_frames import CONVERTIBLE
 
 if TYPE_CHECKING:
@@ -94,7 +100,7 @@ class VideoDriver(FrameDriver):
         self._paced = _one_of(address, "pace", said, ("real", "none")) == "real"
         self._format = _wanted(address, said.get("format"))
         self._options = _options(address, said)
-        self._thread: _Thread | None = None
+        self._thread: _ReadingThread | None = None
         self._task: asyncio.Task[None] | None = None
         self._stream: StreamFormat | None = None
         self._number = 0
@@ -151,10 +157,10 @@ class VideoDriver(FrameDriver):
         """Have nothing left. Idempotent."""
         await self.stop()
 
-    async def _begin(self) -> tuple[Reading, Read]:
+    async def _begin(self) -> tuple[PictureReading, Read]:
         """Open it and read the first picture."""
         await self.stop()
-        thread = self._thread = _Thread(self.name)
+        thread = self._thread = _ReadingThread(self.name)
         reading = await thread.open(self._opened)
         first = await thread.do(reading.read)
         if first is None:
@@ -163,7 +169,7 @@ class VideoDriver(FrameDriver):
             raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
         return reading, first
 
-    def _opened(self) -> Reading:
+    def _opened(self) -> PictureReading:
         address = self.address
         network = address.scheme != "file"
         url = address.url.partition("#")[0] if network else f"file:{self._path}"
@@ -178,9 +184,9 @@ class VideoDriver(FrameDriver):
         )
         return PictureFiles(plan) if pictures else VideoReading(plan)
 
-    async def _pump(self, sink: FrameSink, reading: Reading, first: Read) -> None:
+    async def _pump(self, sink: FrameSink, reading: PictureReading, first: Read) -> None:
         rate, live, thread = reading.rate, reading.live, self._thread
-        clock = _Clock(self._fps or (None if rate else PICTURE_RATE), rate)
+        clock = _Playback(self._fps or (None if rate else PICTURE_RATE), rate)
         read: Read | None = first
         try:
             while read is not None and thread is not None:
@@ -228,17 +234,17 @@ class VideoDriver(FrameDriver):
         )
 
 
-class _Thread:
+class _ReadingThread:
     """One thread, and what is read in it: it opens that, reads, and gives it back."""
 
     def __init__(self, name: str) -> None:
         self._pool = ThreadPoolExecutor(1, f"frames of {name}")
-        self._reading: Reading | None = None
+        self._reading: PictureReading | None = None
 
-    async def open(self, make: Callable[[], Reading]) -> Reading:
+    async def open(self, make: Callable[[], PictureReading]) -> PictureReading:
         """Return what is opened; the thread has it even if nobody is there for it any longer."""
 
-        def opened() -> Reading:
+        def opened() -> PictureReading:
             self._reading = made = make()
             return made
 
@@ -274,7 +280,7 @@ def _looked_at(done: asyncio.Future[Any]) -> None:
         done.exception()  # nobody may be there for it any longer
 
 
-class _Clock:
+class _Playback:
     """When a recording's pictures are due.
 
     Args:
