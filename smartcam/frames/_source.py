@@ -208,6 +208,8 @@ class FrameReader:
 
     async def _take(self, end: float | None, what: str) -> Frame | None:
         """Return the next frame as soon as there is one; None at the end of the source."""
+        if self._next is not None:
+            return self._taken(self._next)
         try:
             async with asyncio.timeout_at(end):
                 while self._next is None and not self._ended:
