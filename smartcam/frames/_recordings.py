@@ -27,6 +27,9 @@ PICTURES: Final = frozenset(
 )
 """Names of files in a folder that are taken for pictures."""
 
+WAITED: Final = 0.01
+"""Seconds; a packet that took so long came just now, and not out of a buffer."""
+
 _PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
 """Codecs whose bytes are a format of ours, and so can be handed on as they are."""
 
@@ -66,7 +69,7 @@ class Read(NamedTuple):
     Attributes:
         pixels: of it.
         time: seconds by the stream's own clock; None: it has none.
-        arrived: seconds of ``time.monotonic()``, before it was decoded.
+        arrived: seconds of ``time.monotonic()``, before it was decoded, or earlier.
         lost: damaged ones that came before it.
         clock: ``time`` is the camera's, not one that was counted up here.
     """
@@ -78,7 +81,7 @@ class Read(NamedTuple):
     clock: bool = False
 
 
-class Reading(ABC):
+class PictureReading(ABC):
     """Something that pictures are read from; its methods block, and one thread calls them.
 
     Attributes:
@@ -112,7 +115,7 @@ class Reading(ABC):
         """Give it back. Idempotent."""
 
 
-class VideoReading(Reading):
+class VideoReading(PictureReading):
     """A stream or file, opened.
 
     Raises:
@@ -125,7 +128,10 @@ class VideoReading(Reading):
         super().__init__(plan)
         self._given_any = False
         self._start_codes: Any = None
+        self._began = time.monotonic()
         self._container = self._opened()
+        self._open_from = time.monotonic()
+        self._behind = True  # what comes has waited while FFmpeg looked what it is
         try:
             self._stream = self._first_stream()
             self._packets = self._container.demux(self._stream)
@@ -142,6 +148,7 @@ class VideoReading(Reading):
 
     def _tried(self, do: Callable[[], Any]) -> Any:
         """Return what FFmpeg does; None where it is at the end."""
+        begun = time.monotonic()
         try:
             return do()
         except EOFError as exc:
@@ -151,7 +158,7 @@ class VideoReading(Reading):
         if isinstance(failure, EOFError) and self._given_any:
             return None
         # raised here and not above, for what failed has the URL in its text, and so the password
-        raise self._error(failure) from _plain(failure)
+        raise self._error(failure, time.monotonic() - begun) from _plain(failure)
 
     def _first_stream(self) -> Any:
         streams = self._container.streams.video
@@ -182,20 +189,34 @@ class VideoReading(Reading):
 
     def read(self) -> Read | None:
         """Return the next picture."""
+        begun = time.monotonic()
         while not self._pictures and not self.stopped.is_set():
+            if self.plan.network and time.monotonic() - begun > self.plan.timeout:
+                raise self.plan.wrong(
+                    f"expected a picture, got bytes that make none for {self.plan.timeout:g} s"
+                )
+            asked = time.monotonic()
             packet = self._tried(lambda: next(self._packets, None))
             if packet is None:
                 self._end()
                 return None
-            self._take(packet, time.monotonic())
+            self._take(packet, self._arrival(asked, time.monotonic()))
         if not self._pictures or self.stopped.is_set():
             return None
         picture, arrived = self._pictures.popleft()
         lost, self._lost = self._lost, 0
         self._given_any = True
-        at = None if picture.pts is None else float(picture.pts * picture.time_base)
-        clock = at is not None and self._container.format.name == "rtsp"
+        base = picture.time_base or self._stream.time_base
+        at = None if picture.pts is None else float(picture.pts * base)
+        clock = at is not None and self._container.format.name == "rtsp" and arrived > self._began
         return Read(self._pixels(picture), at, arrived, lost, clock)
+
+    def _arrival(self, asked: float, now: float) -> float:
+        """Return when a packet came; at the earliest, where it waited in FFmpeg since."""
+        if self._behind:
+            drained = now - self._open_from > self._open_from - self._began
+            self._behind = not drained and now - asked < WAITED
+        return self._began if self._behind else now
 
     def _end(self) -> None:
         if self.live:
@@ -243,10 +264,11 @@ class VideoReading(Reading):
         """Close it."""
         self._container.close()
 
-    def _error(self, failure: Exception) -> FrameSourceError:
+    def _error(self, failure: Exception, took: float) -> FrameSourceError:
         """Return the error of what FFmpeg could not do; its own text has the password in it."""
         name, limit = self.plan.name, self.plan.timeout
-        if isinstance(failure, load("av").ExitError):
+        late = self.plan.network and took >= limit and isinstance(failure, ValueError)
+        if late or isinstance(failure, load("av").ExitError):  # the first is RTSP's way to say it
             text = f"{name}: expected an answer, got none within {limit:g} s"
             return FrameSourceError(text, source=name)
         kind = FrameFormatError if isinstance(failure, ValueError) else FrameSourceError
@@ -262,7 +284,7 @@ def _plain(failure: Exception) -> OSError:
     return OSError(getattr(failure, "errno", None) or errno.EIO, _reason(failure))
 
 
-class PictureFiles(Reading):
+class PictureFiles(PictureReading):
     """Pictures in files, by their names' order, each as a source of one picture."""
 
     def __init__(self, plan: VideoPlan) -> None:

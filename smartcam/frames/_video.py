@@ -14,7 +14,13 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._pixels import find_format
-from smartcam.frames._recordings import PictureFiles, Reading, VideoPlan, VideoReading, is_pictures
+from smartcam.frames._recordings import (
+    PictureFiles,
+    PictureReading,
+    VideoPlan,
+    VideoReading,
+    is_pictures,
+)
 from smartcam.frames._video_frames import CONVERTIBLE
 
 if TYPE_CHECKING:
@@ -38,6 +44,9 @@ PICTURE_RATE: Final = 10.0
 
 BEHIND: Final = 0.5
 """Seconds that a recording may be late before its clock is set anew."""
+
+QUICK: Final = {"fpsprobesize": "0", "probesize": "32768", "analyzeduration": "500000"}
+"""Of FFmpeg, which else looks at a second of a live stream first, and then gives it late."""
 
 _COMMON: Final = ("delay", "format", "name", "timeout")
 _RECORDED: Final = ("fps", "pace")
@@ -73,7 +82,8 @@ class VideoDriver(FrameDriver):
     ``name``          of the camera
     ================= =============================================================================
 
-    A live stream's frames are stamped with their arrival; only RTSP has a clock, ``device_time``.
+    A live stream's frames are stamped with their arrival; those that waited while FFmpeg looked
+    what comes, with when it began to. Only RTSP has a clock, ``device_time``.
     None has numbers, so ``sequence`` counts what came, and ``lost`` what was damaged. A damaged
     picture is never given, nor one that rests on it as far as the decoder can tell.
     """
@@ -90,9 +100,7 @@ class VideoDriver(FrameDriver):
         self._paced = _one_of(address, "pace", said, ("real", "none")) == "real"
         self._format = _wanted(address, said.get("format"))
         self._options = _options(address, said)
-        self._pool: ThreadPoolExecutor | None = None
-        self._working: asyncio.Future[Any] | None = None
-        self._reading: Reading | None = None
+        self._thread: _ReadingThread | None = None
         self._task: asyncio.Task[None] | None = None
         self._stream: StreamFormat | None = None
         self._number = 0
@@ -111,11 +119,10 @@ class VideoDriver(FrameDriver):
             MissingExtraError: the extra ``video`` is not installed.
         """
         try:
-            first = await self._begin()
+            reading, first = await self._begin()
         finally:
             await self.stop()
-        rate = self._fps or first[1]
-        pixels = first[0].pixels
+        rate, pixels = self._fps or reading.rate, first.pixels
         rates = (rate,) if rate else ()
         self._stream = StreamFormat(pixels.format, pixels.width, pixels.height, rates)
         return self._stream
@@ -127,54 +134,42 @@ class VideoDriver(FrameDriver):
             FrameSourceError: it is gone, or silent.
         """
         try:
-            first, rate = await self._begin()
+            reading, first = await self._begin()
         except BaseException:
             await self.stop()
             raise
-        self._task = asyncio.create_task(
-            self._pump(sink, first, rate), name=f"frames of {self.name}"
-        )
+        pumping = self._pump(sink, reading, first)
+        self._task = asyncio.create_task(pumping, name=f"frames of {self.name}")
 
     async def stop(self) -> None:
         """Read no longer. What hangs in a read is waited for until its timeout, no longer."""
         task, self._task = self._task, None
-        reading, self._reading = self._reading, None
-        if reading is not None:
-            reading.stopped.set()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.stop()
         if task is not None:
             task.cancel()
             await asyncio.wait([task])
-        pool, self._pool = self._pool, None
-        if pool is None:
-            return
-        last = self._working
-        if reading is not None:
-            last = asyncio.get_running_loop().run_in_executor(pool, reading.close)
-        pool.shutdown(wait=False)
-        if last is not None:
-            _, late = await asyncio.wait([last], timeout=self._timeout + GRACE)
-            if late:
-                _log.warning("! %s: its thread hangs, and is left to end by itself", self.name)
+        if thread is not None and not await thread.ended(self._timeout + GRACE):
+            _log.warning("! %s: its thread hangs, and is left to end by itself", self.name)
 
     async def close(self) -> None:
         """Have nothing left. Idempotent."""
         await self.stop()
 
-    async def _begin(self) -> tuple[Read, float | None]:
-        """Open it and read the first picture; return its rate, too."""
+    async def _begin(self) -> tuple[PictureReading, Read]:
+        """Open it and read the first picture."""
         await self.stop()
-        self._pool = ThreadPoolExecutor(1, f"frames of {self.name}")
-        reading = self._reading = await self._in_thread(self._opened)
-        first = await self._in_thread(reading.read)
+        thread = self._thread = _ReadingThread(self.name)
+        reading = await thread.open(self._opened)
+        first = await thread.do(reading.read)
         if first is None:
             raise FrameFormatError(f"{self.name}: there is no picture in it", source=self.name)
         if self._fps and reading.live:
-            raise self.address.wrong(
-                "fps", "a recording, to which alone it applies", "a live stream"
-            )
-        return first, reading.rate
+            raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
+        return reading, first
 
-    def _opened(self) -> Reading:
+    def _opened(self) -> PictureReading:
         address = self.address
         network = address.scheme != "file"
         url = address.url.partition("#")[0] if network else f"file:{self._path}"
@@ -189,37 +184,28 @@ class VideoDriver(FrameDriver):
         )
         return PictureFiles(plan) if pictures else VideoReading(plan)
 
-    async def _in_thread(self, work: Callable[[], T]) -> T:
-        """Have the thread do something; one that is cancelled is finished all the same."""
-        pool = self._pool
-        if pool is None:
-            raise FrameSourceError(f"{self.name}: stopped", source=self.name)
-        working = asyncio.get_running_loop().run_in_executor(pool, work)
-        working.add_done_callback(_looked_at)
-        self._working = working
-        return await asyncio.shield(working)
-
-    async def _pump(self, sink: FrameSink, first: Read, rate: float | None) -> None:
-        reading = self._reading
-        if reading is None:
-            return
-        clock = _Clock(self._fps or (None if rate else PICTURE_RATE), rate)
-        paced = self._paced and not reading.live
+    async def _pump(self, sink: FrameSink, reading: PictureReading, first: Read) -> None:
+        rate, live, thread = reading.rate, reading.live, self._thread
+        clock = _Playback(self._fps or (None if rate else PICTURE_RATE), rate)
         read: Read | None = first
         try:
-            while read is not None:
-                if paced:
+            while read is not None and thread is not None:
+                if self._paced and not live:
                     await clock.wait_for(read.time)
-                sink.frame(self._frame(read, reading.live, rate))
-                if not self._paced and not reading.live:
+                sink.frame(self._frame(read, live))
+                if not self._paced and not live:
                     await sink.taken()
-                read = await self._in_thread(reading.read)
+                read = await thread.do(reading.read)
         except FrameSourceError as error:
             sink.ended(error)
+        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+            failed = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
+            failed.__cause__ = exc
+            sink.ended(failed)
         else:
             sink.ended(None)
 
-    def _frame(self, read: Read, live: bool, rate: float | None) -> Frame:
+    def _frame(self, read: Read, live: bool) -> Frame:
         pixels, now = read.pixels, time.monotonic()
         comes = (pixels.format, pixels.width, pixels.height)
         if self._stream is not None and comes != self._stream[:3]:
@@ -248,7 +234,53 @@ class VideoDriver(FrameDriver):
         )
 
 
-class _Clock:
+class _ReadingThread:
+    """One thread, and what is read in it: it opens that, reads, and gives it back."""
+
+    def __init__(self, name: str) -> None:
+        self._pool = ThreadPoolExecutor(1, f"frames of {name}")
+        self._reading: PictureReading | None = None
+
+    async def open(self, make: Callable[[], PictureReading]) -> PictureReading:
+        """Return what is opened; the thread has it even if nobody is there for it any longer."""
+
+        def opened() -> PictureReading:
+            self._reading = made = make()
+            return made
+
+        return await self.do(opened)
+
+    async def do(self, work: Callable[[], T]) -> T:
+        """Have something done; what is cancelled is done all the same."""
+        doing = asyncio.get_running_loop().run_in_executor(self._pool, work)
+        doing.add_done_callback(_looked_at)
+        return await asyncio.shield(doing)
+
+    def stop(self) -> None:
+        """Have a picture that is looked for given up."""
+        if self._reading is not None:
+            self._reading.stopped.set()
+
+    async def ended(self, within: float) -> bool:
+        """Give everything back, and return whether the thread did so in time."""
+        last = asyncio.get_running_loop().run_in_executor(self._pool, self._give_back)
+        last.add_done_callback(_looked_at)
+        self._pool.shutdown(wait=False)
+        _, late = await asyncio.wait([last], timeout=within)
+        return not late
+
+    def _give_back(self) -> None:
+        reading, self._reading = self._reading, None
+        if reading is not None:
+            reading.close()
+
+
+def _looked_at(done: asyncio.Future[Any]) -> None:
+    if not done.cancelled():
+        done.exception()  # nobody may be there for it any longer
+
+
+class _Playback:
     """When a recording's pictures are due.
 
     Args:
@@ -274,11 +306,6 @@ class _Clock:
         if self._began is None or now > self._began + at + BEHIND:
             self._began = now - at
         await asyncio.sleep(self._began + at - now)
-
-
-def _looked_at(done: asyncio.Future[T]) -> None:
-    if not done.cancelled():
-        done.exception()
 
 
 def _split(address: FrameAddress) -> tuple[str, str]:
@@ -322,9 +349,9 @@ def _one_of(address: FrameAddress, name: str, said: dict[str, str], known: tuple
 
 def _options(address: FrameAddress, said: dict[str, str]) -> dict[str, str]:
     """Return FFmpeg's."""
-    options = {}
+    options: dict[str, str] = {}
     if address.scheme.startswith("rtsp"):
-        options["rtsp_transport"] = _one_of(address, "transport", said, ("tcp", "udp"))
+        options |= QUICK | {"rtsp_transport": _one_of(address, "transport", said, ("tcp", "udp"))}
     if address.scheme in ("https", "rtsps"):
         verified = _one_of(address, "verify", said, ("yes", "no")) == "yes"
         paths = ssl.get_default_verify_paths()
