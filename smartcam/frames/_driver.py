@@ -69,6 +69,12 @@ class FrameSink(ABC):
     def ended(self, error: FrameSourceError | None) -> None:
         """Take that nothing more comes: None at the end of a file. Readers get the error."""
 
+    async def taken(self) -> None:  # noqa: B027 - who has no readers waits for none
+        """Return once every reader has taken the last frame: for a recording that is to lose none.
+
+        Cancellation: safe.
+        """
+
 
 class FrameDriver(ABC):
     """One device, file or address that frames come from; made of its address.

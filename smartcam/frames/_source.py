@@ -248,6 +248,8 @@ class FrameReader:
         if frame is self._next:
             self._next = None
             self._delivered += 1
+            if self._source is not None:
+                self._source._took.set()  # noqa: SLF001 - the two are one
         self._last = frame
         return frame
 
@@ -291,6 +293,8 @@ class FrameSource(FrameSink):
         self._format: StreamFormat | None = None
         self._task: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()  # readers came or went, or the driver ended
+        self._took = asyncio.Event()  # a reader took a frame, or went
+        self._held_up = False  # the driver waits for readers
         self._streaming = False
         self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
         self._frames = self._lost = self._started = self._ahead = 0
@@ -472,6 +476,17 @@ class FrameSource(FrameSink):
         self._over = (error,)
         self._changed.set()
 
+    async def taken(self) -> None:
+        """Wait until every reader has taken the last frame; meanwhile nothing is stuck."""
+        self._held_up = True
+        try:
+            while any(reader._next is not None for reader in self._alive()):  # noqa: SLF001
+                self._took.clear()
+                await self._took.wait()
+        finally:
+            self._held_up = False
+            self._last_came = asyncio.get_running_loop().time()
+
     def _alive(self) -> list[FrameReader]:
         return [reader for one in self._readers if (reader := one()) is not None]
 
@@ -480,6 +495,7 @@ class FrameSource(FrameSink):
         if not self._readers and self._task is not None:
             self._idle_since = self._task.get_loop().time()
         self._changed.set()
+        self._took.set()
 
     def _forget(self, reader: FrameReader) -> None:
         self._dropped(weakref.ref(reader))
@@ -529,6 +545,8 @@ class FrameSource(FrameSink):
                 await self._until_changed(lambda: not self._readers)
             else:
                 left = self._last_came + self._stall - asyncio.get_running_loop().time()
+                if left <= 0 and self._held_up:
+                    left = self._stall
                 if left <= 0:
                     raise FrameSourceError(
                         f"{self.name}: it streams, but gave no frame for {self._stall:g} s",
