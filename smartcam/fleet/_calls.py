@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._frame_wire import Encoding
+from smartcam.fleet._frame_wire import FrameForm
 from smartcam.fleet._frames import FrameOrder
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Carrier, Owner
@@ -214,7 +214,7 @@ async def _request(call: ProgramCall) -> Answer:
 
 def _frame_order(call: ProgramCall) -> FrameOrder:
     name = call.host.name
-    encoding = Encoding.checked(
+    encoding = FrameForm.checked(
         call.argument("encoding", str) or "raw", call.argument("quality", int), name
     )
     return FrameOrder(call.program, call.owner.call, encoding, call.timeout)

@@ -25,7 +25,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._caller import Caller, Met
 from smartcam.fleet._errors import from_fields
-from smartcam.fleet._frame_wire import Encoding
+from smartcam.fleet._frame_wire import FrameForm
 from smartcam.fleet._receiver import FleetListeners, Own, Receiver
 from smartcam.fleet._wire import grace
 from smartcam.models import (
@@ -694,7 +694,7 @@ class FleetCamera(Camera[ValueT]):
         from smartcam.fleet._frame_caller import SharedFrameDriver
         from smartcam.frames import FrameAddress, FrameSource
 
-        wanted = Encoding.checked(encoding, quality, self.name)
+        wanted = FrameForm.checked(encoding, quality, self.name)
         driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, wanted)
         async with (
             FrameSource(driver, timeout=timeout, stall=None) as source,
@@ -713,7 +713,7 @@ class FleetCamera(Camera[ValueT]):
         self._deadline(timeout)
         if not max_age >= 0:
             raise ConfigurationError(f"{self.name}: max_age: expected seconds, got {max_age!r}")
-        wanted = Encoding.checked(encoding, quality, self.name)
+        wanted = FrameForm.checked(encoding, quality, self.name)
         age = None if math.isinf(max_age) else max_age
         return await self.frame_caller.one(wanted, timeout, max_age=age)
 
@@ -726,7 +726,7 @@ class FleetCamera(Camera[ValueT]):
         timeout: float = FRAME_TIMEOUT,
     ) -> FleetFrame:
         self._deadline(timeout)
-        wanted = Encoding.checked(encoding, quality, self.name)
+        wanted = FrameForm.checked(encoding, quality, self.name)
         if moment is None:
             return await self.frame_caller.one(wanted, timeout, fresh=True)
         if not math.isfinite(moment):

@@ -19,7 +19,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.fleet._frame_encoding import FORMATS
-from smartcam.fleet._frame_wire import Encoding, from_fields
+from smartcam.fleet._frame_wire import FrameForm, from_fields
 from smartcam.fleet._frames import HOLD
 from smartcam.frames import FrameDriver, StreamFormat, find_format
 
@@ -76,7 +76,7 @@ class FrameCaller:
         self.name, self._caller = name, caller
         self._lenses: dict[tuple[int, int], CameraModel | None] = {}
 
-    async def about(self, encoding: Encoding) -> StreamFormat:
+    async def about(self, encoding: FrameForm) -> StreamFormat:
         """Return what frames come, as the device says; it is opened for that.
 
         Raises:
@@ -95,7 +95,7 @@ class FrameCaller:
 
     async def one(
         self,
-        encoding: Encoding,
+        encoding: FrameForm,
         timeout: float,
         *,
         max_age: float | None = None,
@@ -225,7 +225,7 @@ class SharedFrameDriver(FrameDriver):
 
     times_frames = True
 
-    def __init__(self, address: FrameAddress, frames: FrameCaller, encoding: Encoding) -> None:
+    def __init__(self, address: FrameAddress, frames: FrameCaller, encoding: FrameForm) -> None:
         super().__init__(address)
         self._frames, self._encoding = frames, encoding
         self._task: asyncio.Task[None] | None = None

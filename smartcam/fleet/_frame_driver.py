@@ -7,7 +7,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet._frame_caller import SharedFrameDriver, as_source_error
-from smartcam.fleet._frame_wire import Encoding
+from smartcam.fleet._frame_wire import FrameForm
 from smartcam.fleet._opening import fleet_camera
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ class FleetFrameDriver(SharedFrameDriver):
         url, said = _split(address.url)
         quality = said.get("quality")
         number = None if quality is None else int(address.number("quality", quality, 1, 100))
-        encoding = Encoding.checked(said.get("encoding", "raw"), number, f"{address.shown!r}")
+        encoding = FrameForm.checked(said.get("encoding", "raw"), number, f"{address.shown!r}")
         self._url = url
         self._camera = self._make()
         super().__init__(address, self._camera.frame_caller, encoding)

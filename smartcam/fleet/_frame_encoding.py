@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from smartcam.fleet._frame_wire import Encoding
+    from smartcam.fleet._frame_wire import FrameForm
     from smartcam.frames import Codecs, Frame
 
 FORMATS = {"jpeg": "MJPEG", "png": "PNG", "jpegxl": "JPEGXL"}
@@ -18,7 +18,7 @@ class FrameEncoder:
     def __init__(self) -> None:
         self._codecs: Codecs | None = None
 
-    async def encoded(self, frame: Frame, encoding: Encoding) -> Frame:
+    async def encoded(self, frame: Frame, encoding: FrameForm) -> Frame:
         """Return a frame encoded; one that its camera has encoded so is left as it is.
 
         Raises:

@@ -26,7 +26,7 @@ ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
 """What frames may be encoded as; raw is as the camera gave them."""
 
 
-class Encoding(NamedTuple):
+class FrameForm(NamedTuple):
     """How frames are to come.
 
     Attributes:
@@ -38,7 +38,7 @@ class Encoding(NamedTuple):
     quality: int | None = None
 
     @classmethod
-    def checked(cls, name: object, quality: object, who: str) -> Encoding:
+    def checked(cls, name: object, quality: object, who: str) -> FrameForm:
         """Return it.
 
         Raises:

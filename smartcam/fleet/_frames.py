@@ -22,7 +22,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
     UnsupportedError,
 )
-from smartcam.fleet._frame_wire import MOST_FRAME, Encoding, to_fields
+from smartcam.fleet._frame_wire import MOST_FRAME, FrameForm, to_fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
@@ -82,12 +82,12 @@ class FrameOrder(NamedTuple):
 
     program: str
     call: int
-    encoding: Encoding
+    encoding: FrameForm
     timeout: float
 
 
 @dataclass(eq=False)
-class _Viewer:
+class _FrameStream:
     """A stream of a program."""
 
     number: int
@@ -138,9 +138,11 @@ class SharedFrames:
     url: str | None = None
     _source: FrameSource | None = None
     _opening: asyncio.Task[FrameSource] | None = None
-    _viewers: dict[tuple[str, int], _Viewer] = field(default_factory=dict[tuple[str, int], _Viewer])
+    _viewers: dict[tuple[str, int], _FrameStream] = field(
+        default_factory=dict[tuple[str, int], _FrameStream]
+    )
     _asking: dict[str, int] = field(default_factory=dict[str, int])
-    _encoded: dict[Encoding, _Encoded] = field(default_factory=dict[Encoding, _Encoded])
+    _encoded: dict[FrameForm, _Encoded] = field(default_factory=dict[FrameForm, _Encoded])
     _lenses: dict[int, CameraModel] = field(default_factory=dict[int, "CameraModel"])
     _numbers: itertools.count[int] = field(default_factory=lambda: itertools.count(1))
     _tasks: set[asyncio.Task[Any]] = field(default_factory=set["asyncio.Task[Any]"])
@@ -281,7 +283,7 @@ class SharedFrames:
         }
         return {"came": came, "frame": self._send(sent, order, took), **counts}
 
-    async def _view(self, key: tuple[str, int], timeout: float) -> _Viewer:
+    async def _view(self, key: tuple[str, int], timeout: float) -> _FrameStream:
         """Begin a stream."""
         with self._within(timeout, "the device"):
             async with asyncio.timeout(timeout):
@@ -294,7 +296,7 @@ class SharedFrames:
                 f"{self.name}: {len(self._viewers)} streams of frames, {theirs} of them this "
                 "program's; no more are possible"
             )
-        viewer = self._viewers[key] = _Viewer(next(self._numbers), source.reader(timeout=None))
+        viewer = self._viewers[key] = _FrameStream(next(self._numbers), source.reader(timeout=None))
         return viewer
 
     def leave(self, program: str, stream: int) -> None:
@@ -303,7 +305,7 @@ class SharedFrames:
         if viewer is not None:
             self._leave((program, stream), viewer)
 
-    def _leave(self, key: tuple[str, int], viewer: _Viewer) -> None:
+    def _leave(self, key: tuple[str, int], viewer: _FrameStream) -> None:
         if self._viewers.get(key) is viewer:
             del self._viewers[key]
         viewer.close()
@@ -331,7 +333,7 @@ class SharedFrames:
         self.sender.send(order.program, order.call, frame.data)
         return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
 
-    async def _encode(self, frame: Frame, encoding: Encoding) -> tuple[Frame, float]:
+    async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
         """Return a frame encoded, once for all who want the same, and how long that took."""
         if encoding.name == "raw":
             return frame, 0.0

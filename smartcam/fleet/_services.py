@@ -14,7 +14,7 @@ from smartcam._client.triggering import TriggerRequest
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import FrameFormatError, UnsupportedError
 from smartcam.fleet._calls import ACTIONS, MOST_FILLED, ProgramCall, outcomes
-from smartcam.fleet._frame_wire import Encoding, to_fields
+from smartcam.fleet._frame_wire import FrameForm, to_fields
 from smartcam.fleet._frames import FrameOrder
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._reading import result_fields, singles
@@ -232,7 +232,7 @@ async def _results(work: Work) -> dict[str, Any]:
 
 async def _frame(work: Work) -> dict[str, Any]:
     request, host = work.request, work.host
-    encoding = Encoding.checked(request.encoding, request.quality, host.name)
+    encoding = FrameForm.checked(request.encoding, request.quality, host.name)
     order = FrameOrder("", work.owner.call, encoding, work.timeout)
     frame, took = await host.frames.get(
         order, max_age=request.max_age, after=None, fresh=request.fresh
