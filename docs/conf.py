@@ -16,6 +16,7 @@ import importlib
 import inspect
 import itertools
 import json
+import re
 import struct
 import textwrap
 import tomllib
@@ -581,6 +582,7 @@ def setup(app: Any) -> None:
     app.add_directive("generated", Generated)
     app.connect("autodoc-skip-member", _skip)
     app.connect("autodoc-process-signature", _plain_types)
+    app.connect("autodoc-process-signature", _which_frame)
 
 
 def _plain_types(
@@ -599,6 +601,18 @@ def _plain_types(
     shown = inspect.Signature([one.replace(annotation=types[one.name]) for one in given])
     array = "numpy.ndarray[tuple[typing.Any, ...], numpy.dtype[numpy.float64]]"
     return stringify_signature(shown).replace(array, "Array"), ""
+
+
+def _which_frame(
+    _app: Any, _what: str, name: str, _member: Any, _options: Any, signature: str, gives: str
+) -> tuple[str | None, str | None]:
+    """Say whose frame it is: a camera's, or a protocol's."""
+    home = "protocols" if name.startswith("smartcam.protocols") else "frames"
+
+    def named(text: str | None) -> str | None:
+        return text and re.sub(r"(?<![\w.])Frame(?!\w)", f"~smartcam.{home}.Frame", text)
+
+    return named(signature), named(gives)
 
 
 def _skip(_app: Any, _what: str, _name: str, member: object, skip: bool, _options: Any) -> bool:
