@@ -22,6 +22,7 @@ from smartcam.exceptions import CalibrationError, ConfigurationError, Unsupporte
 from smartcam.frames import FrameAddress
 from smartcam.models import Localization
 from smartcam.registry import FRAMES, PROTOCOLS
+from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -196,7 +197,7 @@ async def _run(
 def _only_frames(url: str) -> bool:
     """Tell whether a URL is that of a source of frames, and of no camera."""
     scheme = url.partition("://")[0] if is_source(url) else ""
-    return scheme in FRAMES and scheme not in PROTOCOLS
+    return scheme in FRAMES and scheme not in PROTOCOLS and not is_fleet(url)
 
 
 @contextlib.asynccontextmanager
