@@ -1,0 +1,94 @@
+"""Buffers that a driver writes pictures into: asked for, mapped, queued, and given back."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames._v4l2 import abi, system
+from smartcam.frames._v4l2.abi import Buffer
+
+if TYPE_CHECKING:
+    import mmap
+
+    from smartcam.frames._v4l2.device import Device
+
+LEAST = 2
+"""Buffers: one that is written while another one is read."""
+
+
+class Buffers:
+    """The buffers of a device, which streams from now on.
+
+    Args:
+        device: set to what it is to stream.
+        count: how many are asked for; the driver may give more or fewer.
+
+    Raises:
+        FrameSourceError: it is in use, or has no memory; nothing streams.
+    """
+
+    def __init__(self, device: Device, count: int) -> None:
+        self._device = device
+        self._pages: list[mmap.mmap] = []
+        try:
+            given = device.ask(
+                abi.REQBUFS, count, abi.CAPTURE, abi.MEMORY_MMAP, tried="asking for buffers"
+            )[0]
+            if given < LEAST:
+                raise FrameSourceError(
+                    f"{device.path}: expected {LEAST} buffers or more, got {given}",
+                    source=device.path,
+                )
+            for index in range(given):
+                self._prepare(index)
+            device.ask(abi.STREAMON, abi.CAPTURE, tried="starting the stream")
+        except BaseException:
+            self.release()
+            raise
+
+    def __len__(self) -> int:
+        return len(self._pages)
+
+    def take(self) -> tuple[Buffer, bytes]:
+        """Return what the driver wrote into the oldest buffer that is full; queue it again.
+
+        Returns:
+            The bytes are a copy: the only one that is made. Of a buffer with an error it is empty.
+
+        Raises:
+            BlockingIOError: none is full.
+            OSError: the device is gone, or its driver gave up.
+        """
+        argument = abi.new_buffer(0)
+        number = self._device.number
+        system.ioctl(number, abi.DQBUF, argument)
+        buffer = Buffer.of(argument)
+        pages = self._pages[buffer.index]
+        data = b"" if buffer.flags & abi.BUF_ERROR else pages[: buffer.used]
+        system.ioctl(number, abi.QBUF, argument)
+        return buffer, data
+
+    def release(self) -> None:
+        """Stop the stream and give the buffers back: others may use the device."""
+        with suppress(FrameSourceError):  # the device may be gone
+            self._device.ask(abi.STREAMOFF, abi.CAPTURE)
+        while self._pages:
+            self._pages.pop().close()
+        with suppress(FrameSourceError):
+            self._device.ask(abi.REQBUFS, 0, abi.CAPTURE, abi.MEMORY_MMAP)
+
+    def _prepare(self, index: int) -> None:
+        """Map and queue a buffer."""
+        device = self._device
+        argument = abi.new_buffer(index)
+        try:
+            system.ioctl(device.number, abi.QUERYBUF, argument)
+            buffer = Buffer.of(argument)
+            self._pages.append(system.pages(device.number, buffer.length, buffer.offset))
+            system.ioctl(device.number, abi.QBUF, argument)
+        except (OSError, ValueError) as exc:
+            raise FrameSourceError(
+                f"{device.path}: buffer {index}: {exc}", source=device.path
+            ) from exc
