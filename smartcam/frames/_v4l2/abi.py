@@ -12,7 +12,6 @@ from __future__ import annotations
 from struct import Struct
 from typing import Final, NamedTuple
 
-
 WRITE: Final = 1
 READ: Final = 2
 
@@ -41,7 +40,7 @@ _CAPABILITY = Struct("16s32s32sIII12x")
 _FORMAT_DESCRIPTION = Struct("III32sII12x")
 _FORMAT = Struct("I0P12I152x0P")
 _REQUEST_BUFFERS = Struct("IIIIB3x")
-_BUFFER = Struct("IIIII0lllIIBBBB4sII0LI0LIIi0l")
+_BUFFER = Struct("IIIII0lll16xII0LI0LI8x0l")
 _INTEGER = Struct("i")
 _PARAMETERS = Struct("I10I160x")
 _CONTROL = Struct("Ii")
@@ -131,57 +130,21 @@ class PixelLayout(NamedTuple):
     size: int
 
 
-class Buffer(NamedTuple):
-    """``struct v4l2_buffer``."""
-
-    index: int
-    type: int
-    used: int
-    flags: int
-    field: int
-    seconds: int
-    microseconds: int
-    timecode: tuple[object, ...]
-    sequence: int
-    memory: int
-    offset: int
-    length: int
-
-    @classmethod
-    def of(cls, argument: bytearray) -> Buffer:
-        """Read one."""
-        fields = _BUFFER.unpack(argument)
-        return cls(*fields[:7], fields[7:14], *fields[14:18])
+FULL_BUFFER: Final = Struct("I4xII4x0lll16xI0l")
+"""Of a buffer that was taken: its place, bytes, flags, seconds, microseconds, and number."""
 
 
 def new_buffer(index: int) -> bytearray:
     """Return the argument that asks for a buffer, or for any."""
     argument = bytearray(_BUFFER.size)
-    _BUFFER.pack_into(
-        argument,
-        0,
-        index,
-        CAPTURE,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        b"",
-        0,
-        MEMORY_MMAP,
-        0,
-        0,
-        0,
-        0,
-    )
+    _BUFFER.pack_into(argument, 0, index, CAPTURE, 0, 0, 0, 0, 0, 0, MEMORY_MMAP, 0, 0)
     return argument
+
+
+def offset_and_length(argument: bytearray) -> tuple[int, int]:
+    """Return where a buffer is mapped, and its bytes."""
+    offset, length = _BUFFER.unpack(argument)[9:11]
+    return offset, length
 
 
 def text(raw: bytes) -> str:

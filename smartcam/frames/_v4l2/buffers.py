@@ -3,19 +3,39 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames._v4l2 import abi, system
-from smartcam.frames._v4l2.abi import Buffer
 
 if TYPE_CHECKING:
     import mmap
 
     from smartcam.frames._v4l2.device import Device
 
-LEAST = 2
+LEAST: Final = 2
 """Buffers: one that is written while another one is read."""
+
+
+_unpack: Final = abi.FULL_BUFFER.unpack_from
+
+
+class Full(NamedTuple):
+    """What was in a buffer.
+
+    Attributes:
+        data: a copy, the only one that is made; of a buffer with an error it is empty.
+        used: bytes that the driver says it wrote.
+        flags: of V4L2.
+        seconds: of its time stamp.
+        sequence: the driver's number of the frame.
+    """
+
+    data: bytes
+    used: int
+    flags: int
+    seconds: float
+    sequence: int
 
 
 class Buffers:
@@ -32,6 +52,7 @@ class Buffers:
     def __init__(self, device: Device, count: int) -> None:
         self._device = device
         self._pages: list[mmap.mmap] = []
+        self._argument = abi.new_buffer(0)  # of one call after the other
         try:
             given = device.ask(
                 abi.REQBUFS, count, abi.CAPTURE, abi.MEMORY_MMAP, tried="asking for buffers"
@@ -51,24 +72,19 @@ class Buffers:
     def __len__(self) -> int:
         return len(self._pages)
 
-    def take(self) -> tuple[Buffer, bytes]:
-        """Return what the driver wrote into the oldest buffer that is full; queue it again.
-
-        Returns:
-            The bytes are a copy: the only one that is made. Of a buffer with an error it is empty.
+    def take(self) -> Full:
+        """Take the oldest picture that is there out of its buffer; the driver gets the buffer back.
 
         Raises:
-            BlockingIOError: none is full.
+            BlockingIOError: none is there.
             OSError: the device is gone, or its driver gave up.
         """
-        argument = abi.new_buffer(0)
-        number = self._device.number
+        argument, number = self._argument, self._device.number
         system.ioctl(number, abi.DQBUF, argument)
-        buffer = Buffer.of(argument)
-        pages = self._pages[buffer.index]
-        data = b"" if buffer.flags & abi.BUF_ERROR else pages[: buffer.used]
+        place, used, flags, seconds, microseconds, sequence = _unpack(argument)
+        data = b"" if flags & abi.BUF_ERROR else self._pages[place][:used]
         system.ioctl(number, abi.QBUF, argument)
-        return buffer, data
+        return Full(data, used, flags, seconds + microseconds / 1e6, sequence)
 
     def release(self) -> None:
         """Stop the stream and give the buffers back: others may use the device."""
@@ -85,8 +101,8 @@ class Buffers:
         argument = abi.new_buffer(index)
         try:
             system.ioctl(device.number, abi.QUERYBUF, argument)
-            buffer = Buffer.of(argument)
-            self._pages.append(system.pages(device.number, buffer.length, buffer.offset))
+            offset, length = abi.offset_and_length(argument)
+            self._pages.append(system.pages(device.number, length, offset))
             system.ioctl(device.number, abi.QBUF, argument)
         except (OSError, ValueError) as exc:
             raise FrameSourceError(

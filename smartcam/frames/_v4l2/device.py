@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -127,9 +128,8 @@ class Device:
         """Return the driver's answer, or raise its OSError."""
         layout = request.layout
         argument = bytearray(layout.size)
-        given = abi.Struct(f"{len(fields)}I") if fields else None
-        if given is not None:  # the fields that are asked with stand in front, each of 32 bits
-            given.pack_into(argument, 0, *fields)
+        # the fields that are asked with stand in front, each of 32 bits
+        struct.pack_into(f"{len(fields)}I", argument, 0, *fields)
         system.ioctl(self.number, request, argument)
         return layout.unpack(argument)
 

@@ -45,7 +45,9 @@ class Stamps:
         self._name = name
         self._told = period
         self._began = self._empty = began
-        self._last: tuple[float, int] | None = None  # stamp and number of the frame before
+        # stamp and number of the frame before; none is from long before the stream began
+        self._last: tuple[float, int | None] = (began - 2 * (period or UNTOLD), None)
+        self.is_newest = False  # the last one that was read: no later one can be there yet
         self._doubted = False
 
     def queue_is_empty(self, now: float) -> None:
@@ -61,27 +63,26 @@ class Stamps:
             number: of the frame, counted on over lost ones.
             now: seconds of ``time.monotonic()``.
         """
+        self.is_newest = False
         kind = flags & abi.TIMESTAMP_MASK
         if kind != abi.TIMESTAMP_MONOTONIC:
             return self._arrived(now, seconds if kind == abi.TIMESTAMP_COPY else None)
-        last = self._last
-        period = self._period(seconds, number)
         starts = flags & abi.TSTAMP_SRC_MASK == abi.TSTAMP_SRC_SOE
-        early = last[0] if last is not None else self._began - 2 * period
-        if not early < seconds <= (now if starts else now + (self._told or UNTOLD)):
+        period = self._told or UNTOLD
+        last, then = self._last
+        if not last < seconds <= (now if starts else now + period):
             self._doubt(seconds, now)
             return self._arrived(now, seconds)
         self._last = (seconds, number)
+        self.is_newest = now - seconds < (self._told or 0.0)
+        if self.is_newest:
+            self._empty = now
         if starts:
             return Stamp(seconds, Moment.EXPOSURE_START, 0.0, None)
+        if then is not None:
+            period = max(self._told or 0.0, (seconds - last) / max(1, number - then))
         # some drivers stamp with the end that they expect; a frame that is here has ended
         return Stamp(min(seconds, now), Moment.FRAME_END, 2 * period, None)
-
-    def _period(self, seconds: float, number: int) -> float:
-        seen = 0.0
-        if self._last is not None:
-            seen = (seconds - self._last[0]) / max(1, number - self._last[1])
-        return max(self._told or 0.0, seen) or UNTOLD
 
     def _arrived(self, now: float, device_time: float | None) -> Stamp:
         duration = now - self._empty + 2 * (self._told or UNTOLD)

@@ -14,7 +14,7 @@ from smartcam.frames._v4l2.stamps import Stamps
 
 if TYPE_CHECKING:
     from smartcam.frames._driver import FrameSink
-    from smartcam.frames._v4l2.abi import Buffer
+    from smartcam.frames._v4l2.buffers import Full
     from smartcam.frames._v4l2.device import Device, Setting
 
 BAD_IN_A_ROW: Final = 30
@@ -71,50 +71,55 @@ class Stream:
         """
         for _ in range(len(self._buffers)):
             try:
-                buffer, data = self._buffers.take()
+                full = self._buffers.take()
             except BlockingIOError:
                 self._stamps.queue_is_empty(system.now())
-                break
+                self._none_was_there()
+                return
             except OSError as exc:
                 raise failure(self._name, "taking a picture", exc) from exc
             self._empty = 0
-            self._deliver(buffer, data, sink)
+            frame = self._frame(full, sink)
+            if frame is not None:
+                sink.frame(frame)
+                if self._stamps.is_newest:
+                    return
+
+    def _frame(self, full: Full, sink: FrameSink) -> Frame | None:
+        """Return what was in a buffer as a frame; what is none counts as lost."""
+        steps = self._steps(full.sequence)
+        if len(full.data) < self._least:
+            sink.lost(steps)
+            self._bad += 1
+            if self._bad >= BAD_IN_A_ROW:
+                raise self._no_pictures(full)
+            return None
+        self._bad = 0
+        now, utc = system.now(), time.time()
+        stamp = self._stamps.read(full.seconds, full.flags, self._number, now)
+        return Frame(
+            data=full.data,
+            format=self._setting.format,
+            width=self._setting.layout.width,
+            height=self._setting.layout.height,
+            stride=self._stride,
+            captured=stamp.captured,
+            utc=utc - (now - stamp.captured),
+            moment=stamp.moment,
+            duration=stamp.duration,
+            device_time=stamp.device_time,
+            sequence=self._number,
+            lost=steps - 1,
+            source=self._name,
+        )
+
+    def _none_was_there(self) -> None:
         self._empty += 1
         if self._empty > EMPTY_IN_A_ROW:
             raise FrameSourceError(
                 f"{self._name}: its driver says that a picture is there, and gives none",
                 source=self._name,
             )
-
-    def _deliver(self, buffer: Buffer, data: bytes, sink: FrameSink) -> None:
-        steps = self._steps(buffer.sequence)
-        if len(data) < self._least:
-            sink.lost(steps)
-            self._bad += 1
-            if self._bad >= BAD_IN_A_ROW:
-                raise self._no_pictures(buffer)
-            return
-        self._bad = 0
-        now, utc = system.now(), time.time()
-        seconds = buffer.seconds + buffer.microseconds / 1e6
-        stamp = self._stamps.read(seconds, buffer.flags, self._number, now)
-        sink.frame(
-            Frame(
-                data=data,
-                format=self._setting.format,
-                width=self._setting.layout.width,
-                height=self._setting.layout.height,
-                stride=self._stride,
-                captured=stamp.captured,
-                utc=utc - (now - stamp.captured),
-                moment=stamp.moment,
-                duration=stamp.duration,
-                device_time=stamp.device_time,
-                sequence=self._number,
-                lost=steps - 1,
-                source=self._name,
-            )
-        )
 
     def _steps(self, sequence: int) -> int:
         """Return how many frames on it is; a driver that does not count has none lost."""
@@ -127,12 +132,12 @@ class Stream:
         self._number += steps
         return steps
 
-    def _no_pictures(self, buffer: Buffer) -> FrameFormatError:
+    def _no_pictures(self, full: Full) -> FrameFormatError:
         setting = self._setting
-        came = "an error of the device" if buffer.flags & abi.BUF_ERROR else f"{buffer.used} bytes"
+        came = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
         return FrameFormatError(
             f"{self._name}: expected {setting.format.name} {setting.layout.width}x"
-            f"{setting.layout.height}, {self._least} bytes or more, {self._bad} times in a row came "
-            f"{came}",
+            f"{setting.layout.height}, {self._least} bytes or more, got {came} {self._bad} times "
+            "in a row",
             source=self._name,
         )
