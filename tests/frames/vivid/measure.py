@@ -16,7 +16,6 @@ from contextlib import AsyncExitStack
 import smartcam.frames
 
 SECONDS = 5.0
-F = 0
 URL = "v4l2:///dev/video{}?format=YUYV&size=640x480&fps=25"
 
 
@@ -35,9 +34,9 @@ def cost(frames: int, began: tuple[float, float]) -> tuple[int, float]:
 async def ours(cameras: int, seconds: float) -> tuple[int, float]:
     """Read cameras at once, each by one reader."""
 
-    async def read(source: smartcam.frames.FrameSource) -> int:
-        count, end = 0, time.monotonic() + seconds
-        async for frame in source:
+    async def read(reader: smartcam.frames.FrameReader, end: float) -> int:
+        count = 0
+        async for frame in reader:
             count += len(frame.data) == 614400
             if time.monotonic() > end:
                 break
@@ -48,10 +47,12 @@ async def ours(cameras: int, seconds: float) -> tuple[int, float]:
             await stack.enter_async_context(smartcam.frames.open(URL.format(one)))
             for one in range(cameras)
         ]
-        for one in sources:
+        readers = [one.reader() for one in sources]
+        for one in readers:
             await one.newest()
         began = time.monotonic(), time.process_time()
-        return cost(sum(await asyncio.gather(*(read(one) for one in sources))), began)
+        end = began[0] + seconds
+        return cost(sum(await asyncio.gather(*(read(one, end) for one in readers))), began)
 
 
 async def idle(seconds: float) -> tuple[int, float]:
