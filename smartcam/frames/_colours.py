@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["COLOURS", "MATRICES", "Colours", "Matrix", "yuv_to_rgb"]
 
 FRACTION: Final = 16
 """Bits behind the point of the sums below."""
@@ -38,6 +37,7 @@ MATRICES: Final = {
     "601": Matrix(0.299, 0.114, full=False),
     "601 full": Matrix(0.299, 0.114, full=True),
     "709": Matrix(0.2126, 0.0722, full=False),
+    "709 full": Matrix(0.2126, 0.0722, full=True),
 }
 """ITU-R BT.601 as V4L2 takes it for cameras, as JPEG has it, and BT.709 as in HD video."""
 

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["decode_jpeg", "jpeg_header"]
 
 HARMLESS: Final = "extraneous bytes before marker 0xd9"
 """What libjpeg says of bytes between the whole picture and its end mark; some cameras send them."""

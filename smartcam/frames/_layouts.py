@@ -16,8 +16,6 @@ from smartcam.frames._unpacking import Packing, unpack
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Compressed", "Jpeg", "Layout", "Picture", "Planes", "Samples", "YuvPairs"]
-
 
 class Picture(NamedTuple):
     """The bytes of a frame and what is said of them.

@@ -176,18 +176,21 @@ PIXEL_FORMATS: Final = (
     _pairs("YCbCr601_422_8_CbYCrY", "", 0x02100044, 1, "601"),
     _pairs("YCbCr709_422_8", "", 0x02100041, 0, "709"),
     _pairs("YCbCr709_422_8_CbYCrY", "", 0x02100045, 1, "709"),
-    _planes("NV12", "NV12", 2, 2, "601"),
-    _planes("NV12_full", "", 2, 2, "601 full"),
-    _planes("NV12_709", "", 2, 2, "709"),
-    _planes("I420", "YU12", 2, 2, "601"),
-    _planes("I420_full", "", 2, 2, "601 full"),
-    _planes("I420_709", "", 2, 2, "709"),
-    _planes("I422", "422P", 2, 1, "601"),
-    _planes("I422_full", "", 2, 1, "601 full"),
-    _planes("I422_709", "", 2, 1, "709"),
-    _planes("I444", "", 1, 1, "601"),
-    _planes("I444_full", "", 1, 1, "601 full"),
-    _planes("I444_709", "", 1, 1, "709"),
+    *(
+        _planes(f"{name}{end}", "" if end else fourcc, across, down, matrix)
+        for name, fourcc, across, down in (
+            ("NV12", "NV12", 2, 2),
+            ("I420", "YU12", 2, 2),
+            ("I422", "422P", 2, 1),
+            ("I444", "", 1, 1),
+        )
+        for end, matrix in (
+            ("", "601"),
+            ("_full", "601 full"),
+            ("_709", "709"),
+            ("_709_full", "709 full"),
+        )
+    ),
     PixelFormat("MJPEG", "MJPG", 0, layout=Jpeg()),
     PixelFormat("PNG", "", 0, 0, 16, layout=Compressed("Codecs.decode")),
     PixelFormat("JPEGXL", "", 0, 0, 16, layout=Compressed("Codecs.decode")),

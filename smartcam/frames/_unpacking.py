@@ -14,8 +14,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["PACKINGS", "Packing", "unpack"]
-
 
 class Part(NamedTuple):
     """Some bits of a pixel: ``(byte >> right & mask) << left``."""
