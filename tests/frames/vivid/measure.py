@@ -22,12 +22,6 @@ URL = "v4l2:///dev/video{}?format=YUYV&size=640x480&fps=25"
 def cost(frames: int, began: tuple[float, float]) -> tuple[int, float]:
     """Return the frames and the percentage of a processor since a beginning."""
     wall, cpu = time.monotonic() - began[0], time.process_time() - began[1]
-    import resource
-
-    global F
-    n = resource.getrusage(0).ru_minflt
-    print("faults", n - F)
-    F = n
     return frames, 100 * cpu / wall
 
 
