@@ -112,21 +112,7 @@ def simple(label: str) -> str:
 
 def list_controls(device: Device) -> dict[str, Control]:
     """Return the controls by their names, in the driver's order."""
-    found: dict[str, Control] = {}
-    number = 0
-    while True:
-        try:
-            answer = device.try_to(abi.QUERY_EXT_CTRL, number | abi.CTRL_NEXT)
-        except OSError as exc:
-            if exc.errno in (errno.EINVAL, errno.ENOTTY):  # that was the last one
-                return found
-            raise failure(device.path, "listing its controls", exc) from exc
-        if answer[0] <= number:  # a driver that goes in circles
-            return found
-        number = answer[0]
-        if answer[1] in KINDS and not answer[7] & abi.CTRL_DISABLED:
-            control = _control(device, answer)
-            found.setdefault(control.name, control)
+    return {name: _control(device, answer) for name, answer in _described(device).items()}
 
 
 def set_control(device: Device, name: str, value: int | str) -> int:
@@ -139,15 +125,10 @@ def set_control(device: Device, name: str, value: int | str) -> int:
         FrameSourceError: there is none of that name, it cannot be set, or takes no such value; it
             lists what there is.
     """
-    controls = list_controls(device)
-    control = controls.get(simple(name))
-    if control is None:
-        raise FrameSourceError(
-            f"{device.path}: no control {name!r}; it has {', '.join(controls) or 'none'}"
-            f"{did_you_mean(simple(name), list(controls))}",
-            source=device.path,
-            available=tuple(map(str, controls.values())),
-        )
+    answer = _described(device).get(simple(name))
+    if answer is None:
+        raise _unknown(device, name)
+    control = _control(device, answer)
     number = control.number_of(value)
     if number is None or control.flags & abi.CTRL_READ_ONLY:
         expected = control.range if number is None else "nothing, since it is read-only"
@@ -162,6 +143,34 @@ def set_control(device: Device, name: str, value: int | str) -> int:
     if got != number and not control.flags & (abi.CTRL_VOLATILE | abi.CTRL_EXECUTE_ON_WRITE):
         raise _refusal(device, control, f"set to {number}, the device has it at {got}")
     return got
+
+
+def _described(device: Device) -> dict[str, tuple[Any, ...]]:
+    """Return the driver's descriptions by name; no value is read, which may take a camera long."""
+    found: dict[str, tuple[Any, ...]] = {}
+    number = 0
+    while True:
+        try:
+            answer = device.try_to(abi.QUERY_EXT_CTRL, number | abi.CTRL_NEXT)
+        except OSError as exc:
+            if exc.errno in (errno.EINVAL, errno.ENOTTY):  # that was the last one
+                return found
+            raise failure(device.path, "listing its controls", exc) from exc
+        if answer[0] <= number:  # a driver that goes in circles
+            return found
+        number = answer[0]
+        if answer[1] in KINDS and not answer[7] & abi.CTRL_DISABLED:
+            found.setdefault(simple(abi.text(answer[2])), answer)
+
+
+def _unknown(device: Device, name: str) -> FrameSourceError:
+    controls = list_controls(device)
+    return FrameSourceError(
+        f"{device.path}: no control {name!r}; it has {', '.join(controls) or 'none'}"
+        f"{did_you_mean(simple(name), list(controls))}",
+        source=device.path,
+        available=tuple(map(str, controls.values())),
+    )
 
 
 def _refusal(device: Device, control: Control, text: str) -> FrameSourceError:

@@ -162,7 +162,7 @@ def run(script: Path, arguments: Iterable[str], out: Path, timeout: float) -> tu
     (out / "initial").write_bytes(initial_files())
     shared = "local,security_model=none"
     machine = [
-        "qemu-system-x86_64", "-accel", "tcg", "-cpu", os.environ.get("QCPU","max"), *os.environ.get("QX","").split(), "-smp", "1", "-m", "768",
+        "qemu-system-x86_64", "-accel", "tcg", "-cpu", os.environ.get("QCPU","max"), *os.environ.get("QX","-icount shift=1,sleep=on").split(), "-smp", "1", "-m", "768",
         "-nodefaults", "-display", "none", "-serial", "stdio", "-no-reboot",
         "-kernel", str(CACHE / "vmlinuz"), "-initrd", str(out / "initial"),
         "-append", "console=ttyS0 quiet panic=-1 mitigations=off nokaslr random.trust_cpu=on",
@@ -193,7 +193,7 @@ def main(arguments: list[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         status, said = run(Path(arguments[1]).resolve(), arguments[2:], Path(folder), 300)
         print(said)
-        for one in Path(folder).glob("result*"):
+        for one in Path(folder).glob("*.json"):
             shutil.copy(one, os.environ.get("OUT", "."))
     return status
 

@@ -1,0 +1,30 @@
+"""Writes the table of the fast tests anew, in the machine with video devices::
+
+OUT=tests/frames/v4l2 python -m tests.frames.vivid.machine run tests/frames/vivid/record.py
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import smartcam.frames
+from smartcam.frames._v4l2 import abi, discovery, system
+from tests.frames.v4l2.conversations import WRAPPED, Recorder
+from tests.frames.v4l2.scenarios import SCENARIOS
+
+
+async def record() -> None:
+    await smartcam.frames.discover("v4l2")  # what it imports comes from the other computer
+    recorder = Recorder()
+    few = {code: discovery.FORMATS[code] for code in (abi.fourcc("GREY"), abi.fourcc("YUYV"))}
+    discovery.FORMATS = few  # type: ignore[misc]
+    for name in WRAPPED:
+        setattr(system, name, getattr(recorder, name))
+    for name, scenario in SCENARIOS.items():
+        recorder.begin(name)
+        await scenario()
+    Path("/run/out/vivid.json").write_text(recorder.table())
+
+
+asyncio.run(record())
