@@ -38,7 +38,7 @@ class Answer(NamedTuple):
     """Of a picture that was taken: when, seconds of the monotonic clock."""
 
 
-def digits(data: bytes) -> str:
+def digits(data: bytes | bytearray) -> str:
     return data.rstrip(b"\0").hex()
 
 
@@ -125,8 +125,8 @@ class Replay:
 
     def __init__(self, scenario: str) -> None:
         table = json.loads(TABLE.read_text())
-        answers = [Answer(*one) for one in table["answers"]]
-        self.left = [answers[one] for one in reversed(table["scenarios"][scenario])]
+        answers: list[Answer] = [Answer(*one) for one in table["answers"]]
+        self.left: list[Answer] = [answers[one] for one in reversed(table["scenarios"][scenario])]
         self.devices: set[int] = set()
         self.mapped: list[Pages] = []
         self.taken: list[bytes] = []

@@ -9,11 +9,14 @@ from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FoundSource, Frame, FrameReader
 from smartcam.frames._v4l2 import abi
 from smartcam.frames._v4l2.controls import Control
-from smartcam.frames._v4l2.device import Device
+from smartcam.frames._v4l2.device import FORMATS, Device
 from smartcam.frames._v4l2.driver import V4L2Driver
 
 URL = "v4l2:///dev/video0?format=YUYV&size=320x180&fps=25"
 
+
+FEW = {abi.fourcc(one): FORMATS[abi.fourcc(one)] for one in ("GREY", "YUYV")}
+"""Formats that are counted up when cameras are looked for: all would make a long table."""
 
 CONTROLS = {
     "timestamp_source": 0xF0F018,

@@ -11,7 +11,7 @@ import pytest
 
 import smartcam.frames
 from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
-from smartcam.frames import FrameSource, Moment
+from smartcam.frames import Moment
 from smartcam.frames._v4l2 import abi, discovery, stream, system
 from tests.frames.v4l2 import scenarios
 from tests.frames.v4l2.conversations import WRAPPED, Replay
@@ -166,8 +166,7 @@ async def test_controls_have_ranges_menus_and_values(play: Player) -> None:
 async def test_cameras_are_found_and_other_devices_left_out(
     play: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = {abi.fourcc(one): discovery.FORMATS[abi.fourcc(one)] for one in ("GREY", "YUYV")}
-    monkeypatch.setattr(discovery, "FORMATS", few)
+    monkeypatch.setattr(discovery, "FORMATS", scenarios.FEW)
     replay = play("found")
     found = await scenarios.found()
     whole(replay)
@@ -204,12 +203,9 @@ def changed(replay: Replay, monkeypatch: pytest.MonkeyPatch, **fields: int) -> N
     monkeypatch.setattr(system, "ioctl", ioctl)
 
 
-async def _reading(
-    expected: type[Exception], count: int = 3, source: FrameSource | None = None
-) -> str:
+async def _reading(expected: type[Exception]) -> str:
     with pytest.raises(expected) as caught:
-        async with smartcam.frames.open(scenarios.URL) as source, source.reader() as reader:
-            await scenarios.take(reader, count)
+        await scenarios.stream()
     return str(caught.value)
 
 

@@ -2,7 +2,8 @@
 
     python -m tests.frames.vivid.machine run tests/frames/vivid/measure.py
 
-``... measure.py ours`` runs without OpenCV, and ``... measure.py seconds=3`` for so long each.
+That counts instructions; with ``clock run`` it is the time that they took, of what a busy computer
+leaves. ``... measure.py ours`` runs without OpenCV, ``... measure.py seconds=3`` for so long each.
 """
 
 from __future__ import annotations
@@ -96,7 +97,10 @@ def main(arguments: list[str]) -> None:
     for turn in range(2):
         for name, measure in kinds.items():
             frames, percent = measure()
-            print(f"{turn}  {name:24} {frames / seconds:6.1f} frames/s {percent:6.2f} % CPU")
+            sys.stdout.write(
+                f"{turn}  {name:24} {frames / seconds:6.1f} frames/s {percent:6.2f} % CPU\n"
+            )
+            sys.stdout.flush()
 
 
 if __name__ == "__main__":
