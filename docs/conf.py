@@ -29,7 +29,14 @@ import smartcam
 from smartcam._client.handshake import load_protocol
 from smartcam.calibration._files.storage import Stored
 from smartcam.emulator import Quirks
-from smartcam.fleet._file import CameraEntry, Emulated, FleetFile, History, Retry
+from smartcam.fleet._file import (
+    CameraEntry,
+    Emulated,
+    FleetFile,
+    FramesEntry,
+    History,
+    Retry,
+)
 from smartcam.protocols._base import POLICIES
 from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
 from smartcam.protocols._framed.dialect import MAX_SURPLUS
@@ -436,6 +443,11 @@ def fleet_emulated() -> str:
     return _fields(Emulated)
 
 
+def fleet_frames() -> str:
+    """Return those of its ``frames``."""
+    return _fields(FramesEntry)
+
+
 def fleet_reconnect() -> str:
     """Return those of its ``reconnect``."""
     return _fields(Retry)
@@ -542,7 +554,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, settings, transitions, policies, layers, limits),
-        *(fleet_file, fleet_camera, fleet_emulated, fleet_reconnect, fleet_history),
+        *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
     )
 }
 """What ``{generated}`` knows."""

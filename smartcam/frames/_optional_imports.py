@@ -24,5 +24,5 @@ def load(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as exc:
-        reason, extra = EXTRAS[name]
+        reason, extra = EXTRAS[name.partition(".")[0]]
         raise MissingExtraError(f'{reason}: pip install "smartcam[{extra}]"', extra=extra) from exc

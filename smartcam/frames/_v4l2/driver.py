@@ -48,6 +48,8 @@ class V4L2Driver(FrameDriver):
       ``control.brightness=10``, ``control.power_line_frequency=50_hz``. The name is its label in
       small letters with underscores, the value a number, a menu's label, or ``on`` and ``off``.
 
+    ``source.driver`` has :meth:`controls` and :meth:`set_control` for the time in between.
+
     While nothing is read from it, the device is closed: another program can use it. Each frame's
     bytes are copied out of the driver's buffer once. One that is replaced before a reader took it
     has been copied, too: to know that before, buffers would have to be kept from the driver, which

@@ -146,7 +146,7 @@ async def in_use() -> FrameSourceError:
 
 async def controls() -> tuple[dict[str, Control], list[int], FrameSourceError]:
     async with smartcam.frames.open(URL) as source:
-        driver = source._driver
+        driver = source.driver
         assert isinstance(driver, V4L2Driver)
         found = await driver.controls()
         values = [

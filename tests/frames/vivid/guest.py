@@ -309,7 +309,7 @@ async def what_a_device_has_not_is_listed() -> None:
 @check
 async def controls_are_listed_set_and_bounded() -> None:
     async with smartcam.frames.open(f"{URL.format(0)}&control.brightness=0x21") as source:
-        driver = source._driver
+        driver = source.driver
         assert isinstance(driver, V4L2Driver)
         controls = await driver.controls()
         assert str(controls["brightness"]) == "brightness: 0 to 255; default 128, now 33"
