@@ -16,7 +16,7 @@ WRITE: Final = 1
 READ: Final = 2
 
 
-class Request(NamedTuple):
+class Ioctl(NamedTuple):
     """An ioctl.
 
     Attributes:
@@ -30,8 +30,8 @@ class Request(NamedTuple):
     layout: Struct
 
 
-def _request(name: str, number: int, direction: int, layout: Struct) -> Request:
-    return Request(name, direction << 30 | layout.size << 16 | ord("V") << 8 | number, layout)
+def _request(name: str, number: int, direction: int, layout: Struct) -> Ioctl:
+    return Ioctl(name, direction << 30 | layout.size << 16 | ord("V") << 8 | number, layout)
 
 
 POINTER: Final = Struct("P").size
@@ -119,7 +119,7 @@ class Capability(NamedTuple):
     device_caps: int
 
 
-class PixelLayout(NamedTuple):
+class BufferLayout(NamedTuple):
     """``struct v4l2_format`` of one plane, as far as it is of interest."""
 
     width: int

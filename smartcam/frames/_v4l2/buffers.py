@@ -11,7 +11,7 @@ from smartcam.frames._v4l2 import abi, system
 if TYPE_CHECKING:
     import mmap
 
-    from smartcam.frames._v4l2.device import Device
+    from smartcam.frames._v4l2.device import CaptureDevice
 
 LEAST: Final = 2
 """Buffers: one that is written while another one is read."""
@@ -49,7 +49,7 @@ class Buffers:
         FrameSourceError: it is in use, or has no memory; nothing streams.
     """
 
-    def __init__(self, device: Device, count: int) -> None:
+    def __init__(self, device: CaptureDevice, count: int) -> None:
         self._device = device
         self._pages: list[mmap.mmap] = []
         self._argument = abi.new_buffer(0)  # of one call after the other

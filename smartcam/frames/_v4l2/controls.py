@@ -16,7 +16,7 @@ from smartcam.frames._v4l2.device import failure
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.frames._v4l2.device import Device
+    from smartcam.frames._v4l2.device import CaptureDevice
 
 KINDS: Final = {
     abi.CTRL_INTEGER: "integer",
@@ -32,7 +32,7 @@ SWITCHES: Final = {"on": 1, "true": 1, "yes": 1, "off": 0, "false": 0, "no": 0}
 
 
 @dataclass(frozen=True, slots=True)
-class Control:
+class DeviceControl:
     """A control of a device.
 
     Attributes:
@@ -110,12 +110,12 @@ def simple(label: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
 
 
-def list_controls(device: Device) -> dict[str, Control]:
+def list_controls(device: CaptureDevice) -> dict[str, DeviceControl]:
     """Return the controls by their names, in the driver's order."""
     return {name: _control(device, answer) for name, answer in _described(device).items()}
 
 
-def set_control(device: Device, name: str, value: int | str) -> int:
+def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
     """Set a control.
 
     Returns:
@@ -145,7 +145,7 @@ def set_control(device: Device, name: str, value: int | str) -> int:
     return got
 
 
-def _described(device: Device) -> dict[str, tuple[Any, ...]]:
+def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
     """Return the driver's descriptions by name; no value is read, which may take a camera long."""
     found: dict[str, tuple[Any, ...]] = {}
     number = 0
@@ -163,7 +163,7 @@ def _described(device: Device) -> dict[str, tuple[Any, ...]]:
             found.setdefault(simple(abi.text(answer[2])), answer)
 
 
-def _unknown(device: Device, name: str) -> FrameSourceError:
+def _unknown(device: CaptureDevice, name: str) -> FrameSourceError:
     controls = list_controls(device)
     return FrameSourceError(
         f"{device.path}: no control {name!r}; it has {', '.join(controls) or 'none'}"
@@ -173,7 +173,7 @@ def _unknown(device: Device, name: str) -> FrameSourceError:
     )
 
 
-def _refusal(device: Device, control: Control, text: str) -> FrameSourceError:
+def _refusal(device: CaptureDevice, control: DeviceControl, text: str) -> FrameSourceError:
     return FrameSourceError(
         f"{device.path}: control {control.name}: {text}",
         source=device.path,
@@ -181,12 +181,12 @@ def _refusal(device: Device, control: Control, text: str) -> FrameSourceError:
     )
 
 
-def _control(device: Device, answer: tuple[Any, ...]) -> Control:
+def _control(device: CaptureDevice, answer: tuple[Any, ...]) -> DeviceControl:
     number, kind, label, least, most, step, default, flags = answer[:8]
     menu: dict[int, str] = {}
     if KINDS[kind] == "menu":
         menu = _menu(device, number, kind, range(least, min(most, least + 255) + 1))
-    return Control(
+    return DeviceControl(
         simple(abi.text(label)),
         number,
         KINDS[kind],
@@ -200,7 +200,7 @@ def _control(device: Device, answer: tuple[Any, ...]) -> Control:
     )
 
 
-def _menu(device: Device, number: int, kind: int, places: range) -> dict[int, str]:
+def _menu(device: CaptureDevice, number: int, kind: int, places: range) -> dict[int, str]:
     items: dict[int, str] = {}
     for place in places:
         try:
@@ -214,7 +214,7 @@ def _menu(device: Device, number: int, kind: int, places: range) -> dict[int, st
     return items
 
 
-def _value(device: Device, number: int, flags: int) -> int | None:
+def _value(device: CaptureDevice, number: int, flags: int) -> int | None:
     if flags & abi.CTRL_WRITE_ONLY:
         return None
     try:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.frames._pixels import PixelFormat
-    from smartcam.frames._v4l2.abi import PixelLayout, Request
+    from smartcam.frames._v4l2.abi import BufferLayout, Ioctl
 
 
 FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fourcc}
@@ -55,7 +55,7 @@ def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
     )
 
 
-class Wanted(NamedTuple):
+class WantedSetting(NamedTuple):
     """What is asked of a device; None: as it is."""
 
     format: PixelFormat | None
@@ -73,11 +73,11 @@ class Setting(NamedTuple):
     """
 
     format: PixelFormat
-    layout: PixelLayout
+    layout: BufferLayout
     rate: float | None
 
 
-class Device:
+class CaptureDevice:
     """An open capture device. All of it may wait for the device, and none of it is asynchronous."""
 
     def __init__(self, path: str, number: int) -> None:
@@ -113,7 +113,7 @@ class Device:
         """Name and place of the device; another one has another."""
         return abi.text(self.capability.card), abi.text(self.capability.bus_info)
 
-    def ask(self, request: Request, *fields: object, tried: str = "") -> tuple[Any, ...]:
+    def ask(self, request: Ioctl, *fields: object, tried: str = "") -> tuple[Any, ...]:
         """Return the driver's answer; fields that are not given are 0.
 
         Raises:
@@ -124,7 +124,7 @@ class Device:
         except OSError as exc:
             raise failure(self.path, tried or request.name, exc) from exc
 
-    def try_to(self, request: Request, *fields: object) -> tuple[Any, ...]:
+    def try_to(self, request: Ioctl, *fields: object) -> tuple[Any, ...]:
         """Return the driver's answer, or raise its OSError."""
         layout = request.layout
         argument = bytearray(layout.size)
@@ -133,7 +133,7 @@ class Device:
         system.ioctl(self.number, request, argument)
         return layout.unpack(argument)
 
-    def enumerate(self, request: Request, *fields: object) -> Iterator[tuple[Any, ...]]:
+    def enumerate(self, request: Ioctl, *fields: object) -> Iterator[tuple[Any, ...]]:
         """Return what the driver counts up; nothing where it does not."""
         for index in range(ENOUGH):
             try:
@@ -185,7 +185,7 @@ class Device:
 
     # what it is set to
 
-    def set(self, wanted: Wanted) -> Setting:
+    def set(self, wanted: WantedSetting) -> Setting:
         """Set the device so, and see that it did it.
 
         Raises:
@@ -227,8 +227,8 @@ class Device:
         return (0,) * (abi.POINTER // 4 - 1)
 
     @staticmethod
-    def _layout(answer: tuple[Any, ...]) -> PixelLayout:
-        return abi.PixelLayout(*answer[1:7])
+    def _layout(answer: tuple[Any, ...]) -> BufferLayout:
+        return abi.BufferLayout(*answer[1:7])
 
     def _code(self, wanted: PixelFormat | None, current: int) -> int:
         """Return the fourcc that is to be streamed."""
@@ -248,7 +248,7 @@ class Device:
             available=there,
         )
 
-    def _compare(self, code: int, size: tuple[int, int] | None, got: PixelLayout) -> None:
+    def _compare(self, code: int, size: tuple[int, int] | None, got: BufferLayout) -> None:
         """See that the device took what it was asked for."""
         if got.fourcc != code:
             raise self._no_format(_named(code))
@@ -267,7 +267,7 @@ class Device:
                 source=self.path,
             )
 
-    def _rate(self, wanted: float | None, layout: PixelLayout) -> float | None:
+    def _rate(self, wanted: float | None, layout: BufferLayout) -> float | None:
         """Set the rate, where one is wanted; return what it is."""
         try:
             _, can, _, over, under, *_ = self.try_to(abi.G_PARM, abi.CAPTURE)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames._driver import FoundSource, StreamFormat
 from smartcam.frames._v4l2 import abi, system
-from smartcam.frames._v4l2.device import FORMATS, Device
+from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,7 +26,7 @@ def find() -> list[FoundSource]:
 def _look(path: str, name: str) -> FoundSource | None:
     url = f"v4l2://{path}"
     try:
-        device = Device.open(path)
+        device = CaptureDevice.open(path)
     except FrameSourceError as exc:
         cause = exc.__cause__
         if cause is None:  # it opened, and is no camera
@@ -43,7 +43,7 @@ def _look(path: str, name: str) -> FoundSource | None:
     return FoundSource(url, device.identity[0], known, remark)
 
 
-def _formats(device: Device, code: int) -> Iterator[StreamFormat]:
+def _formats(device: CaptureDevice, code: int) -> Iterator[StreamFormat]:
     known = FORMATS.get(code)
     if known is not None:
         for width, height in device.sizes(code):

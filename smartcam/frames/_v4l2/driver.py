@@ -12,16 +12,16 @@ from smartcam.exceptions import FrameSourceError, LocalProtocolError
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._pixels import find_format
 from smartcam.frames._v4l2.controls import list_controls, set_control
-from smartcam.frames._v4l2.device import Device, Wanted
+from smartcam.frames._v4l2.device import CaptureDevice, WantedSetting
 from smartcam.frames._v4l2.discovery import find
-from smartcam.frames._v4l2.stream import Stream
+from smartcam.frames._v4l2.stream import CaptureStream
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FoundSource, FrameSink
-    from smartcam.frames._v4l2.controls import Control
+    from smartcam.frames._v4l2.controls import DeviceControl
     from smartcam.frames._v4l2.device import Setting
 
 Value = TypeVar("Value")
@@ -71,7 +71,7 @@ class V4L2Driver(FrameDriver):
         self._path = address.path
         if address.host or self._path in ("", "/"):
             raise address.wrong("path", "a device, as in v4l2:///dev/video0", address.shown)
-        self._wanted = Wanted(
+        self._wanted = WantedSetting(
             find_format(said["format"]) if "format" in said else None,
             address.size(said["size"]) if "size" in said else None,
             address.number("fps", said["fps"], 0.001, 100_000) if "fps" in said else None,
@@ -84,7 +84,7 @@ class V4L2Driver(FrameDriver):
             name.removeprefix(CONTROL): said[name] for name in controls if name in said
         }
         self._identity: tuple[str, str] | None = None
-        self._stream: Stream | None = None  # the thread's, but for taking frames out
+        self._stream: CaptureStream | None = None  # the thread's, but for taking frames out
         self._watched: int | None = None
         self._thread: ThreadPoolExecutor | None = None
 
@@ -123,7 +123,7 @@ class V4L2Driver(FrameDriver):
             if thread is not None:
                 thread.shutdown(wait=False)
 
-    async def controls(self) -> dict[str, Control]:
+    async def controls(self) -> dict[str, DeviceControl]:
         """Return what can be set at the device, by name.
 
         Raises:
@@ -148,7 +148,7 @@ class V4L2Driver(FrameDriver):
 
     # in the event loop
 
-    def _ready(self, stream: Stream, sink: FrameSink) -> None:
+    def _ready(self, stream: CaptureStream, sink: FrameSink) -> None:
         try:
             stream.drain(sink)
         except FrameSourceError as exc:
@@ -180,21 +180,21 @@ class V4L2Driver(FrameDriver):
     # in the thread
 
     def _try(self) -> StreamFormat:
-        with closing(Device.open(self._path)) as device:
+        with closing(CaptureDevice.open(self._path)) as device:
             setting = self._set(device)
             self._identity = device.identity
         rates = () if setting.rate is None else (setting.rate,)
         size = (setting.layout.width, setting.layout.height)
-        self._wanted = Wanted(setting.format, size, self._wanted.rate)  # so it stays
+        self._wanted = WantedSetting(setting.format, size, self._wanted.rate)  # so it stays
         return StreamFormat(setting.format, *size, rates)
 
-    def _begin(self) -> Stream:
-        device = Device.open(self._path)
+    def _begin(self) -> CaptureStream:
+        device = CaptureDevice.open(self._path)
         try:
             if device.identity != self._identity:
                 raise self._another(device)
             setting = self._set(device)
-            self._stream = Stream(device, setting, self._buffers, self.name)
+            self._stream = CaptureStream(device, setting, self._buffers, self.name)
         except BaseException:
             device.close()
             raise
@@ -205,18 +205,18 @@ class V4L2Driver(FrameDriver):
         if stream is not None:
             stream.close()
 
-    def _set(self, device: Device) -> Setting:
+    def _set(self, device: CaptureDevice) -> Setting:
         for name, value in self._controls.items():
             set_control(device, name, value)
         return device.set(self._wanted)
 
-    def _with_device(self, job: Callable[[Device], Value]) -> Value:
+    def _with_device(self, job: Callable[[CaptureDevice], Value]) -> Value:
         if self._stream is not None:
             return job(self._stream.device)
-        with closing(Device.open(self._path)) as device:
+        with closing(CaptureDevice.open(self._path)) as device:
             return job(device)
 
-    def _another(self, device: Device) -> FrameSourceError:
+    def _another(self, device: CaptureDevice) -> FrameSourceError:
         expected, got = (
             "nothing" if one is None else " at ".join(one)
             for one in (self._identity, device.identity)

@@ -14,7 +14,7 @@ UNTOLD: Final = 1.0
 """Seconds that a frame is taken to last where neither driver nor frames tell."""
 
 
-class Stamp(NamedTuple):
+class BufferStamp(NamedTuple):
     """When a frame was taken; as in :class:`smartcam.frames.Frame`."""
 
     captured: float
@@ -23,7 +23,7 @@ class Stamp(NamedTuple):
     device_time: float | None
 
 
-class Stamps:
+class BufferStamps:
     """The time stamps of one stream.
 
     A stamp of the monotonic clock is the start of the exposure or the end of the frame, as its
@@ -54,7 +54,7 @@ class Stamps:
         """Take that all frames so far were taken out."""
         self._empty = now
 
-    def read(self, seconds: float, flags: int, number: int, now: float) -> Stamp:
+    def read(self, seconds: float, flags: int, number: int, now: float) -> BufferStamp:
         """Return when the frame with that number was taken.
 
         Args:
@@ -78,15 +78,15 @@ class Stamps:
         if self.is_newest:
             self._empty = now
         if starts:
-            return Stamp(seconds, Moment.EXPOSURE_START, 0.0, None)
+            return BufferStamp(seconds, Moment.EXPOSURE_START, 0.0, None)
         if then is not None:
             period = max(self._told or 0.0, (seconds - last) / max(1, number - then))
         # some drivers stamp with the end that they expect; a frame that is here has ended
-        return Stamp(min(seconds, now), Moment.FRAME_END, 2 * period, None)
+        return BufferStamp(min(seconds, now), Moment.FRAME_END, 2 * period, None)
 
-    def _arrived(self, now: float, device_time: float | None) -> Stamp:
+    def _arrived(self, now: float, device_time: float | None) -> BufferStamp:
         duration = now - self._empty + 2 * (self._told or UNTOLD)
-        return Stamp(now, Moment.ARRIVAL, duration, device_time)
+        return BufferStamp(now, Moment.ARRIVAL, duration, device_time)
 
     def _doubt(self, seconds: float, now: float) -> None:
         if not self._doubted:

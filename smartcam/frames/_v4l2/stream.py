@@ -10,12 +10,12 @@ from smartcam.frames._frame import Frame
 from smartcam.frames._v4l2 import abi, system
 from smartcam.frames._v4l2.buffers import Buffers
 from smartcam.frames._v4l2.device import failure
-from smartcam.frames._v4l2.stamps import Stamps
+from smartcam.frames._v4l2.stamps import BufferStamps
 
 if TYPE_CHECKING:
     from smartcam.frames._driver import FrameSink
     from smartcam.frames._v4l2.buffers import Full
-    from smartcam.frames._v4l2.device import Device, Setting
+    from smartcam.frames._v4l2.device import CaptureDevice, Setting
 
 BAD_IN_A_ROW: Final = 30
 """Buffers without a picture after which the stream ends: there is no use in waiting."""
@@ -27,7 +27,7 @@ HALF: Final = 1 << 31
 """Of the numbers of frames, which are of 32 bits: more than that onwards is backwards."""
 
 
-class Stream:
+class CaptureStream:
     """The frames of a device that was set.
 
     Args:
@@ -40,7 +40,7 @@ class Stream:
         FrameSourceError: it does not stream; the device is still the caller's.
     """
 
-    def __init__(self, device: Device, setting: Setting, buffers: int, name: str) -> None:
+    def __init__(self, device: CaptureDevice, setting: Setting, buffers: int, name: str) -> None:
         self.device = device
         self._setting = setting
         self._name = name
@@ -52,7 +52,7 @@ class Stream:
             if setting.format.compressed
             else setting.format.size(layout.width, layout.height, layout.stride)
         )
-        self._stamps = Stamps(name, period, system.now())
+        self._stamps = BufferStamps(name, period, system.now())
         self._buffers = Buffers(device, buffers)
         self._sequence: int | None = None  # the driver's number of the last frame
         self._number = 0

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from smartcam.frames._v4l2.abi import Request
+    from smartcam.frames._v4l2.abi import Ioctl
 
 
 SYSFS: Final = Path("/sys/class/video4linux")
@@ -26,7 +26,7 @@ def close(device: int) -> None:
     os.close(device)
 
 
-def ioctl(device: int, request: Request, argument: bytearray) -> None:
+def ioctl(device: int, request: Ioctl, argument: bytearray) -> None:
     """Ask the driver; its answer stands in ``argument``."""
     while True:
         try:

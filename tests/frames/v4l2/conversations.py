@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from smartcam.frames._v4l2 import abi, system
-from smartcam.frames._v4l2.abi import Request
+from smartcam.frames._v4l2.abi import Ioctl
 
 TABLE = Path(__file__).with_name("vivid.json")
 WRAPPED = ("open", "close", "ioctl", "pages", "nodes", "now")
@@ -77,7 +77,7 @@ class Recorder:
         self._tell("close", "", 0, "", 0)
         self.real["close"](device)
 
-    def ioctl(self, device: int, request: Request, argument: bytearray) -> None:
+    def ioctl(self, device: int, request: Ioctl, argument: bytearray) -> None:
         given = "" if request.name in STREAM else digits(argument)
         try:
             self.real["ioctl"](device, request, argument)
@@ -149,7 +149,7 @@ class Replay:
         self.devices.remove(device)
         os.close(device)
 
-    def ioctl(self, device: int, request: Request, argument: bytearray) -> None:
+    def ioctl(self, device: int, request: Ioctl, argument: bytearray) -> None:
         with self._lock:
             assert device in self.devices
             if request.name == "DQBUF" and (self._given or not self._picture_is_next()):

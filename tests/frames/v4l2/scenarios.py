@@ -8,8 +8,8 @@ import smartcam.frames
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FoundSource, Frame, FrameReader
 from smartcam.frames._v4l2 import abi
-from smartcam.frames._v4l2.controls import Control
-from smartcam.frames._v4l2.device import FORMATS, Device
+from smartcam.frames._v4l2.controls import DeviceControl
+from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
 from smartcam.frames._v4l2.driver import V4L2Driver
 
 URL = "v4l2:///dev/video0?format=YUYV&size=320x180&fps=25"
@@ -34,7 +34,7 @@ CONTROLS = {
 
 def press(name: str, value: int = 1) -> None:
     """Set a control as another program would."""
-    device = Device.open("/dev/video0")
+    device = CaptureDevice.open("/dev/video0")
     try:
         device.ask(abi.S_CTRL, CONTROLS[name], value)
     finally:
@@ -144,7 +144,7 @@ async def in_use() -> FrameSourceError:
         return await refusal(opened("v4l2:///dev/video0?format=GREY"))
 
 
-async def controls() -> tuple[dict[str, Control], list[int], FrameSourceError]:
+async def controls() -> tuple[dict[str, DeviceControl], list[int], FrameSourceError]:
     async with smartcam.frames.open(URL) as source:
         driver = source.driver
         assert isinstance(driver, V4L2Driver)

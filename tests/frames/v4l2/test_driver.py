@@ -194,7 +194,7 @@ def changed(replay: Replay, monkeypatch: pytest.MonkeyPatch, **fields: int) -> N
     """Have the kernel say something else of each picture."""
     places = {"used": 8, "flags": 12, "sequence": 56}
 
-    def ioctl(device: int, request: abi.Request, argument: bytearray) -> None:
+    def ioctl(device: int, request: abi.Ioctl, argument: bytearray) -> None:
         replay.ioctl(device, request, argument)
         if request.name == "DQBUF":
             for name, value in fields.items():
@@ -247,7 +247,7 @@ async def test_a_driver_that_says_full_for_ever_and_gives_nothing_ends(
 ) -> None:
     replay = play("stream")
 
-    def ioctl(device: int, request: abi.Request, argument: bytearray) -> None:
+    def ioctl(device: int, request: abi.Ioctl, argument: bytearray) -> None:
         if request.name == "DQBUF":
             raise BlockingIOError
         replay.ioctl(device, request, argument)

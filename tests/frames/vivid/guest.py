@@ -25,11 +25,11 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames import Frame, FrameReader, FrameSource, Moment
 from smartcam.frames._v4l2 import abi
 from smartcam.frames._v4l2.controls import set_control
-from smartcam.frames._v4l2.device import Device
+from smartcam.frames._v4l2.device import CaptureDevice
 from smartcam.frames._v4l2.driver import V4L2Driver
 
 URL = "v4l2:///dev/video{}?format=YUYV&size=320x180&fps=25"
-S_INPUT = abi.Request("S_INPUT", 0xC0045627, struct.Struct("i"))
+S_INPUT = abi.Ioctl("S_INPUT", 0xC0045627, struct.Struct("i"))
 SCALERS = ("enable_capture_scaler", "enable_capture_composing", "enable_capture_cropping")
 UNBIND = Path("/sys/bus/platform/drivers/vivid")
 CHECKS: dict[str, Callable[[], Awaitable[None]]] = {}
@@ -78,7 +78,7 @@ async def ends(reader: FrameReader, *words: str) -> None:
 
 def press(number: int, name: str, value: int = 1) -> None:
     """Set a control as another program would."""
-    device = Device.open(f"/dev/video{number}")
+    device = CaptureDevice.open(f"/dev/video{number}")
     try:
         set_control(device, name, value)
     finally:
@@ -341,7 +341,7 @@ async def controls_are_listed_set_and_bounded() -> None:
 @check
 async def a_format_that_another_program_set_is_set_back() -> None:
     async with smartcam.frames.open(URL.format(0)) as source:
-        device = Device.open("/dev/video0")
+        device = CaptureDevice.open("/dev/video0")
         device.ask(abi.S_FMT, 1, 0, 640, 480, abi.fourcc("GREY"), 1)
         device.close()
         frame = await source.newest()
@@ -351,14 +351,14 @@ async def a_format_that_another_program_set_is_set_back() -> None:
 @check
 async def a_device_that_changed_says_what_it_has_now() -> None:
     async with smartcam.frames.open(URL.format(0)) as source:
-        device = Device.open("/dev/video0")
+        device = CaptureDevice.open("/dev/video0")
         device.ask(S_INPUT, 1)  # a tuner, of 720 columns
         for one in SCALERS:
             set_control(device, one, 0)
         device.close()
         async with source.reader() as reader:
             await ends(reader, "/dev/video0: expected")
-        device = Device.open("/dev/video0")
+        device = CaptureDevice.open("/dev/video0")
         for one in SCALERS:
             set_control(device, one, 1)
         device.ask(S_INPUT, 0)
