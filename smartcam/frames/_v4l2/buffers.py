@@ -79,11 +79,11 @@ class Buffers:
             BlockingIOError: none is there.
             OSError: the device is gone, or its driver gave up.
         """
-        argument, number = self._argument, self._device.number
-        system.ioctl(number, abi.DQBUF, argument)
+        argument, number, ioctl = self._argument, self._device.number, system.ioctl
+        ioctl(number, abi.DQBUF, argument)
         place, used, flags, seconds, microseconds, sequence = _unpack(argument)
         data = b"" if flags & abi.BUF_ERROR else self._pages[place][:used]
-        system.ioctl(number, abi.QBUF, argument)
+        ioctl(number, abi.QBUF, argument)
         return Full(data, used, flags, seconds + microseconds / 1e6, sequence)
 
     def release(self) -> None:

@@ -42,10 +42,10 @@ class CaptureStream:
 
     def __init__(self, device: CaptureDevice, setting: Setting, buffers: int, name: str) -> None:
         self.device = device
-        self._setting = setting
         self._name = name
         layout = setting.layout
         period = None if setting.rate is None else 1 / setting.rate
+        self._format, self._width, self._height = setting.format, layout.width, layout.height
         self._stride = 0 if setting.format.compressed else layout.stride
         self._least = (
             1
@@ -99,9 +99,9 @@ class CaptureStream:
         stamp = self._stamps.read(full.seconds, full.flags, self._number, now)
         return Frame(
             data=full.data,
-            format=self._setting.format,
-            width=self._setting.layout.width,
-            height=self._setting.layout.height,
+            format=self._format,
+            width=self._width,
+            height=self._height,
             stride=self._stride,
             captured=stamp.captured,
             utc=utc - (now - stamp.captured),
@@ -133,11 +133,9 @@ class CaptureStream:
         return steps
 
     def _no_pictures(self, full: Full) -> FrameFormatError:
-        setting = self._setting
         came = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
         return FrameFormatError(
-            f"{self._name}: expected {setting.format.name} {setting.layout.width}x"
-            f"{setting.layout.height}, {self._least} bytes or more, got {came} {self._bad} times "
-            "in a row",
+            f"{self._name}: expected {self._format.name} {self._width}x{self._height}, "
+            f"{self._least} bytes or more, got {came} {self._bad} times in a row",
             source=self._name,
         )
