@@ -95,7 +95,7 @@ class FrameReader:
         self._last: Frame | None = None  # the last one that was taken
         self._ended = False
         self._error: FrameSourceError | None = None
-        self._came = asyncio.Event()
+        self._waiters: list[asyncio.Future[bool]] = []
         self._offered = self._delivered = self._skipped = self._lost = 0
 
     def statistics(self) -> ReaderStatistics:
@@ -208,29 +208,43 @@ class FrameReader:
 
     async def _take(self, end: float | None, what: str) -> Frame | None:
         """Return the next frame as soon as there is one; None at the end of the source."""
-        if self._next is not None:
-            return self._taken(self._next)
-        try:
-            async with asyncio.timeout_at(end):
-                while self._next is None and not self._ended:
-                    self._came.clear()
-                    await self._came.wait()
-        except TimeoutError:
-            raise FrameTimeoutError(
-                f"{self._name}: expected {what}, got none in time", source=self._name
-            ) from None
+        while self._next is None and not self._ended:
+            if not await self._woken(end):
+                raise FrameTimeoutError(
+                    f"{self._name}: expected {what}, got none in time", source=self._name
+                )
         if self._next is not None:
             return self._taken(self._next)
         if self._error is not None:
             raise self._error
         return None
 
+    async def _woken(self, end: float | None) -> bool:
+        """Wait until something came, or return False when its time is over.
+
+        A future and a timer: what asyncio has for it costs twice as much, for each frame.
+        """
+        loop = asyncio.get_running_loop()
+        waiter: asyncio.Future[bool] = loop.create_future()
+        timer = None if end is None else loop.call_at(end, _settle, waiter, False)
+        self._waiters.append(waiter)
+        try:
+            return await waiter or self._next is not None
+        finally:
+            self._waiters.remove(waiter)
+            if timer is not None:
+                timer.cancel()
+
+    def _wake(self) -> None:
+        for waiter in self._waiters:
+            _settle(waiter, True)
+
     def _offer(self, frame: Frame) -> None:
         self._offered += 1
         if self._next is not None:
             self._skipped += 1
         self._next = frame
-        self._came.set()
+        self._wake()
 
     def _miss(self, count: int) -> None:
         self._lost += count
@@ -242,7 +256,7 @@ class FrameReader:
     def _end(self, error: FrameSourceError | None) -> None:
         if not self._ended:
             self._ended, self._error = True, error
-        self._came.set()
+        self._wake()
 
     def _taken(self, frame: Frame) -> Frame:
         if frame is self._next:
@@ -252,6 +266,11 @@ class FrameReader:
                 self._source._took.set()  # noqa: SLF001 - the two are one
         self._last = frame
         return frame
+
+
+def _settle(waiter: asyncio.Future[bool], came: bool) -> None:
+    if not waiter.done():
+        waiter.set_result(came)
 
 
 class FrameSource(FrameSink):
@@ -306,6 +325,11 @@ class FrameSource(FrameSink):
     def name(self) -> str:
         """The camera's name."""
         return self._driver.name
+
+    @property
+    def driver(self) -> FrameDriver:
+        """The device's driver, for what only its kind can, such as a V4L2 device's controls."""
+        return self._driver
 
     @property
     def format(self) -> StreamFormat:
