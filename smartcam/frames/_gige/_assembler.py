@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._gige._block import PAYLOAD, Block
+from smartcam.frames._gige._block import PACKET, Block
 from smartcam.frames._gige._gvcp import Status
 from smartcam.frames._gige._gvsp import HEADER, Kind, decode_header
 
@@ -136,18 +136,11 @@ class Assembler:
             arrived: what the picture says whose first packet it is.
         """
         current = self._current
-        if current is not None and size == self._datagram and not current.extended:
+        if current is not None and size == self._datagram:
             status, block_id, word = _SHORT.unpack_from(data)
             if word == current.expected and block_id == current.block_id and status == 0:
-                packet = word & 0xFFFFFF
-                if current.highest < packet and current.take_payload(packet, data[HEADER:size]):
-                    current.seen[packet] = 1
-                    current.highest = packet
-                    current.expected = word + 1
-                    current.progress = self._accepted = now
-                    if packet == current.packets or current.trailer is not None:
-                        current.mark(packet)
-                        self._settle()
+                if current.take_next(word & PACKET, data[HEADER:size], now):
+                    self._accepted = now
                     return
         header = decode_header(data, size)
         if header is None or not header.block:

@@ -12,10 +12,13 @@ from smartcam.frames._gige._pfnc import bits_of
 if TYPE_CHECKING:
     from smartcam.frames._gige._gvsp import Leader
 
-__all__ = ["Block", "Picture", "picture_bytes"]
+__all__ = ["PACKET", "Block", "Picture", "picture_bytes"]
 
 PAYLOAD: Final = 0x03000000
 """Kind of a payload packet, above its id: the second word of its header."""
+
+PACKET: Final = 0xFFFFFF
+"""The id in that word."""
 
 
 class Picture(NamedTuple):
@@ -110,6 +113,28 @@ class Block:
         self.over = False  # the camera is past it, or silent in the middle of it
         self.complete = self.dead = False
 
+    def take_next(self, packet: int, data: memoryview, now: float) -> bool:
+        """Take the packet that is next in order, full and not the last one; whether it is that.
+
+        It is what nearly all packets are, so it is short; :meth:`take_payload` does it for all.
+        """
+        buffer = self.buffer
+        if (
+            buffer is None
+            or not self.highest < packet < self.packets
+            or self.trailer is not None
+            or self.short is not None
+        ):
+            return False
+        begin = (packet - 1) * self.full
+        buffer[begin : begin + self.full] = data
+        self.seen[packet] = 1
+        self.got += 1
+        self.highest = packet
+        self.expected += 1
+        self.progress = now
+        return True
+
     def take_payload(self, packet: int, data: memoryview) -> bool:
         """Take a payload packet's bytes; whether they fit where they belong."""
         size = len(data)
@@ -159,7 +184,7 @@ class Block:
     def mark(self, packet: int) -> None:
         """Note that a packet is there."""
         self.seen[packet] = 1
-        if packet == self.expected & 0xFFFFFF or (packet == 0 and self.highest == 0):
+        if packet == self.expected & PACKET or (packet == 0 and self.highest == 0):
             following = self.seen.find(0, packet + 1 if packet else 1)
             self.expected = PAYLOAD | (following if following > 0 else 0)
         self.complete = (

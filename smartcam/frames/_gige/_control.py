@@ -204,7 +204,9 @@ class ControlChannel(asyncio.DatagramProtocol):
                     ack = await self._answers.get()
                     if isinstance(ack, OSError):
                         raise FrameSourceError(
-                            f"{self._source}: {command.name} {what}: {ack}", source=self._source
+                            f"{self._source}: {command.name} {what}: nothing listens there that "
+                            f"speaks GVCP: {ack}",
+                            source=self._source,
                         ) from ack
                     if ack.command != Command.PENDING_ACK:
                         return ack

@@ -81,7 +81,7 @@ def networks() -> list[Network]:
                 )
                 network = ipaddress.IPv4Network(f"{address}/{mask}", strict=False)
                 own = broadcast if broadcast != "0.0.0.0" else str(network.broadcast_address)  # noqa: S104
-                targets = (own,) if network.is_loopback else (own, "255.255.255.255")
+                targets = (own, address if network.is_loopback else "255.255.255.255")
                 found.append(Network(address, targets, network))
     return found
 
@@ -118,7 +118,8 @@ async def find(places: Iterable[Network], *, port: int = PORT, wait: float = WAI
     finally:
         for transport in transports:
             transport.close()
-    found = {(one.info.mac, one.info.serial, one.address): one for it in asked for one in it.found}
+    answers = sorted((one for it in asked for one in it.found), key=lambda one: one.reachable)
+    found = {(one.info.mac, one.info.serial, one.address): one for one in answers}
     return sorted(found.values(), key=lambda one: (one.info.label, one.address))
 
 

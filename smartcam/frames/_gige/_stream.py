@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import sys
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -28,7 +29,11 @@ MOST_AT_ONCE: Final = 128
 """Packets that are read before the event loop has its turn: half a millisecond."""
 
 BUFFER: Final = 8 << 20
-"""Bytes that the system is asked to keep for us; net.core.rmem_max bounds it."""
+"""Bytes that the system is asked to keep for us; Linux gives net.core.rmem_max at most, by default
+208 KiB, which a frame of 512x512 fills. A frame that does not fit is lost while the loop is busy."""
+
+SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
+"""asm-generic/socket.h: past rmem_max, for who may administer the network."""
 
 
 class StreamSocket:
@@ -47,8 +52,9 @@ class StreamSocket:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.setblocking(False)
-            with contextlib.suppress(OSError):  # some systems refuse instead of giving what they can
-                self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+            for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
+                with contextlib.suppress(OSError):  # the second one is for the privileged
+                    self.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
             self.socket.bind((local, 0))
         except BaseException:
             self.socket.close()
