@@ -186,7 +186,7 @@ class Block:
         self.seen[packet] = 1
         if packet == self.expected & PACKET or (packet == 0 and self.highest == 0):
             following = self.seen.find(0, packet + 1 if packet else 1)
-            self.expected = PAYLOAD | (following if following > 0 else 0)
+            self.expected = PAYLOAD | (max(0, following))
         self.complete = (
             self.trailer is not None and self.leader is not None and self.got == self.trailer - 1
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import sys
 from typing import TYPE_CHECKING, Final, cast
 
 from smartcam.exceptions import FrameSourceError, FrameTimeoutError, MessageError
@@ -40,6 +41,9 @@ ANSWER: Final = 0.3
 """Seconds for an answer: the standard lets a camera take 200 ms before it says "pending"."""
 
 TRIES: Final = 3
+
+IP_MTU: Final = 14
+"""linux/in.h: what the system knows of the way that a connected socket's packets go."""
 
 LONGEST_PENDING: Final = 30.0
 """Seconds that a camera may put a request off altogether."""
@@ -95,10 +99,10 @@ class ControlChannel(asyncio.DatagramProtocol):
     @property
     def path_mtu(self) -> int:
         """Bytes of the largest IP packet on the way, as far as the system knows; 1500: unknown."""
-        if self._transport is None or not hasattr(socket, "IP_MTU"):
+        if self._transport is None or sys.platform != "linux":
             return 1500
         inside = self._transport.get_extra_info("socket")
-        return int(inside.getsockopt(socket.IPPROTO_IP, socket.IP_MTU))
+        return int(inside.getsockopt(socket.IPPROTO_IP, IP_MTU))
 
     def close(self) -> None:
         """Close the socket. Idempotent."""

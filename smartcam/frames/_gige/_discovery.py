@@ -67,7 +67,7 @@ class Camera(NamedTuple):
 def networks() -> list[Network]:
     """Return this machine's IPv4 networks; where they cannot be listed, the one that leads out."""
     try:
-        import fcntl  # noqa: PLC0415 - not on Windows
+        import fcntl
     except ImportError:
         return [Network("0.0.0.0", ("255.255.255.255",))]  # noqa: S104 - any address of its own
     found = []

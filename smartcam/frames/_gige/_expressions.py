@@ -75,7 +75,7 @@ def _rest(left: Number, right: Number) -> Number:
 
 
 def _power(left: Number, right: Number) -> Number:
-    if isinstance(left, int) and isinstance(right, int) and 0 <= right:
+    if isinstance(left, int) and isinstance(right, int) and right >= 0:
         if abs(left) > 1 and right * math.log2(abs(left)) >= 64:
             raise OverflowError("a power past 64 bits")
         return int(left**right)

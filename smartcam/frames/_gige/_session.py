@@ -113,10 +113,9 @@ class Session:
             heartbeat(self.control, timeout, self.label, self._on_lost),
             name=f"heartbeat of {self.label}",
         )
-        self.ticks_per_second = (
-            await self._register_or_0(Register.TICK_FREQUENCY_HIGH) << 32
-            | await self._register_or_0(Register.TICK_FREQUENCY_LOW)
-        )
+        self.ticks_per_second = await self._register_or_0(
+            Register.TICK_FREQUENCY_HIGH
+        ) << 32 | await self._register_or_0(Register.TICK_FREQUENCY_LOW)
         self.can_resend = bool(await self._register_or_0(CAPABILITIES) & RESEND_CAPABILITY)
         self._features = Features(await self._description(), self.control, self.label)
 
@@ -162,9 +161,7 @@ class Session:
         )
 
 
-async def _in_thread(
-    work: Callable[[], dict[str, Element]], label: str
-) -> dict[str, Element]:
+async def _in_thread(work: Callable[[], dict[str, Element]], label: str) -> dict[str, Element]:
     """Do work beside the loop: 2 MB of XML take a quarter of a second."""
     pool = ThreadPoolExecutor(1, thread_name_prefix=f"description of {label}")
     try:

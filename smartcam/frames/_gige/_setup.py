@@ -170,7 +170,10 @@ async def _shape(session: Session) -> Shape:
             source=session.label,
             available=fitting,
         )
-    width, height = int(await features.number("Width") or 0), int(await features.number("Height") or 0)
+    width, height = (
+        int(await features.number("Width") or 0),
+        int(await features.number("Height") or 0),
+    )
     least = (width * height * bits_of(number) + 7) // 8
     payload = int(await features.number("PayloadSize") or least)
     if not 0 < least <= payload <= LARGEST_FRAME:
@@ -224,7 +227,7 @@ async def connect(session: Session, where: StreamSocket, asked: int) -> int:
     await control.write_register(Register.STREAM_DESTINATION, address)
     await control.write_register(Register.STREAM_PORT, where.port)
     size = await (_given(session, asked) if asked else _tested(session, where))
-    if not IP_UDP + EXTENDED_HEADER < size:
+    if not size > IP_UDP + EXTENDED_HEADER:
         raise FrameSourceError(
             f"{session.label}: packet_size: expected {PACKETS[0]} bytes or more, the camera says "
             f"{size}",
@@ -247,7 +250,8 @@ async def _given(session: Session, asked: int) -> int:
 
 async def _tested(session: Session, where: StreamSocket) -> int:
     """Return the largest size of which a test packet came; without any the camera's own, of 1500
-    bytes at most."""
+    bytes at most.
+    """
     control = session.control
     own = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
     way = min(control.path_mtu, 9000)

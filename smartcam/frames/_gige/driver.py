@@ -152,7 +152,9 @@ class GigEDriver(FrameDriver):
         try:
             where = StreamSocket(session.control.local_address, session.control.camera_address)
         except OSError as exc:
-            raise FrameSourceError(f"{self.name}: no socket for it: {exc}", source=self.name) from exc
+            raise FrameSourceError(
+                f"{self.name}: no socket for it: {exc}", source=self.name
+            ) from exc
         try:
             asked = self._wanted.packet_size or self._packet_size
             size = self._packet_size = await connect(session, where, asked)
