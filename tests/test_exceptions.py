@@ -30,6 +30,9 @@ TREE: dict[type[Exception], tuple[type[Exception], ...]] = {
     e.UnsupportedError: (ROOT,),
     e.CameraFaultError: (ROOT,),
     e.CalibrationError: (ROOT, ValueError),
+    e.FrameSourceError: (ROOT, OSError),
+    e.FrameFormatError: (e.FrameSourceError,),
+    e.FrameTimeoutError: (e.FrameSourceError, TimeoutError),
     e.RecordingError: (ROOT, OSError),
     e.SubscriberOverflowError: (ROOT,),
     e.TriggerError: (ROOT,),
@@ -49,6 +52,7 @@ TREE: dict[type[Exception], tuple[type[Exception], ...]] = {
 
 LINK: dict[str, Any] = {"host": "192.168.0.10", "port": 36701}
 FRAME: dict[str, Any] = {"offset": 4, "data": b"\x01\x02"}
+SOURCE: dict[str, Any] = {"source": "/dev/video0", "available": ("Mono8 640x480",)}
 FIELD: dict[str, Any] = {"field": "x", "offset": 8, "expected": "real32", "got": b"\0"}
 
 ATTRIBUTES: dict[type[Exception], dict[str, Any]] = {
@@ -64,6 +68,9 @@ ATTRIBUTES: dict[type[Exception], dict[str, Any]] = {
     e.CommandRejectedError: {"message_id": 0x31, "code": 1, "active_application": 3},
     e.TriggerTimeoutError: {"waited": 5.0},
     e.CalibrationError: {"code": "TOO_FEW", "expected": 3, "got": 2},
+    e.FrameSourceError: SOURCE,
+    e.FrameFormatError: SOURCE,
+    e.FrameTimeoutError: SOURCE,
     e.RemoteProtocolError: FRAME,
     e.FrameError: FRAME,
     e.MessageError: FRAME,
@@ -74,7 +81,7 @@ ATTRIBUTES: dict[type[Exception], dict[str, Any]] = {
 DEFAULTS: dict[str, Any] = {
     "text": "", "position": 0, "name": "", "extra": "", "host": "", "port": 0, "attempts": (),
     "message_id": None, "waited": 0.0, "code": 0, "active_application": None, "offset": 0,
-    "data": b"", "field": "", "expected": None, "got": None,
+    "data": b"", "field": "", "expected": None, "got": None, "source": "", "available": (),
 }  # fmt: skip
 
 SPECIAL: dict[tuple[type[Exception], str], Any] = {

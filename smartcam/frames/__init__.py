@@ -18,30 +18,39 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
+    from smartcam.frames._clocks import ClockStatistics
+    from smartcam.frames._codecs import Codecs
     from smartcam.frames._driver import FoundSource, FrameDriver, FrameSink, StreamFormat
     from smartcam.frames._frame import Frame, Moment
+    from smartcam.frames._group import FrameGroup, FrameSet, GroupStatistics
+    from smartcam.frames._h264 import H264Decoder, H264Encoder
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
-    from smartcam.frames._source import (
-        FrameReader,
-        FrameSource,
-        ReaderStatistics,
-        SourceStatistics,
-    )
+    from smartcam.frames._source import FrameReader, FrameSource, ReaderStatistics, SourceStatistics
+    from smartcam.frames._stages import Rectifier, Undistorter
 
 __all__ = [
+    "ClockStatistics",
+    "Codecs",
     "FoundSource",
     "Frame",
     "FrameAddress",
     "FrameDriver",
+    "FrameGroup",
     "FrameReader",
+    "FrameSet",
     "FrameSink",
     "FrameSource",
+    "GroupStatistics",
+    "H264Decoder",
+    "H264Encoder",
     "Moment",
     "PixelFormat",
     "ReaderStatistics",
+    "Rectifier",
     "SourceStatistics",
     "StreamFormat",
+    "Undistorter",
     "discover",
     "find_format",
     "open",
@@ -52,10 +61,15 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_address": "FrameAddress",
+            "_clocks": "ClockStatistics",
+            "_codecs": "Codecs",
             "_driver": "FoundSource FrameDriver FrameSink StreamFormat",
             "_frame": "Frame Moment",
+            "_group": "FrameGroup FrameSet GroupStatistics",
+            "_h264": "H264Decoder H264Encoder",
             "_opening": "discover open",
             "_pixels": "PixelFormat find_format",
             "_source": "FrameReader FrameSource ReaderStatistics SourceStatistics",
+            "_stages": "Rectifier Undistorter",
         },
     )

@@ -14,8 +14,6 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["FrameAddress"]
-
 
 @dataclass(frozen=True, slots=True)
 class FrameAddress:

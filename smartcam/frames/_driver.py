@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from smartcam.frames._frame import Frame
     from smartcam.frames._pixels import PixelFormat
 
-__all__ = ["FoundSource", "FrameDriver", "FrameSink", "StreamFormat"]
-
 
 class StreamFormat(NamedTuple):
     """What a source streams, or could.

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.frames._pixels import PixelFormat
 
-__all__ = ["Frame", "Moment"]
-
 
 class Moment(enum.Enum):
     """Which moment a frame's capture time is."""
@@ -43,6 +41,8 @@ class Frame:
         duration: longest time from the start of the exposure to ``captured``, seconds: 0 where
             that is the start; else what the source knows of its frame time and of its way here.
         device_time: what the camera's own clock said, seconds; None: it has none, or said nothing.
+            A driver that has it gives the arrival as ``captured``, and the source puts in its place
+            where the device's time is on our clock.
         sequence: the camera's number of the frame; it counts lost ones, too.
         lost: frames that were lost between the last one and this one, on the way or in the camera.
         source: name of the camera.

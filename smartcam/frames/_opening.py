@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.frames._driver import FoundSource, FrameDriver
 
-__all__ = ["discover", "open"]
-
 
 def open(
     url: str,

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFormatError
+from smartcam.frames._colours import COLOURS
+from smartcam.frames._layouts import Compressed, Jpeg, Layout, Picture, Planes, Samples, YuvPairs
+from smartcam.frames._unpacking import PACKINGS
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
-
-__all__ = ["PIXEL_FORMATS", "PixelFormat", "find_format"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,57 +22,213 @@ class PixelFormat:
 
     Attributes:
         name: of PFNC, as ``Mono8``; where PFNC has none the usual one, as ``NV12`` or ``MJPEG``.
-        fourcc: of V4L2, as ``GREY``, or "" where V4L2 has none.
-        bits: of a pixel; 0: it is compressed.
+        fourcc: of V4L2, as ``GREY``, or "" where V4L2 has none; without the blanks at its end.
+        bits: of a pixel, those that mean nothing included; 0: it is compressed.
+        code: 32 bits of PFNC, as GigE Vision sends it; 0: PFNC has none.
+        depth: bits of a sample that mean something.
+        layout: how its bytes are read.
     """
 
     name: str
     fourcc: str
     bits: int
+    code: int = 0
+    depth: int = 8
+    layout: Layout = field(kw_only=True, repr=False, compare=False)
+
+    @property
+    def compressed(self) -> bool:
+        """Whether only a codec reads it."""
+        return self.bits == 0
+
+    @property
+    def grey_is_sent(self) -> bool:
+        """Whether :meth:`Frame.grey` is what the camera sent; else it is made from colours."""
+        return self.layout.grey_is_sent
+
+    def stride(self, width: int) -> int:
+        """Return the bytes of a row without padding; 0: the format is compressed."""
+        return self.layout.least_stride(width)
+
+    def size(self, width: int, height: int, stride: int | None = None) -> int:
+        """Return the bytes of a picture; 0: the format is compressed.
+
+        Args:
+            width: pixels.
+            height: pixels.
+            stride: bytes from one row to the next; None: no padding. The last row may go without
+                its padding, where the format has one plane only.
+        """
+        return self.layout.size(width, height, self.stride(width) if stride is None else stride)
+
+    def check(
+        self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
+    ) -> None:
+        """See that there are bytes enough.
+
+        Raises:
+            FrameFormatError: there are not.
+        """
+        self.layout.check(Picture(self.name, data, width, height, stride))
 
     def array(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> NDArray[Any]:
         """Return the pixels as they are; see :meth:`smartcam.frames.Frame.array`."""
-        if len(data) < stride * height:
-            raise FrameFormatError(
-                f"{self.name} {width}x{height}: expected {stride * height} bytes, got {len(data)}"
-            )
-        rows = np.frombuffer(data, np.uint8, stride * height).reshape(height, stride)
-        return rows[:, : width * self.bits // 8]
+        return self.layout.array(Picture(self.name, data, width, height, stride))
+
+    def planes(
+        self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
+    ) -> tuple[NDArray[np.uint8], ...]:
+        """Return Y, U and V of a format that has them, views; U and V have the size they have.
+
+        Raises:
+            FrameFormatError: it has none, or there are too few bytes.
+        """
+        return self.layout.planes(Picture(self.name, data, width, height, stride))
 
     def grey(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> NDArray[Any]:
         """Return the brightness; see :meth:`smartcam.frames.Frame.grey`."""
-        return self.array(data, width, height, stride)
+        return self.layout.grey(Picture(self.name, data, width, height, stride))
 
     def rgb(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> NDArray[Any]:
         """Return the colours; see :meth:`smartcam.frames.Frame.rgb`."""
-        return np.repeat(self.array(data, width, height, stride)[..., None], 3, axis=2)
+        return self.layout.rgb(Picture(self.name, data, width, height, stride))
 
 
-PIXEL_FORMATS = (
-    PixelFormat("Mono8", "GREY", 8),
-    PixelFormat("YUV422_8", "YUYV", 16),
-    PixelFormat("YUV422_8_UYVY", "UYVY", 16),
+def _samples(
+    name: str, fourcc: str, code: int, depth: int, colours: str, channels: int = 1
+) -> PixelFormat:
+    """Return a format of samples in whole bytes."""
+    size = (depth + 7) // 8
+    layout = Samples(COLOURS[colours], size, channels)
+    return PixelFormat(name, fourcc, 8 * size * channels, code, depth, layout=layout)
+
+
+def _packed(name: str, code: int, colours: str) -> PixelFormat:
+    """Return a format whose samples share bytes; the code's third digits are its bits."""
+    packing = PACKINGS[next(end for end in PACKINGS if name.endswith(end))]
+    depth = 10 if "10" in name else 12
+    layout = Samples(COLOURS[colours], 2, packing=packing)
+    return PixelFormat(name, "", code >> 16 & 0xFF, code, depth, layout=layout)
+
+
+def _pairs(name: str, fourcc: str, code: int, y: int, matrix: str) -> PixelFormat:
+    return PixelFormat(name, fourcc, 16, code, layout=YuvPairs(y, matrix))
+
+
+def _planes(name: str, fourcc: str, across: int, down: int, matrix: str) -> PixelFormat:
+    """Return a format of planes; woven where it is called NV."""
+    layout = Planes(across, down, name.startswith("NV"), matrix)
+    return PixelFormat(name, fourcc, 8 + 16 // (across * down), layout=layout)
+
+
+_BAYER: Final = {
+    "GR": ("GRBG", "BA10", "BA12", "GR16"),
+    "RG": ("RGGB", "RG10", "RG12", "RG16"),
+    "GB": ("GBRG", "GB10", "GB12", "GB16"),
+    "BG": ("BA81", "BG10", "BG12", "BYR2"),
+}
+"""V4L2's names of 8, 10, 12 and 16 bits, in the order of PFNC's codes."""
+
+_BAYER_CODES: Final = ((8, 0x01080008), (10, 0x0110000C), (12, 0x01100010), (16, 0x0110002E))
+"""Bits, and the code of the first of the four."""
+
+_BAYER_PACKED: Final = (
+    ("10Packed", {"GR": 0x010C0026, "RG": 0x010C0027, "GB": 0x010C0028, "BG": 0x010C0029}),
+    ("12Packed", {"GR": 0x010C002A, "RG": 0x010C002B, "GB": 0x010C002C, "BG": 0x010C002D}),
+    ("10p", {"GR": 0x010A0056, "RG": 0x010A0058, "GB": 0x010A0054, "BG": 0x010A0052}),
+    ("12p", {"GR": 0x010C0057, "RG": 0x010C0059, "GB": 0x010C0055, "BG": 0x010C0053}),
 )
-"""All formats that are known."""
+
+PIXEL_FORMATS: Final = (
+    _samples("Mono8", "GREY", 0x01080001, 8, "grey"),
+    _samples("Mono10", "Y10", 0x01100003, 10, "grey"),
+    _samples("Mono12", "Y12", 0x01100005, 12, "grey"),
+    _samples("Mono14", "Y14", 0x01100025, 14, "grey"),
+    _samples("Mono16", "Y16", 0x01100007, 16, "grey"),
+    _packed("Mono10Packed", 0x010C0004, "grey"),
+    _packed("Mono12Packed", 0x010C0006, "grey"),
+    _packed("Mono10p", 0x010A0046, "grey"),
+    _packed("Mono12p", 0x010C0047, "grey"),
+    *(
+        _samples(f"Bayer{pattern}{depth}", fourccs[column], code + row, depth, pattern)
+        for row, (pattern, fourccs) in enumerate(_BAYER.items())
+        for column, (depth, code) in enumerate(_BAYER_CODES)
+    ),
+    *(
+        _packed(f"Bayer{pattern}{end}", code, pattern)
+        for end, codes in _BAYER_PACKED
+        for pattern, code in codes.items()
+    ),
+    _samples("RGB8", "RGB3", 0x02180014, 8, "rgb", 3),
+    _samples("BGR8", "BGR3", 0x02180015, 8, "bgr", 3),
+    _samples("Coord3D_C16", "Z16", 0x011000B8, 16, "depth"),
+    _pairs("YUV422_8", "YUYV", 0x02100032, 0, "601"),
+    _pairs("YUV422_8_UYVY", "UYVY", 0x0210001F, 1, "601"),
+    _pairs("YCbCr422_8", "", 0x0210003B, 0, "601 full"),
+    _pairs("YCbCr422_8_CbYCrY", "", 0x02100043, 1, "601 full"),
+    _pairs("YCbCr601_422_8", "", 0x0210003E, 0, "601"),
+    _pairs("YCbCr601_422_8_CbYCrY", "", 0x02100044, 1, "601"),
+    _pairs("YCbCr709_422_8", "", 0x02100041, 0, "709"),
+    _pairs("YCbCr709_422_8_CbYCrY", "", 0x02100045, 1, "709"),
+    *(
+        _planes(f"{name}{end}", "" if end else fourcc, across, down, matrix)
+        for name, fourcc, across, down in (
+            ("NV12", "NV12", 2, 2),
+            ("I420", "YU12", 2, 2),
+            ("I422", "422P", 2, 1),
+            ("I444", "", 1, 1),
+        )
+        for end, matrix in (
+            ("", "601"),
+            ("_full", "601 full"),
+            ("_709", "709"),
+            ("_709_full", "709 full"),
+        )
+    ),
+    PixelFormat("MJPEG", "MJPG", 0, layout=Jpeg()),
+    PixelFormat("PNG", "", 0, 0, 16, layout=Compressed("Codecs.decode")),
+    PixelFormat("JPEGXL", "", 0, 0, 16, layout=Compressed("Codecs.decode")),
+    PixelFormat("H264", "H264", 0, layout=Compressed("Codecs.h264_decoder")),
+)
+"""All formats that are known.
+
+Y, U and V are BT.601's of limited range, as V4L2 has them by default; where the name says ``full``
+or ``709`` that range or BT.709. Source: PFNC 2.1 and its list of values, videodev2.h.
+"""
+
+_ALIASES: Final = {"JPEG": "MJPEG", "YUY2": "YUV422_8"}
+
+_BY_NAME: Final[dict[str | int, PixelFormat]] = {
+    key: one
+    for one in reversed(PIXEL_FORMATS)
+    for key in (one.fourcc.upper(), one.code, one.name.upper())
+    if key
+}
 
 
-def find_format(name: str) -> PixelFormat:
-    """Return the format that PFNC, or V4L2, calls so; small letters do, too.
+def find_format(name: str | int) -> PixelFormat:
+    """Return the format that PFNC, or V4L2, calls so, or that has that code of PFNC.
+
+    Args:
+        name: small letters and blanks at the end do not matter; or 32 bits of PFNC.
 
     Raises:
         FrameFormatError: there is none; the text lists the known ones.
     """
-    for one in PIXEL_FORMATS:
-        if name.upper() in (one.name.upper(), one.fourcc.upper()):
-            return one
+    key = name if isinstance(name, int) else name.strip().upper()
+    found = _BY_NAME.get(_ALIASES.get(key, key) if isinstance(key, str) else key)
+    if found is not None:
+        return found
     known = [one.name for one in PIXEL_FORMATS]
+    shown, guess = (f"{name:#010x}", "") if isinstance(name, int) else (repr(name), None)
     raise FrameFormatError(
-        f"unknown pixel format {name!r}; known are {', '.join(known)}{did_you_mean(name, known)}",
+        f"unknown pixel format {shown}; known are {', '.join(known)}"
+        f"{did_you_mean(str(name), known) if guess is None else guess}",
         available=tuple(known),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import logging
 import math
 import time
 import weakref
@@ -12,10 +13,12 @@ from typing import TYPE_CHECKING
 
 from smartcam.exceptions import (
     ConfigurationError,
+    FrameFormatError,
     FrameSourceError,
     FrameTimeoutError,
     LocalProtocolError,
 )
+from smartcam.frames._clocks import DeviceClock
 from smartcam.frames._driver import FrameSink
 
 if TYPE_CHECKING:
@@ -24,10 +27,12 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.calibration._lens.model import CameraModel
+    from smartcam.frames._clocks import ClockStatistics
     from smartcam.frames._driver import FrameDriver, StreamFormat
     from smartcam.frames._frame import Frame
 
-__all__ = ["FrameReader", "FrameSource", "ReaderStatistics", "SourceStatistics"]
+
+_log = logging.getLogger(__name__)
 
 FRAME_TIMEOUT = 5.0
 """Seconds that a frame is waited for, unless one says otherwise."""
@@ -62,6 +67,9 @@ class SourceStatistics:
         started: how often the device began to stream.
         frames: came, for readers or not.
         lost: never came: lost in the camera or on the way.
+        ahead: frames whose time was later than that of their arrival; they have that of the
+            arrival instead.
+        clock: of the camera's own clock; None: it has none.
     """
 
     streaming: bool
@@ -69,6 +77,8 @@ class SourceStatistics:
     started: int
     frames: int
     lost: int
+    ahead: int
+    clock: ClockStatistics | None
 
 
 class FrameReader:
@@ -277,9 +287,10 @@ class FrameSource(FrameSink):
         self._changed = asyncio.Event()  # readers came or went, or the driver ended
         self._streaming = False
         self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
-        self._frames = self._lost = self._started = 0
+        self._frames = self._lost = self._started = self._ahead = 0
+        self._clock: DeviceClock | None = None
         self._newest: Frame | None = None
-        self._last_came = 0.0
+        self._last_came = self._idle_since = 0.0  # on the loop's clock
 
     @property
     def name(self) -> str:
@@ -300,7 +311,13 @@ class FrameSource(FrameSink):
     def statistics(self) -> SourceStatistics:
         """Return what it did since it was opened."""
         return SourceStatistics(
-            self._streaming, len(self._readers), self._started, self._frames, self._lost
+            self._streaming,
+            len(self._readers),
+            self._started,
+            self._frames,
+            self._lost,
+            self._ahead,
+            None if self._clock is None else self._clock.statistics(),
         )
 
     async def __aenter__(self) -> Self:
@@ -314,12 +331,23 @@ class FrameSource(FrameSink):
         if self._task is not None:
             raise LocalProtocolError(f"{self.name} is open already")
         try:
-            self._format = await self._driver.open()
+            self._format = self._checked(await self._driver.open())
         except BaseException:
             await self._driver.close()
             raise
         self._task = asyncio.create_task(self._run(), name=f"frames of {self.name}")
         return self
+
+    def _checked(self, form: StreamFormat) -> StreamFormat:
+        size = (form.width, form.height)
+        if self._camera_info is not None and tuple(self._camera_info.size) != size:
+            raise FrameFormatError(
+                f"{self.name}: expected frames of the size that camera_info has, "
+                f"{self._camera_info.size[0]}x{self._camera_info.size[1]}, got {form}",
+                source=self.name,
+                available=(str(form),),
+            )
+        return form
 
     async def __aexit__(
         self,
@@ -357,9 +385,13 @@ class FrameSource(FrameSink):
         if self._task is None:
             raise LocalProtocolError(f"{self.name} is not open: async with it, then read")
         reader = FrameReader(self, self._timeout if timeout is ... else timeout)
+        self.attach(reader)
+        return reader
+
+    def attach(self, reader: FrameReader) -> None:
+        """Have a reader hear of frames from now on."""
         self._readers.add(weakref.ref(reader, self._dropped))
         self._changed.set()
-        return reader
 
     def __aiter__(self) -> FrameReader:
         return self.reader()
@@ -388,13 +420,34 @@ class FrameSource(FrameSink):
         """Take a frame from the driver."""
         if frame.lost:
             self.lost(frame.lost)
+        self._last_came = asyncio.get_running_loop().time()
+        frame = self._timed(frame, time.monotonic())
         if self._camera_info is not None and frame.camera_info is None:
             frame = dataclasses.replace(frame, camera_info=self._camera_info)
         self._frames += 1
         self._newest = frame
-        self._last_came = time.monotonic()
         for reader in self._alive():
             reader._offer(frame)  # noqa: SLF001 - the two are one
+
+    def _timed(self, frame: Frame, now: float) -> Frame:
+        """Return a frame with its time on our clock, not later than now."""
+        captured = frame.captured
+        if frame.device_time is not None:
+            if self._clock is None:
+                self._clock = DeviceClock()
+            jumps = self._clock.statistics().jumps
+            captured = self._clock.captured(frame.device_time, captured)
+            if self._clock.statistics().jumps > jumps:
+                _log.warning(
+                    "%s: the camera's clock was set anew, at frame %d", self.name, frame.sequence
+                )
+        if captured > now:  # no camera sees what has not happened yet
+            self._ahead += 1
+            captured = now
+        if captured == frame.captured:
+            return frame
+        shift = captured - frame.captured
+        return dataclasses.replace(frame, captured=captured, utc=frame.utc + shift)
 
     def lost(self, count: int) -> None:
         """Take from the driver that frames were lost."""
@@ -412,6 +465,8 @@ class FrameSource(FrameSink):
 
     def _dropped(self, one: weakref.ref[FrameReader]) -> None:
         self._readers.discard(one)
+        if not self._readers and self._task is not None:
+            self._idle_since = self._task.get_loop().time()
         self._changed.set()
 
     def _forget(self, reader: FrameReader) -> None:
@@ -426,6 +481,9 @@ class FrameSource(FrameSink):
                     await self._stream()
                 except FrameSourceError as error:
                     self._tell(error)
+                except Exception as error:  # noqa: BLE001 - a driver may be anybody's
+                    _log.exception("%s: its driver failed", self.name)
+                    self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
         finally:
             self._newest = None
             await self._driver.close()
@@ -438,7 +496,7 @@ class FrameSource(FrameSink):
             await self._driver.start(self)
             self._streaming = True
             self._started += 1
-            self._last_came = time.monotonic()
+            self._last_came = asyncio.get_running_loop().time()
             await self._while_read()
         finally:
             self._streaming = False
@@ -452,12 +510,13 @@ class FrameSource(FrameSink):
         """Wait until the driver ended, it is stuck, or nobody reads for as long as it lingers."""
         while self._over is None:
             if not self._readers:
-                if not await self._within(self._linger, lambda: bool(self._readers)):
+                left = self._idle_since + self._linger - asyncio.get_running_loop().time()
+                if not await self._within(left, lambda: bool(self._readers)) and left <= 0:
                     return
             elif self._stall is None:
                 await self._until_changed(lambda: not self._readers)
             else:
-                left = self._last_came + self._stall - time.monotonic()
+                left = self._last_came + self._stall - asyncio.get_running_loop().time()
                 if left <= 0:
                     raise FrameSourceError(
                         f"{self.name}: it streams, but gave no frame for {self._stall:g} s",

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
 
-__all__ = ["SyntheticDriver", "read_stamp"]
 
 BITS: Final = 64
 """Of each of the two rows of a stamp."""
@@ -79,12 +78,13 @@ class SyntheticDriver(FrameDriver):
         width, height = self._size
         picture = stripes(width, height)
         grey = find_format("Mono8")
-        began, drawn = time.monotonic(), 0
+        loop = asyncio.get_running_loop()
+        began, drawn = loop.time(), 0
         while True:
             drawn += 1
-            await asyncio.sleep(began + drawn / self._rate - time.monotonic())
+            await asyncio.sleep(began + drawn / self._rate - loop.time())
             self._number += 1
-            late = int((time.monotonic() - began) * self._rate) - drawn  # those nobody had time for
+            late = int((loop.time() - began) * self._rate) - drawn  # those nobody had time for
             if late > 0:
                 drawn += late
                 self._number += late

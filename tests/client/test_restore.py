@@ -231,9 +231,13 @@ async def test_way_back_that_a_loss_interrupted_is_gone_again() -> None:
     async with by_hand(reconnect=FAST) as (box, camera):
         async with camera.application(3):
             switch, box.script[SWITCH] = box.script[SWITCH], quiet
+
+            def lose(_: object) -> None:  # the next session may begin before the block has ended
+                box.script[SWITCH] = switch
+                box.hang_up()
+
             leaving = asyncio.create_task(box.wait_for(SWITCH, 2))
-            leaving.add_done_callback(lambda _: box.hang_up())
-        box.script[SWITCH] = switch
+            leaving.add_done_callback(lose)
         await camera.wait_connected(SOON)
         assert (box.active, camera.status) == (7, Status(READY))
         assert await leaving == struct.pack("<I", 7)

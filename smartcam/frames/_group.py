@@ -1,0 +1,299 @@
+"""Several cameras at once: frames of one moment."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameSourceError,
+    FrameTimeoutError,
+    LocalProtocolError,
+)
+from smartcam.frames._source import FRAME_TIMEOUT, FrameReader
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import TracebackType
+    from typing import Self
+
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._source import FrameSource
+
+
+KEPT: Final = 8
+"""Frames of each camera that wait for those of the others."""
+
+UNKNOWN_PERIOD: Final = 0.04
+"""Seconds between frames of a camera that does not say."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSet:
+    """Frames of one moment, one of each camera.
+
+    Attributes:
+        frames: by the names that the group gave.
+        skew: seconds from the first to the last of them, by ``Frame.captured``.
+    """
+
+    frames: Mapping[str, Frame]
+    skew: float
+
+    def __getitem__(self, name: str) -> Frame:
+        """Return the frame of one camera."""
+        return self.frames[name]
+
+    @property
+    def captured(self) -> float:
+        """When the last of them was captured, seconds of ``time.monotonic()``."""
+        return max(frame.captured for frame in self.frames.values())
+
+
+@dataclass(frozen=True, slots=True)
+class GroupStatistics:
+    """What became of the frames of a group.
+
+    Attributes:
+        offered: sets that came together; always delivered + skipped + waiting.
+        delivered: sets that were taken.
+        skipped: sets that a newer one came before.
+        waiting: 1 where one is there that was not taken.
+        alone: of each camera, frames that found none of the same moment in every other one.
+        skew: the largest of any set, seconds.
+    """
+
+    offered: int
+    delivered: int
+    skipped: int
+    waiting: int
+    alone: Mapping[str, int]
+    skew: float
+
+
+class FrameGroup:
+    """Cameras that are opened, begin and end together; an iterator of :class:`FrameSet`.
+
+    ::
+
+        async with FrameGroup({"left": open(LEFT), "right": open(RIGHT)}) as pair:
+            async for both in pair:
+                both["left"], both["right"], both.skew
+
+    It gives the newest set, and skips what it missed. All cameras stream from the first iteration
+    on until the group is closed. Each frame is in one set at most.
+
+    Args:
+        sources: by name, none of them open; they are the group's from now on.
+        within: largest skew of a set, seconds; None: half of the time between two frames of the
+            fastest camera, so that each frame has one partner.
+        timeout: seconds that an iteration waits for a set; None: as long as it takes.
+
+    Raises:
+        ConfigurationError: no sources, one twice, or times that are none.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, FrameSource],
+        *,
+        within: float | None = None,
+        timeout: float | None = FRAME_TIMEOUT,
+    ) -> None:
+        if not sources or len({id(one) for one in sources.values()}) < len(sources):
+            raise ConfigurationError(
+                f"group of frame sources: expected one or more, each once, got {list(sources)}"
+            )
+        for name, value in (("within", within), ("timeout", timeout)):
+            if value is not None and not 0 < value < float("inf"):
+                raise ConfigurationError(f"{name}: expected seconds above 0 or None, got {value!r}")
+        self._sources = dict(sources)
+        self._within, self._timeout = within, timeout
+        self._readers: dict[str, _GroupReader] = {}
+        self._open = False
+        self._kept: dict[str, collections.deque[Frame]] = {
+            name: collections.deque() for name in sources
+        }
+        self._alone = dict.fromkeys(sources, 0)
+        self._next: FrameSet | None = None
+        self._over: tuple[FrameSourceError | None] | None = None
+        self._came = asyncio.Event()
+        self._offered = self._delivered = self._skipped = 0
+        self._skew = 0.0
+
+    @property
+    def sources(self) -> Mapping[str, FrameSource]:
+        """The cameras by name."""
+        return self._sources
+
+    @property
+    def within(self) -> float:
+        """Largest skew of a set, seconds.
+
+        Raises:
+            LocalProtocolError: it follows from what the cameras stream, and they are not open.
+        """
+        if self._within is not None:
+            return self._within
+        rates = [rate for one in self._sources.values() for rate in one.format.rates[:1]]
+        return 0.5 * (1 / max(rates) if rates else UNKNOWN_PERIOD)
+
+    def statistics(self) -> GroupStatistics:
+        """Return the account as it is now."""
+        return GroupStatistics(
+            self._offered,
+            self._delivered,
+            self._skipped,
+            int(self._next is not None),
+            dict(self._alone),
+            self._skew,
+        )
+
+    async def __aenter__(self) -> Self:
+        """Open all cameras at the same time; they do not stream yet.
+
+        Raises:
+            FrameSourceError: of the first one that cannot be opened; all are closed again.
+        """
+        if self._open:
+            raise LocalProtocolError("the group of frame sources is open already")
+        opening = [asyncio.ensure_future(source.__aenter__()) for source in self._sources.values()]
+        try:
+            await asyncio.gather(*opening)
+        except BaseException:
+            for one in opening:
+                one.cancel()
+            await asyncio.wait(opening)
+            await self._close_all()
+            raise
+        self._open = True
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End and close all cameras. Idempotent."""
+        self._open = False
+        for reader in self._readers.values():
+            reader.close()
+        self._readers.clear()
+        if self._next is not None:
+            self._next = None
+            self._skipped += 1
+        self._end(None)
+        await self._close_all()
+
+    async def _close_all(self) -> None:
+        for source in self._sources.values():
+            await source.close()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> FrameSet:
+        """Return the newest set that was not returned yet.
+
+        Raises:
+            FrameTimeoutError: none came in time; the text says which cameras gave frames.
+            FrameSourceError: of the first camera that ended with one.
+
+        Cancellation: safe; the set is there for the next one.
+        """
+        self._start()
+        try:
+            async with asyncio.timeout(self._timeout):
+                while self._next is None and self._over is None:
+                    self._came.clear()
+                    await self._came.wait()
+        except TimeoutError:
+            raise FrameTimeoutError(self._silence(), source=", ".join(self._sources)) from None
+        if self._next is not None:
+            taken, self._next = self._next, None
+            self._delivered += 1
+            return taken
+        if self._over is not None and self._over[0] is not None:
+            raise self._over[0]
+        raise StopAsyncIteration
+
+    def _start(self) -> None:
+        if not self._open:
+            raise LocalProtocolError("the group of frame sources is not open: async with it")
+        if not self._readers and self._over is None:
+            # all in one turn of the loop, so that each begins when the others do
+            self._readers = {
+                name: _GroupReader(source, self, name) for name, source in self._sources.items()
+            }
+
+    def _silence(self) -> str:
+        came = ", ".join(
+            f"{name} {reader.statistics().offered}" for name, reader in self._readers.items()
+        )
+        return (
+            f"frames of {' and '.join(self._sources)}: expected a set within "
+            f"{self.within * 1e3:.3g} ms of each other in {self._timeout:g} s, got none; frames "
+            f"that came in all: {came}"
+        )
+
+    def _take(self, name: str, frame: Frame) -> None:
+        """Take a frame of a camera; see whether it completes a set."""
+        kept = self._kept[name]
+        kept.append(frame)
+        if len(kept) > KEPT:
+            kept.popleft()
+            self._alone[name] += 1
+        found = {name: frame}
+        for other, waiting in self._kept.items():
+            if other != name:
+                if not waiting:
+                    return
+                found[other] = min(waiting, key=lambda one: abs(one.captured - frame.captured))
+        moments = [one.captured for one in found.values()]
+        skew = max(moments) - min(moments)
+        if skew > self.within:
+            return
+        for other, one in found.items():
+            self._drop_until(other, one)
+        self._offered += 1
+        self._skew = max(self._skew, skew)
+        if self._next is not None:
+            self._skipped += 1
+        self._next = FrameSet({key: found[key] for key in self._sources}, skew)
+        self._came.set()
+
+    def _drop_until(self, name: str, frame: Frame) -> None:
+        """Forget a frame that is in a set, and those before it, which will be in none."""
+        kept = self._kept[name]
+        while kept.popleft() is not frame:
+            self._alone[name] += 1
+
+    def _end(self, error: FrameSourceError | None) -> None:
+        if self._over is None:
+            self._over = (error,)
+        self._came.set()
+
+
+class _GroupReader(FrameReader):
+    """A reader that gives each frame to its group at once."""
+
+    def __init__(self, source: FrameSource, group: FrameGroup, name: str) -> None:
+        super().__init__(source, None)
+        self._group, self._member = group, name
+        source.attach(self)
+
+    def _offer(self, frame: Frame) -> None:
+        self._offered += 1
+        self._delivered += 1
+        self._group._take(self._member, frame)  # noqa: SLF001 - the two are one
+
+    def _end(self, error: FrameSourceError | None) -> None:
+        super()._end(error)
+        self._group._end(error)  # noqa: SLF001

@@ -1,0 +1,219 @@
+"""H.264 by x264 and FFmpeg, without a frame of delay."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from dataclasses import replace
+from fractions import Fraction
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+from smartcam.frames._optional_imports import load
+from smartcam.frames._pictures import decoded
+from smartcam.frames._pixels import find_format
+from smartcam.frames._video_frames import from_video, to_video
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.frames._frame import Frame
+
+
+T = TypeVar("T")
+
+HELD: Final = 32
+"""Encoded frames whose data a decoder remembers until their pictures come out."""
+
+
+class Runs(Protocol):
+    """What has a thread do something: ``Codecs``."""
+
+    def __call__(self, work: Callable[[], T], /) -> Awaitable[T]:
+        """Return what it returns."""
+
+
+class H264Encoder:
+    """One stream of H.264; made by :meth:`Codecs.h264_encoder`.
+
+    Each frame gives its own bytes at once. Instead of key frames, which are large, a column of each
+    frame is sent whole (intra refresh); the parameter sets are repeated, so who joins late sees
+    pictures within two times ``keyint`` frames. Another size or format begins the stream anew, and
+    so does a cancelled call, whose bytes nobody has.
+
+    U and V are shared by four pixels. Y goes in as the camera sent it, with its range told; only
+    RGB is converted, to BT.601 of limited range. A JPEG is decoded to RGB before.
+    """
+
+    def __init__(
+        self, run: Runs, *, fps: float, keyint: int, crf: float, bitrate: int | None
+    ) -> None:
+        load("av")
+        for name, value, least, most in (
+            ("fps", fps, 0.01, 1000.0),
+            ("keyint", keyint, 2, 600),
+            ("crf", crf, 0, 51),
+            ("bitrate", 10_000 if bitrate is None else bitrate, 10_000, 1_000_000_000),
+        ):
+            if not least <= value <= most:
+                raise ConfigurationError(
+                    f"h264_encoder: {name}: expected {least} to {most}, got {value!r}"
+                )
+        self._run = run
+        self._rate = Fraction(fps).limit_denominator(1000)
+        self._options = {
+            "preset": "ultrafast",
+            "tune": "zerolatency",
+            "x264-params": f"intra-refresh=1:keyint={int(keyint)}:repeat-headers=1",
+        }
+        if bitrate is None:
+            self._options["crf"] = f"{crf:g}"
+        else:
+            self._options |= {"maxrate": str(bitrate), "bufsize": str(bitrate // 4)}
+        self._bitrate = bitrate
+        self._turn = asyncio.Lock()
+        self._one = threading.Lock()  # a cancelled call's thread may still be at it
+        self._codec: Any = None
+        self._kind: tuple[object, ...] = ()
+        self._broken = 0  # calls whose bytes nobody has
+        self._count = 0
+
+    async def encode(self, frame: Frame) -> Frame:
+        """Return a frame of format ``H264`` with all that was known of the one given.
+
+        Raises:
+            FrameFormatError: it cannot become video: see the error for what can.
+            LocalProtocolError: the codecs are closed.
+
+        Cancellation: safe; the stream begins anew with the next frame.
+        """
+        async with self._turn:
+            try:
+                return await self._run(partial(self._encode, frame, self._broken))
+            except BaseException:
+                self._broken += 1
+                raise
+
+    def _encode(self, frame: Frame, broken: int) -> Frame:
+        with self._one:
+            if frame.format.name == "MJPEG":
+                frame = decoded(frame, "RGB8")
+            video = to_video(frame)
+            kind = (broken, video.width, video.height, video.format.name, *_colours(video))
+            if kind != self._kind:
+                self._codec = self._begun(video)
+                self._kind = kind
+            video.pts = self._count
+            video.time_base = 1 / self._rate
+            self._count += 1
+            packets = self._codec.encode(video)
+            data = b"".join(bytes(packet) for packet in packets)
+            return replace(frame, data=data, format=find_format("H264"), stride=0)
+
+    def _begun(self, video: Any) -> Any:
+        codec = load("av").CodecContext.create("libx264", "w")
+        codec.width, codec.height, codec.pix_fmt = video.width, video.height, video.format.name
+        codec.framerate, codec.time_base = self._rate, 1 / self._rate
+        codec.color_range, codec.colorspace = _colours(video)
+        codec.thread_count = 1
+        codec.options = self._options
+        if self._bitrate is not None:
+            codec.bit_rate = self._bitrate
+        return codec
+
+
+class H264Decoder:
+    """One stream of H.264; made by :meth:`Codecs.h264_decoder`."""
+
+    def __init__(self, run: Runs) -> None:
+        load("av")
+        self._run = run
+        self._turn = asyncio.Lock()
+        self._one = threading.Lock()
+        self._codec: Any = None
+        self._losses = self._losses_seen = 0
+        self._whole = False
+        self._held: dict[int, Frame] = {}
+        self._count = 0
+
+    def lost(self) -> None:
+        """Say that bytes of the stream are missing: no picture until it is whole again.
+
+        A decoder cannot see what is missing, and would go on with a picture that is none.
+        """
+        self._losses += 1
+
+    async def decode(self, frame: Frame) -> Frame | None:
+        """Return the next picture, with all that was known of its encoded frame.
+
+        Args:
+            frame: of format ``H264``; one encoded frame, whole.
+
+        Returns:
+            None as long as there is no whole picture: at the start in the midst of a stream, and
+            after a loss.
+
+        Raises:
+            FrameFormatError: damaged, or of another size than the frame says; the pictures after it
+                wait until the stream is whole again.
+            LocalProtocolError: the codecs are closed.
+
+        Cancellation: safe; it counts as a loss.
+        """
+        async with self._turn:
+            try:
+                return await self._run(partial(self._decode, frame, self._losses))
+            except BaseException:
+                self.lost()
+                raise
+
+    def _decode(self, frame: Frame, losses: int) -> Frame | None:
+        with self._one:
+            if self._codec is None or losses != self._losses_seen:
+                self._begin(frame)
+                self._losses_seen = losses
+            packet = load("av").Packet(frame.data)
+            self._count += 1
+            packet.pts = self._count
+            self._held[self._count] = frame
+            if len(self._held) > HELD:
+                del self._held[next(iter(self._held))]
+            try:
+                pictures = self._codec.decode(packet)
+            except load("av").FFmpegError as exc:
+                if not self._whole:
+                    return None
+                raise _damaged(frame, str(exc)) from exc
+            whole = [self._made(picture) for picture in pictures if not picture.is_corrupt]
+            if len(whole) < len(pictures) and self._whole:
+                raise _damaged(frame, "a picture with holes")
+            self._whole = self._whole or bool(whole)
+            return whole[-1] if whole else None
+
+    def _begin(self, frame: Frame) -> None:
+        self._codec = codec = load("av").CodecContext.create("h264", "r")
+        codec.thread_count = 1
+        room = (frame.width + 64) * (frame.height + 64)
+        codec.options = {"flags": "low_delay", "max_pixels": str(room)}
+        self._held.clear()
+        self._whole = False
+
+    def _made(self, picture: Any) -> Frame:
+        frame = self._held.pop(picture.pts)
+        pixels = from_video(picture)
+        if (pixels.width, pixels.height) != (frame.width, frame.height):
+            raise _damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
+        return replace(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
+
+
+def _colours(video: Any) -> tuple[int, int]:
+    return int(video.color_range), int(video.colorspace)
+
+
+def _damaged(frame: Frame, got: str) -> FrameFormatError:
+    return FrameFormatError(
+        f"{frame.source}: H264 {frame.width}x{frame.height}: expected a whole encoded frame, got "
+        f"{len(frame.data)} bytes: {got}",
+        source=frame.source,
+    )

@@ -1,0 +1,28 @@
+"""What the extras bring, imported where it is first used."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, Final
+
+from smartcam.exceptions import MissingExtraError
+
+EXTRAS: Final = {
+    "simplejpeg": ("JPEG needs simplejpeg", "frames"),
+    "imagecodecs": ("PNG and JPEG XL need imagecodecs", "frames"),
+    "av": ("video needs PyAV", "video"),
+    "cv2": ("the colours of a Bayer pattern need OpenCV", "calibration"),
+}
+"""What for, and the extra, of each module."""
+
+
+def load(name: str) -> Any:
+    """Return a module that an extra brings; untyped, which is why it is any.
+
+    Raises MissingExtraError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as exc:
+        reason, extra = EXTRAS[name]
+        raise MissingExtraError(f'{reason}: pip install "smartcam[{extra}]"', extra=extra) from exc

@@ -1,0 +1,115 @@
+"""What is done to frames on their way: the lens taken out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._stereo.rectification import Rectification
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._group import FrameSet
+
+
+class Undistorter:
+    """Pictures as a lens without distortion would show them; its maps are made once.
+
+    Args:
+        camera: the lens.
+        alpha: 0: all pixels of the output are valid; 1: all of the source are kept.
+
+    Attributes:
+        camera: the lens of what comes out: no distortion.
+
+    Raises:
+        ConfigurationError: an alpha outside of 0 to 1.
+        MissingExtraError: OpenCV (extra ``calibration``) is not installed.
+    """
+
+    def __init__(self, camera: CameraModel, *, alpha: float = 0.0) -> None:
+        if not 0 <= alpha <= 1:
+            raise ConfigurationError(f"undistort: alpha: expected 0 to 1, got {alpha!r}")
+        cv2 = load("cv2")
+        self._size = tuple(camera.size)
+        lens, turn = (camera.matrix, camera.distortion), np.eye(3)
+        if camera.distortion_model == "equidistant":
+            straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+                *lens, camera.size, turn, balance=alpha
+            )
+            maps = cv2.fisheye.initUndistortRectifyMap(
+                *lens, turn, straight, camera.size, cv2.CV_16SC2
+            )
+        else:
+            straight = cv2.getOptimalNewCameraMatrix(*lens, camera.size, alpha)[0]
+            maps = cv2.initUndistortRectifyMap(*lens, turn, straight, camera.size, cv2.CV_16SC2)
+        self._maps = maps
+        self.camera: CameraModel = CameraModel(size=camera.size, matrix=straight)
+
+    def __call__(self, frame: Frame, *, colour: bool = False) -> NDArray[Any]:
+        """Return a frame's picture without distortion; 0 where there is no source.
+
+        Args:
+            frame: of the lens' size.
+            colour: whether its colours are wanted, (H, W, 3); else its brightness, (H, W).
+
+        Raises:
+            FrameFormatError: it has another size, or not what is wanted.
+        """
+        _check_size(frame, self._size)
+        picture = frame.rgb() if colour else frame.grey()
+        cv2 = load("cv2")
+        return np.asarray(cv2.remap(picture, *self._maps, cv2.INTER_LINEAR))
+
+
+class Rectifier:
+    """Pairs of pictures whose rows show the same points; the maps are those of a calibration.
+
+    Args:
+        rectification: what :meth:`~smartcam.calibration.StereoCalibration.rectify` gives.
+        size: of the sources, width and height in pixels.
+        left: name of the left camera in the sets.
+        right: of the right one.
+    """
+
+    def __init__(
+        self,
+        rectification: Rectification,
+        size: tuple[int, int],
+        *,
+        left: str = "left",
+        right: str = "right",
+    ) -> None:
+        cv2 = load("cv2")
+        self._names, self._size = (left, right), tuple(size)
+        self._maps = tuple(cv2.convertMaps(one, None, cv2.CV_16SC2) for one in rectification.maps)
+
+    def __call__(self, pair: FrameSet, *, colour: bool = False) -> tuple[NDArray[Any], ...]:
+        """Return both pictures rectified, the left one first; 0 where there is no source.
+
+        Raises:
+            FrameFormatError: a frame has another size, or not what is wanted.
+        """
+        cv2 = load("cv2")
+        pictures = []
+        for name, maps in zip(self._names, self._maps, strict=True):
+            frame = pair[name]
+            _check_size(frame, self._size)
+            picture = frame.rgb() if colour else frame.grey()
+            pictures.append(np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR)))
+        return tuple(pictures)
+
+
+def _check_size(frame: Frame, size: tuple[int, ...]) -> None:
+    if (frame.width, frame.height) != size:
+        raise FrameFormatError(
+            f"{frame.source}: expected frames of the lens' {size[0]}x{size[1]}, got "
+            f"{frame.width}x{frame.height}",
+            source=frame.source,
+        )

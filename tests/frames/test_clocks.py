@@ -1,0 +1,62 @@
+"""A camera's clock on ours."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from smartcam.frames._clocks import DeviceClock
+
+
+@given(
+    st.floats(-3e-4, 3e-4),
+    st.floats(0, 1e6),
+    st.integers(0, 1000),
+    st.sampled_from([5.0, 30.0, 120.0]),
+)
+def test_drift_and_moment_are_found_whatever_the_way_takes(
+    drift: float, ahead: float, seed: int, rate: float
+) -> None:
+    chance, clock = random.Random(seed), DeviceClock()  # noqa: S311
+    for number in range(int(60 * rate)):
+        taken = 1000 + number / rate
+        way = 0.002 + (chance.expovariate(500) if chance.random() < 0.9 else 0.2 * chance.random())
+        found = clock.captured(ahead + taken * (1 + drift), taken + way)
+        assert found <= taken + way
+        if number > 20 * rate:
+            assert found - taken == pytest.approx(0.002, abs=0.0015)
+    said = clock.statistics()
+    assert said.jumps == 0
+    assert said.drift == pytest.approx(drift, abs=1e-4)
+
+
+@pytest.mark.parametrize("by", [-100.0, -0.03, 0.2, 3600.0, -3600.0])
+def test_clock_that_is_set_anew_is_seen_and_followed(by: float) -> None:
+    clock, jumped = DeviceClock(), 0.0
+    for number in range(400):
+        taken = number * 0.02
+        jumped = by if number >= 200 else 0.0
+        found = clock.captured(50 + taken + jumped, taken + 0.004)
+        if not 200 <= number < 210:
+            assert found == pytest.approx(taken + 0.004)
+        assert found <= taken + 0.004
+    assert clock.statistics().jumps == 1
+
+
+def test_frames_that_come_late_for_a_while_are_no_jump() -> None:
+    clock = DeviceClock()
+    for number in range(600):
+        taken = number * 0.1
+        way = 0.8 if 100 < number < 120 else 0.001
+        assert clock.captured(taken, taken + way) == pytest.approx(taken + 0.001, abs=1e-4)
+    assert clock.statistics().jumps == 0
+
+
+def test_drift_is_not_told_before_there_is_enough() -> None:
+    clock = DeviceClock()
+    for number in range(7):
+        clock.captured(number * 0.5, number * 0.5)
+        assert clock.statistics().drift is None

@@ -1,0 +1,276 @@
+"""Pixel formats: what their bytes become."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from smartcam.exceptions import FrameFormatError, MissingExtraError
+from smartcam.frames import find_format
+from smartcam.frames._pixels import PIXEL_FORMATS, PixelFormat
+
+PACKED = [
+    (b"\x23\x61\x45\xab\xcd", "Mono10p", [0x123, 0x158, 0x2B4, 0x336]),
+    (b"\x23\x61\x45", "Mono12p", [0x123, 0x456]),
+    (b"\x12\x63\x45", "Mono12Packed", [0x123, 0x456]),
+    (b"\x48\x23\x59", "Mono10Packed", [0x123, 0x166]),
+]
+"""Bytes, and the pixels that they are by the figures of PFNC and GigE Vision, done by hand:
+12p 23 61 45 is 0x456123 as a little-endian number, of which the lowest 12 bits come first."""
+
+
+def packed_by_hand(name: str, pixels: list[int]) -> bytes:
+    """Pack one pixel after the other, in plain Python."""
+    depth = 10 if "10" in name else 12
+    if name.endswith("p"):
+        number = sum(pixel << depth * place for place, pixel in enumerate(pixels))
+        return number.to_bytes((len(pixels) * depth + 7) // 8, "little")
+    packed, low = bytearray(), depth - 8
+    for first in range(0, len(pixels), 2):
+        pair = pixels[first : first + 2]
+        middle = sum((pixel & ((1 << low) - 1)) << 4 * place for place, pixel in enumerate(pair))
+        packed += bytes((pair[0] >> low, middle, *(pixel >> low for pixel in pair[1:])))
+    return bytes(packed)
+
+
+@pytest.mark.parametrize(("data", "name", "pixels"), PACKED)
+def test_packed_bytes_of_the_standard(data: bytes, name: str, pixels: list[int]) -> None:
+    array = find_format(name).array(data, len(pixels), 1, len(data))
+    assert array.tolist() == [pixels]
+    assert array.dtype == np.uint16
+    assert not array.flags.writeable
+    assert packed_by_hand(name, pixels) == data
+
+
+@given(
+    name=st.sampled_from([one.name for one in PIXEL_FORMATS if re.search("(p|Packed)$", one.name)]),
+    width=st.integers(1, 9),
+    height=st.integers(1, 4),
+    padding=st.none() | st.integers(0, 3),
+    data=st.data(),
+)
+def test_packing_agrees_with_plain_python(
+    name: str, width: int, height: int, padding: int | None, data: st.DataObject
+) -> None:
+    found = find_format(name)
+    values = st.integers(0, (1 << found.depth) - 1)
+    rows = data.draw(st.lists(st.lists(values, min_size=width, max_size=width), min_size=height))
+    rows = rows[:height]
+    if padding is None:  # rows follow each other within a byte
+        raw, stride = packed_by_hand(name, [pixel for row in rows for pixel in row]), 0
+    else:
+        raw = b"".join(packed_by_hand(name, row) + b"\xff" * padding for row in rows)
+        stride = found.stride(width) + padding
+    assert found.array(raw, width, height, stride).tolist() == rows
+    assert found.size(width, height, stride) + (padding or 0) == len(raw)
+
+
+@pytest.mark.parametrize("one", PIXEL_FORMATS, ids=lambda one: one.name)
+def test_every_name_code_and_fourcc_finds_its_format(one: PixelFormat) -> None:
+    assert find_format(one.name) is one
+    assert find_format(one.name.lower()) is one
+    for key in (one.fourcc, one.code):
+        assert not key or find_format(key) is one
+
+
+def test_codes_tell_the_bits_of_a_pixel() -> None:
+    """The third and fourth digit of a code of PFNC are the bits that a pixel takes."""
+    coded = [one for one in PIXEL_FORMATS if one.code]
+    assert len(coded) > 40
+    assert [one.name for one in coded if one.code >> 16 & 0xFF != one.bits] == []
+    assert len({one.code for one in coded}) == len(coded)
+
+
+def test_names_of_v4l2_are_those_of_the_header() -> None:
+    header = Path("/usr/include/linux/videodev2.h")
+    if not header.exists():
+        pytest.skip("needs Linux' header videodev2.h (Debian: linux-libc-dev)")
+    quads = re.findall(r"v4l2_fourcc\('(.)', '(.)', '(.)', '(.)'\)", header.read_text())
+    known = {"".join(quad).rstrip() for quad in quads}
+    named = {one.fourcc for one in PIXEL_FORMATS} - {""}
+    assert len(named) > 25
+    assert named - known == set()
+
+
+def test_alias_and_blanks() -> None:
+    assert find_format("Z16 ").name == "Coord3D_C16"
+    assert find_format("jpeg").name == "MJPEG"
+
+
+@pytest.mark.parametrize("name", ["Mono9", 0x01080099])
+def test_unknown_format_lists_the_known(name: str | int) -> None:
+    with pytest.raises(FrameFormatError, match=r"unknown pixel format .*known are Mono8, ") as got:
+        find_format(name)
+    assert "NV12" in got.value.available
+
+
+@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
+def test_rows_with_padding_are_a_view(kind: type) -> None:
+    raw = np.arange(2 * 8, dtype=np.uint8)
+    data = kind(raw.tobytes())
+    array = find_format("Mono8").array(data, 5, 2, 8)
+    assert array.tolist() == raw.reshape(2, 8)[:, :5].tolist()
+    assert np.shares_memory(array, np.frombuffer(data, np.uint8))
+    assert not array.flags.writeable
+
+
+def test_last_row_needs_no_padding() -> None:
+    assert find_format("Mono8").array(bytes(8 + 5), 5, 2, 8).shape == (2, 5)
+
+
+def test_sixteen_bit_rows_with_an_odd_stride_are_a_view() -> None:
+    raw = bytes([1, 2, 3, 4, 0, 5, 6, 7, 8, 0])
+    array = find_format("Mono12").array(raw, 2, 2, 5)
+    assert array.tolist() == [[0x201, 0x403], [0x605, 0x807]]
+    assert np.shares_memory(array, np.frombuffer(raw, np.uint8))
+
+
+def test_depth_has_distances_only() -> None:
+    depth = find_format("Z16")
+    assert depth.array(bytes([1, 2]), 1, 1, 2).tolist() == [[0x201]]
+    for read in (depth.grey, depth.rgb):
+        with pytest.raises(FrameFormatError, match="got distances"):
+            read(bytes(2), 1, 1, 2)
+
+
+@pytest.mark.parametrize(
+    "one", [one for one in PIXEL_FORMATS if not one.compressed], ids=lambda one: one.name
+)
+def test_short_bytes_are_told_at_every_length(one: PixelFormat) -> None:
+    size = one.size(5, 3)
+    stride = one.stride(5)
+    assert one.array(bytes(size), 5, 3, stride).size
+    for length in range(size):
+        with pytest.raises(FrameFormatError, match=f"expected {size} bytes, got {length}"):
+            one.array(bytes(length), 5, 3, stride)
+    with pytest.raises(FrameFormatError, match="from row to row"):
+        one.array(bytes(size), 5, 3, stride - 1)
+    with pytest.raises(FrameFormatError, match="1 or more, got 0x3"):
+        one.array(bytes(size), 0, 3, stride)
+
+
+@pytest.mark.parametrize("name", ["YUYV", "UYVY"])
+def test_grey_of_pairs_is_the_cameras_own_plane(name: str) -> None:
+    data = bytes(range(16)) + b"\xff\xff"  # two pairs a row, and padding
+    found = find_format(name)
+    grey = found.grey(data, 4, 2, 9)
+    first = 0 if name == "YUYV" else 1
+    assert grey.tolist() == [[data[9 * y + first + 2 * x] for x in range(4)] for y in range(2)]
+    assert np.shares_memory(grey, np.frombuffer(data, np.uint8))
+    assert found.grey_is_sent
+    assert found.array(data, 4, 2, 9).shape == (2, 4, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "planes"),
+    [
+        ("NV12", ([[0, 1, 2], [4, 5, 6], [8, 9, 10]], [[12, 14], [16, 18]], [[13, 15], [17, 19]])),
+        ("I420", ([[0, 1, 2], [4, 5, 6], [8, 9, 10]], [[12, 13], [14, 15]], [[16, 17], [18, 19]])),
+    ],
+)
+def test_planes_with_padding_and_odd_size(name: str, planes: tuple[list[list[int]], ...]) -> None:
+    found = find_format(name)
+    data = bytes(range(20))
+    assert found.size(3, 3, 4) == 20
+    assert [plane.tolist() for plane in found.planes(data, 3, 3, 4)] == list(planes)
+    assert np.shares_memory(found.grey(data, 3, 3, 4), np.frombuffer(data, np.uint8))
+    assert found.rgb(data, 3, 3, 4).shape == (3, 3, 3)
+    assert found.array(data, 3, 3, 4).shape == (20,)
+
+
+def expected_rgb(y: int, u: int, v: int, name: str) -> list[float]:
+    """Return the colours by the formulas of the recommendations, in floating point."""
+    red, blue = (0.2126, 0.0722) if "709" in name else (0.299, 0.114)
+    full = "full" in name or name.startswith("YCbCr422")
+    bright = y / 255 if full else (y - 16) / 219
+    cb, cr = ((value - 128) / (255 if full else 224) for value in (u, v))
+    r, b = bright + 2 * (1 - red) * cr, bright + 2 * (1 - blue) * cb
+    g = (bright - red * r - blue * b) / (1 - red - blue)
+    return [min(max(255 * value, 0.0), 255.0) for value in (r, g, b)]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [one.name for one in PIXEL_FORMATS if re.match(r"YUV|YCbCr|NV12|I4", one.name)],
+)
+def test_colours_are_exact_to_the_rounding(name: str) -> None:
+    found = find_format(name)
+    for y, u, v in [(16, 128, 128), (235, 128, 128), (81, 90, 240), (145, 54, 34), (41, 240, 110)]:
+        order = (u, y, v, y) if found.name.endswith(("UYVY", "CbYCrY")) else (y, u, y, v)
+        data = bytes(order) * 2
+        if not name.startswith("Y"):
+            shared = found.size(2, 2) - 4
+            data = bytes([y] * 4)
+            data += (
+                bytes([u, v])
+                if name.startswith("NV")
+                else bytes([u] * (shared // 2) + [v] * (shared // 2))
+            )
+        got = found.rgb(data, 2, 2, found.stride(2)).astype(float)
+        wanted = np.broadcast_to(expected_rgb(y, u, v, name), (2, 2, 3))
+        assert np.abs(got - wanted).max() <= 0.501, (y, u, v)
+
+
+def test_grey_of_colours_is_made_and_says_so() -> None:
+    data = bytes([255, 0, 0, 0, 255, 0, 0, 0, 255, 255, 255, 255])
+    assert find_format("RGB8").grey(data, 4, 1, 12).tolist() == [[76, 150, 29, 255]]
+    assert find_format("BGR8").grey(data, 4, 1, 12).tolist() == [[29, 150, 76, 255]]
+    assert find_format("BGR8").rgb(data, 4, 1, 12)[0, 0].tolist() == [0, 0, 255]
+    assert not find_format("RGB8").grey_is_sent
+
+
+def test_colours_of_grey_are_its_grey_three_times() -> None:
+    assert find_format("Mono8").rgb(b"\x07\x08", 2, 1, 2).tolist() == [[[7, 7, 7], [8, 8, 8]]]
+
+
+@pytest.mark.parametrize("pattern", ["RG", "GR", "GB", "BG"])
+@pytest.mark.parametrize("end", ["8", "12", "12p", "16"])
+def test_bayer_pattern_gives_the_colours_it_was_made_of(pattern: str, end: str) -> None:
+    """Each of four fields has one colour: what is read in its middle must be that colour."""
+    found = find_format(f"Bayer{pattern}{end}")
+    top = (1 << found.depth) - 1
+    fields = {(0, 0): (top, 0, 0), (0, 1): (0, top, 0), (1, 0): (0, 0, top), (1, 1): (top, top, 0)}
+    letters = pattern + {"RG": "GB", "GR": "BG", "GB": "RG", "BG": "GR"}[pattern]
+    rows = [
+        [fields[y // 8, x // 8]["RGB".index(letters[y % 2 * 2 + x % 2])] for x in range(16)]
+        for y in range(16)
+    ]
+    flat = np.array(rows, "<u2" if found.depth > 8 else np.uint8)
+    data = (
+        flat.tobytes()
+        if not end.endswith("p")
+        else packed_by_hand(end, [pixel for row in rows for pixel in row])
+    )
+    rgb = found.rgb(data, 16, 16, found.stride(16))
+    assert {key: tuple(rgb[4 + 8 * key[0], 4 + 8 * key[1]].tolist()) for key in fields} == fields
+    grey = found.grey(data, 16, 16, found.stride(16))
+    assert abs(int(grey[4, 12]) - 0.587 * top) <= 0.01 * top
+    assert not found.grey_is_sent
+
+
+def test_bayer_without_opencv_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "cv2", None)
+    found = find_format("BayerRG8")
+    assert found.array(bytes(4), 2, 2, 2).shape == (2, 2)
+    with pytest.raises(MissingExtraError, match=r"smartcam\[calibration\]") as got:
+        found.rgb(bytes(4), 2, 2, 2)
+    assert got.value.extra == "calibration"
+
+
+def test_compressed_bytes_are_given_as_they_are() -> None:
+    video = find_format("H264")
+    assert video.array(b"abc", 640, 480, 0).tolist() == [97, 98, 99]
+    assert video.array(b"", 640, 480, 0).size == 0
+    for read in (video.grey, video.rgb):
+        with pytest.raises(FrameFormatError, match=r"Codecs\.h264_decoder"):
+            read(b"abc", 640, 480, 0)
+
+
+def test_planes_of_a_format_without_are_told() -> None:
+    with pytest.raises(FrameFormatError, match="a format of Y, U and V"):
+        find_format("Mono8").planes(bytes(4), 2, 2, 2)
