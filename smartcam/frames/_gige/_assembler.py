@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from smartcam.frames._gige._block import Picture
     from smartcam.frames._gige._gvsp import Header
 
-__all__ = ["Assembler", "Counts", "Resend"]
-
 MOST_OPEN: Final = 4
 """Blocks that wait for packets or for an earlier block: at 100 frames/s 40 ms."""
 
@@ -138,10 +136,14 @@ class Assembler:
         current = self._current
         if current is not None and size == self._datagram:
             status, block_id, word = _SHORT.unpack_from(data)
-            if word == current.expected and block_id == current.block_id and status == 0:
-                if current.take_next(word & PACKET, data[HEADER:size], now):
-                    self._accepted = now
-                    return
+            if (
+                word == current.expected
+                and block_id == current.block_id
+                and status == 0
+                and current.take_next(word & PACKET, data[HEADER:size], now)
+            ):
+                self._accepted = now
+                return
         header = decode_header(data, size)
         if header is None or not header.block:
             self.counts.malformed += 1

@@ -6,13 +6,16 @@ import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._gige._gvsp import EXTENDED_HEADER, HEADER, decode_leader, decode_trailer
-from smartcam.frames._gige._pfnc import bits_of
+from smartcam.frames._gige._gvsp import (
+    EXTENDED_HEADER,
+    HEADER,
+    bits_of,
+    decode_leader,
+    decode_trailer,
+)
 
 if TYPE_CHECKING:
     from smartcam.frames._gige._gvsp import Leader
-
-__all__ = ["PACKET", "Block", "Picture", "picture_bytes"]
 
 PAYLOAD: Final = 0x03000000
 """Kind of a payload packet, above its id: the second word of its header."""

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames._gige._assembler import Resend
 
-__all__ = ["ControlChannel", "heartbeat"]
-
 ANSWER: Final = 0.3
 """Seconds for an answer: the standard lets a camera take 200 ms before it says "pending"."""
 
@@ -272,9 +270,10 @@ class ControlChannel(asyncio.DatagramProtocol):
         else:
             self.dropped += 1
 
-    def error_received(self, exc: OSError) -> None:
+    def error_received(self, exc: Exception) -> None:
         """Take that nothing listens there."""
-        self._take(exc)
+        if isinstance(exc, OSError):
+            self._take(exc)
 
 
 class RefusedError(FrameSourceError):

@@ -17,8 +17,6 @@ from xml.parsers import expat
 
 from smartcam.exceptions import MessageError
 
-__all__ = ["LARGEST", "Element", "Location", "locate", "parse", "unpack"]
-
 LARGEST: Final = 16 << 20
 """Bytes of a description, packed or not; those of large cameras have 2 MB."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import ipaddress
 import socket
 import struct
@@ -22,8 +23,6 @@ from smartcam.frames._gige._gvcp import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-__all__ = ["Camera", "Network", "find", "networks"]
 
 WAIT: Final = 0.5
 """Seconds for answers; the standard has cameras answer within 200 ms."""
@@ -98,12 +97,12 @@ async def find(places: Iterable[Network], *, port: int = PORT, wait: float = WAI
     """
     loop = asyncio.get_running_loop()
     asked: list[_Asking] = []
-    transports: list[asyncio.BaseTransport] = []
+    transports: list[asyncio.DatagramTransport] = []
     try:
         for place in places:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, asking = await loop.create_datagram_endpoint(
-                    lambda place=place: _Asking(place),
+                    functools.partial(_Asking, place),
                     local_addr=(place.address, 0),
                     allow_broadcast=True,
                 )
@@ -116,8 +115,8 @@ async def find(places: Iterable[Network], *, port: int = PORT, wait: float = WAI
                     )
         await asyncio.sleep(wait)
     finally:
-        for transport in transports:
-            transport.close()
+        for opened in transports:
+            opened.close()
     answers = sorted((one for it in asked for one in it.found), key=lambda one: one.reachable)
     found = {(one.info.mac, one.info.serial, one.address): one for one in answers}
     return sorted(found.values(), key=lambda one: (one.info.label, one.address))
@@ -141,5 +140,5 @@ class _Asking(asyncio.DatagramProtocol):
         if len(self.found) < MOST_CAMERAS:
             self.found.append(Camera(info, info.address, reachable))
 
-    def error_received(self, exc: OSError) -> None:
+    def error_received(self, exc: Exception) -> None:
         """Take that nobody listens at one of the targets."""

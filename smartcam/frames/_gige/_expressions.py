@@ -19,8 +19,6 @@ from smartcam.exceptions import MessageError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-__all__ = ["evaluate"]
-
 Number: TypeAlias = "int | float"
 Tree: TypeAlias = "tuple[str, tuple[Tree, ...]] | int | float | str"
 
@@ -119,7 +117,7 @@ _UNARY: Final[Mapping[str, Callable[[Number], Number]]] = {
 }
 
 _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Number]]]] = {
-    "ABS": (1, abs),
+    "ABS": (1, lambda value: abs(value)),
     "ACOS": (1, math.acos),
     "ASIN": (1, math.asin),
     "ATAN": (1, math.atan),
@@ -129,7 +127,7 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Number]]]] = {
     "FLOOR": (1, math.floor),
     "LG": (1, math.log10),
     "LN": (1, math.log),
-    "NEG": (1, operator.neg),
+    "NEG": (1, lambda value: -value),
     "ROUND": (2, _rounded),
     "SGN": (1, lambda value: (value > 0) - (value < 0)),
     "SIN": (1, math.sin),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameSourceError, MessageError
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from smartcam.frames._gige._description import Element
-
-__all__ = ["Features", "Port", "Value"]
 
 Value: TypeAlias = "int | float | str | bool"
 
@@ -45,9 +43,11 @@ class Port(Protocol):
 
     async def read(self, address: int, length: int) -> bytes:
         """Return ``length`` bytes."""
+        ...
 
     async def write(self, address: int, data: bytes) -> None:
         """Write them."""
+        ...
 
 
 class Features:
@@ -463,7 +463,7 @@ def _signed(node: Element) -> bool:
     return node.text_of("Sign") == "Signed"
 
 
-def _order(node: Element) -> str:
+def _order(node: Element) -> Literal["big", "little"]:
     return "big" if node.text_of("Endianess") == "BigEndian" else "little"
 
 

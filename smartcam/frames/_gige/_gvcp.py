@@ -14,25 +14,6 @@ from typing import Final, NamedTuple
 
 from smartcam.exceptions import MessageError
 
-__all__ = [
-    "MOST_MEMORY",
-    "PORT",
-    "Ack",
-    "Command",
-    "DeviceInfo",
-    "Register",
-    "Status",
-    "decode_ack",
-    "encode",
-    "encode_resend",
-    "read_memory",
-    "read_registers",
-    "status_text",
-    "text",
-    "write_memory",
-    "write_registers",
-]
-
 PORT: Final = 3956
 """Where cameras listen."""
 

@@ -15,19 +15,6 @@ from typing import Final, NamedTuple
 
 from smartcam.exceptions import MessageError
 
-__all__ = [
-    "EXTENDED_HEADER",
-    "HEADER",
-    "IP_UDP",
-    "Header",
-    "Kind",
-    "Leader",
-    "PayloadType",
-    "decode_header",
-    "decode_leader",
-    "decode_trailer",
-]
-
 IP_UDP: Final = 28
 """Bytes of the IP and UDP headers, which a camera's packet size counts."""
 
@@ -43,6 +30,11 @@ _LONG: Final = struct.Struct(">HHIQI")
 _LEADER: Final = struct.Struct(">HHQ")
 _IMAGE: Final = struct.Struct(">IIIIIHH")
 _TRAILER: Final = struct.Struct(">HHI")
+
+
+def bits_of(pixel_format: int) -> int:
+    """Return the bits of a pixel, which stand in PFNC's number."""
+    return pixel_format >> 16 & 0xFF
 
 
 class Kind(IntEnum):

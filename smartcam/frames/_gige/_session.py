@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames._gige._description import Element
 
-__all__ = ["Session"]
-
 OPENING: Final = 60.0
 """Seconds until a camera is opened; most of it is its description, 512 bytes at a time."""
 
@@ -153,7 +151,7 @@ class Session:
             try:
                 lies = locate(url)
                 data = await self.control.read(lies.address, lies.length)
-                return await _in_thread(lambda data=data: parse(unpack(data)), self.label)
+                return await _in_thread(functools.partial(_nodes, data), self.label)
             except (MessageError, RefusedError) as exc:
                 tried.append(str(exc))
         raise FrameSourceError(
@@ -161,10 +159,14 @@ class Session:
         )
 
 
+def _nodes(data: bytes) -> dict[str, Element]:
+    return parse(unpack(data))
+
+
 async def _in_thread(work: Callable[[], dict[str, Element]], label: str) -> dict[str, Element]:
     """Do work beside the loop: 2 MB of XML take a quarter of a second."""
     pool = ThreadPoolExecutor(1, thread_name_prefix=f"description of {label}")
     try:
-        return await asyncio.get_running_loop().run_in_executor(pool, functools.partial(work))
+        return await asyncio.get_running_loop().run_in_executor(pool, work)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)

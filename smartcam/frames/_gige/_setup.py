@@ -15,8 +15,7 @@ from smartcam.frames._gige._gvcp import (
     PACKET_SIZE_MASK,
     Register,
 )
-from smartcam.frames._gige._gvsp import EXTENDED_HEADER, IP_UDP
-from smartcam.frames._gige._pfnc import bits_of, name_of
+from smartcam.frames._gige._gvsp import EXTENDED_HEADER, IP_UDP, bits_of
 from smartcam.frames._pixels import find_format
 
 if TYPE_CHECKING:
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
     from smartcam.frames._gige._session import Session
     from smartcam.frames._gige._stream import StreamSocket
     from smartcam.frames._pixels import PixelFormat
-
-__all__ = ["FEATURE", "PACKETS", "Shape", "Wanted", "connect", "lock", "set_up"]
 
 FEATURE: Final = "feature."
 """What the URL's parameters of features begin with."""
@@ -91,9 +88,9 @@ async def set_up(session: Session, wanted: Wanted) -> Shape:
     with contextlib.suppress(FrameSourceError):  # it does not stream, which may be an error
         await features.execute("AcquisitionStop")
     await lock(features, False)
-    if "AcquisitionMode" in features:
-        if "Continuous" in await features.entries("AcquisitionMode"):
-            await features.set("AcquisitionMode", "Continuous")
+    mode = "AcquisitionMode"
+    if mode in features and "Continuous" in await features.entries(mode):
+        await features.set(mode, "Continuous")
     for name, value in wanted.said.items():
         if name == "format":
             await _set_format(session, value)
@@ -116,9 +113,8 @@ async def lock(features: Features, locked: bool) -> None:
 async def _set_format(session: Session, name: str) -> None:
     entries = await session.features.entries("PixelFormat")
     for entry, number in entries.items():
-        known = _known(entry, number)
-        names = [entry, name_of(number) or ""]
-        names += [known.name, known.fourcc] if known is not None else []
+        known = _known(number)
+        names = [entry] if known is None else [entry, known.name, known.fourcc]
         if name.upper() in (one.upper() for one in names):
             await session.features.set("PixelFormat", entry)
             return
@@ -161,9 +157,9 @@ async def _shape(session: Session) -> Shape:
     entry = await features.get("PixelFormat")
     entries = await features.entries("PixelFormat")
     number = int(await features.number("PixelFormat") or 0)
-    pixels = _known(str(entry), number)
+    pixels = _known(number)
     if pixels is None:
-        fitting = tuple(name for name, one in entries.items() if _known(name, one) is not None)
+        fitting = tuple(name for name, one in entries.items() if _known(one) is not None)
         raise FrameFormatError(
             f"{session.label}: it is set to {entry}, {number:#010x}, which is not known here; of "
             f"its formats are {', '.join(fitting) or 'none'}",
@@ -189,12 +185,10 @@ async def _shape(session: Session) -> Shape:
     return Shape(StreamFormat(pixels, width, height, rates), number, duration, payload)
 
 
-def _known(entry: str, number: int) -> PixelFormat | None:
-    """Return the format that a camera's entry is."""
-    for name in (name_of(number), entry):
-        if name is not None:
-            with contextlib.suppress(FrameFormatError):
-                return find_format(name)
+def _known(number: int) -> PixelFormat | None:
+    """Return the format of a number; names differ: cameras have older ones than PFNC's."""
+    with contextlib.suppress(FrameFormatError):
+        return find_format(number)
     return None
 
 
@@ -249,9 +243,7 @@ async def _given(session: Session, asked: int) -> int:
 
 
 async def _tested(session: Session, where: StreamSocket) -> int:
-    """Return the largest size of which a test packet came; without any the camera's own, of 1500
-    bytes at most.
-    """
+    """Return the largest size of which a test packet came; without any the camera's own."""
     control = session.control
     own = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
     way = min(control.path_mtu, 9000)

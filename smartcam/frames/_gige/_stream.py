@@ -14,23 +14,20 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final
 
-from smartcam.frames._gige._assembler import Assembler
 from smartcam.frames._gige._gvsp import IP_UDP
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.frames._gige._assembler import Resend
+    from smartcam.frames._gige._assembler import Assembler, Resend
     from smartcam.frames._gige._block import Picture
-
-__all__ = ["Stream", "StreamSocket"]
 
 MOST_AT_ONCE: Final = 128
 """Packets that are read before the event loop has its turn: half a millisecond."""
 
 BUFFER: Final = 8 << 20
 """Bytes that the system is asked to keep for us; Linux gives net.core.rmem_max at most, by default
-208 KiB, which a frame of 512x512 fills. A frame that does not fit is lost while the loop is busy."""
+208 KiB, which a frame of 512x512 fills: what does not fit while the loop is busy is lost."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
 """asm-generic/socket.h: past rmem_max, for who may administer the network."""

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from smartcam.frames._gige._discovery import Camera
     from smartcam.frames._gige._setup import Shape
 
-__all__ = ["GigEDriver"]
-
 _PARAMETERS: Final = ("serial", "format", "size", "fps", "packet_size", "resend", "feature.NAME")
 
 

@@ -71,7 +71,8 @@ DESCRIPTION = """<?xml version="1.0" encoding="utf-8"?>
 <Integer Name="Nothing"><Value>1</Value><pIsAvailable>No</pIsAvailable></Integer>
 <IntSwissKnife Name="PayloadSize"><pVariable Name="W">Width</pVariable>
 <pVariable Name="H">Height</pVariable><pVariable Name="F">PixelFormat</pVariable>
-<pVariable Name="X">ExtraReg</pVariable><Formula>W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8 + X</Formula>
+<pVariable Name="X">ExtraReg</pVariable>
+<Formula>W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8 + X</Formula>
 </IntSwissKnife>
 <IntReg Name="ExtraReg"><Address>0x10020</Address><Length>4</Length><AccessMode>RO</AccessMode>
 <pPort>Device</pPort><Endianess>BigEndian</Endianess></IntReg>
@@ -171,8 +172,10 @@ class Camera:
             0x200: url.ljust(512, b"\0") + bytes(512),
             XML_ADDRESS: data.ljust(len(data) + 512, b"\0"),
         }  # fmt: skip
-        self.dice = random.Random(self.mischief.seed)
+        self.dice = random.Random(self.mischief.seed)  # noqa: S311 - it is to come again
         self.number = 0
+        self.last = 1 << 62  # frame, after which it sends none; then it is done
+        self.done = asyncio.Event()
         self.block = self.first_id - 1
         self.owner: object = None
         self.heard = 0.0
@@ -185,7 +188,7 @@ class Camera:
 
     def received(self, data: bytes, sender: tuple[str, int]) -> None:
         key, flags, command, length, request = struct.unpack_from(">BBHHH", data)
-        assert key == 0x42 and length == len(data) - 8, data.hex()
+        assert (key, length) == (0x42, len(data) - 8), data.hex()
         if self.deaf:
             return
         self.requests += 1
@@ -293,6 +296,9 @@ class Camera:
                 self.words[0xA00], self.owner, self.streaming = 0, None, False
                 return
             self.number += 1
+            if self.number > self.last:
+                self.done.set()
+                return
             self.block += 1
             if self.block > 0xFFFF and not self.extended:
                 self.block = 1
@@ -346,8 +352,8 @@ class Camera:
             if dice.random() < it.drop:
                 self.dropped += 1
                 continue
-            for _ in range(1 + (dice.random() < it.double)):
-                kept.append((at + dice.uniform(0, it.reorder), one))
+            times = 1 + (dice.random() < it.double)
+            kept += [(at + dice.uniform(0, it.reorder), one) for _ in range(times)]
         return [one for _, one in sorted(kept, key=lambda pair: pair[0])]
 
     def again(self, payload: bytes, extended: bool) -> None:
