@@ -12,7 +12,7 @@ import functools
 import math
 import operator
 import re
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from smartcam.exceptions import MessageError
 
@@ -116,8 +116,8 @@ _UNARY: Final[Mapping[str, Callable[[Number], Number]]] = {
     "!": lambda value: int(not value),
 }
 
-_FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Number]]]] = {
-    "ABS": (1, lambda value: abs(value)),
+_FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
+    "ABS": (1, abs),
     "ACOS": (1, math.acos),
     "ASIN": (1, math.asin),
     "ATAN": (1, math.atan),
@@ -127,7 +127,7 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Number]]]] = {
     "FLOOR": (1, math.floor),
     "LG": (1, math.log10),
     "LN": (1, math.log),
-    "NEG": (1, lambda value: -value),
+    "NEG": (1, operator.neg),
     "ROUND": (2, _rounded),
     "SGN": (1, lambda value: (value > 0) - (value < 0)),
     "SIN": (1, math.sin),

@@ -68,6 +68,10 @@ def wire_id(start: int, number: int, extended: bool) -> int:
     return block if extended else (block - 1) % 65535 + 1
 
 
+def seen_id(packet: bytes, extended: bool) -> int:
+    return int.from_bytes(packet[8:16] if extended else packet[2:4], "big")
+
+
 @st.composite
 def mishaps(draw: st.DrawFn) -> tuple[int, bool, bool, int, int, float, float]:
     return (
@@ -87,23 +91,24 @@ def test_each_frame_is_whole_or_lost(
     mishap: tuple[int, bool, bool, int, int, float, float],
 ) -> None:
     start, extended, resend, seed, reorder, drop, double = mishap
-    dice = random.Random(seed)
+    dice = random.Random(seed)  # noqa: S311 - it is to come again
     stream = Stream(extended=extended, resend=resend)
     kept = []
     for number in range(1, 25):
         for at, one in enumerate(
             frame(wire_id(start, number, extended), number, extended=extended)
         ):
-            for _ in range((dice.random() >= drop) * (1 + (dice.random() < double))):
-                kept.append((7 * number + at + dice.uniform(0, reorder), one))
+            times = (dice.random() >= drop) * (1 + (dice.random() < double))
+            kept += [(7 * number + at + dice.uniform(0, reorder), one) for _ in range(times)]
     kept.sort(key=lambda pair: pair[0])
     stream.feed(*(one for _, one in kept), step=0.0005)
     stream.wait(60)
     assert not stream.inside._blocks
     assert stream.numbers == sorted(set(stream.numbers))
-    spanned = stream.inside._newest - (0 if start <= MOST_OPEN else start - 1)
     if kept and not stream.inside.counts.restarts:
-        assert len(stream.pictures) + stream.lost == max(spanned, 0)
+        begun = seen_id(kept[0][1], extended)
+        spanned = stream.inside._newest - (0 if begun <= MOST_OPEN else begun - 1)
+        assert len(stream.pictures) + stream.lost == spanned
     told = sum(one.lost for one in stream.pictures) + stream.inside.take_lost()
     assert told == stream.lost
     if not drop and reorder <= 3:
@@ -125,7 +130,7 @@ def test_exactly_what_is_missing_is_asked_for(missing: set[int]) -> None:
     stream = Stream()
     packets = frame(1, 1)
     stream.feed(*(one for at, one in enumerate(packets) if at not in missing), *frame(2, 2))
-    stream.wait(0.01)
+    stream.wait(0.04)
     asked = {at for one in stream.wanted for at in range(one.first, one.last + 1)}
     assert asked == missing
     assert all(one.block == 1 for one in stream.wanted)
@@ -139,7 +144,7 @@ def test_exactly_what_is_missing_is_asked_for(missing: set[int]) -> None:
 def test_random_bytes_make_no_picture_of_two_and_raise_nothing(
     noise: list[bytes], seed: int
 ) -> None:
-    dice = random.Random(seed)
+    dice = random.Random(seed)  # noqa: S311 - it is to come again
     stream = Stream()
     packets = [one for number in range(1, 6) for one in frame(number, number)]
     mixed = [one for one in noise if one[4:5] not in (b"\x03", b"\x83")]  # pixels are believed
