@@ -55,7 +55,7 @@ class ControlChannel(asyncio.DatagramProtocol):
     """
 
     def __init__(self, source: str) -> None:
-        self._source = source
+        self.source = source
         self._transport: asyncio.DatagramTransport | None = None
         self._lock = asyncio.Lock()
         self._id = 0
@@ -189,14 +189,14 @@ class ControlChannel(asyncio.DatagramProtocol):
                 self._expected = 0
                 self._emptied()
         raise FrameTimeoutError(
-            f"{self._source}: no answer to {command.name} {what} in {TRIES} x {ANSWER:g} s",
-            source=self._source,
+            f"{self.source}: no answer to {command.name} {what} in {TRIES} x {ANSWER:g} s",
+            source=self.source,
         )
 
     async def _tried(self, datagram: bytes, command: Command, what: str) -> Ack | None:
         """Send a request; return its answer, None where none comes in time."""
         if self._transport is None or self._transport.is_closing():
-            raise FrameSourceError(f"{self._source}: it is closed", source=self._source)
+            raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
         loop = asyncio.get_running_loop()
         self._transport.sendto(datagram)
         begun = loop.time()
@@ -206,9 +206,9 @@ class ControlChannel(asyncio.DatagramProtocol):
                     ack = await self._answers.get()
                     if isinstance(ack, OSError):
                         raise FrameSourceError(
-                            f"{self._source}: {command.name} {what}: nothing listens there that "
+                            f"{self.source}: {command.name} {what}: nothing listens there that "
                             f"speaks GVCP: {ack}",
-                            source=self._source,
+                            source=self.source,
                         ) from ack
                     if ack.command != Command.PENDING_ACK:
                         return ack
@@ -220,16 +220,16 @@ class ControlChannel(asyncio.DatagramProtocol):
     def _checked(self, ack: Ack, command: Command, least: int, what: str) -> bytes:
         if ack.status != Status.SUCCESS:
             raise RefusedError(
-                f"{self._source}: {command.name} {what}: the camera answers "
+                f"{self.source}: {command.name} {what}: the camera answers "
                 f"{status_text(ack.status)}",
-                source=self._source,
+                source=self.source,
                 status=ack.status,
             )
         if ack.command != command + 1 or len(ack.payload) < least:
             raise FrameSourceError(
-                f"{self._source}: {command.name} {what}: expected an answer {command + 1:#06x} of "
+                f"{self.source}: {command.name} {what}: expected an answer {command + 1:#06x} of "
                 f"{least} bytes, got {ack.command:#06x} of {len(ack.payload)}",
-                source=self._source,
+                source=self.source,
             )
         return ack.payload
 
@@ -243,7 +243,7 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     def _name(self, kind: str) -> tuple[str, int]:
         if self._transport is None:
-            raise FrameSourceError(f"{self._source}: it is closed", source=self._source)
+            raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
         return cast("tuple[str, int]", self._transport.get_extra_info(kind))
 
     def _take(self, answer: Ack | OSError) -> None:

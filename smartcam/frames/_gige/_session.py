@@ -12,7 +12,7 @@ from smartcam.exceptions import FrameSourceError, FrameTimeoutError, MessageErro
 from smartcam.frames._gige._control import ControlChannel, RefusedError, heartbeat
 from smartcam.frames._gige._description import locate, parse, unpack
 from smartcam.frames._gige._features import Features
-from smartcam.frames._gige._gvcp import CONTROL, Register, Status, text
+from smartcam.frames._gige._gvcp import CONTROL, EXCLUSIVE, Register, Status, text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -104,6 +104,7 @@ class Session:
         names = await self.control.read(Register.MANUFACTURER_NAME, 176)
         model, serial, user = text(names[32:64]), text(names[144:160]), text(names[160:176])
         self.label = user or " ".join(part for part in (model, serial) if part) or self.label
+        self.control.source = self.label
         await self._take_control()
         timeout = await self.control.read_register(Register.HEARTBEAT_TIMEOUT) / 1e3
         timeout = min(max(timeout, HEARTBEATS[0]), HEARTBEATS[1])
@@ -131,8 +132,8 @@ class Session:
     async def _take_control(self) -> None:
         try:
             await self.control.write_register(Register.CONTROL_PRIVILEGE, CONTROL)
-        except RefusedError as exc:
-            if exc.status != Status.ACCESS_DENIED:
+        except FrameSourceError as exc:
+            if not await self._is_taken(exc):
                 raise
             other = await self._register_or_0(Register.PRIMARY_APPLICATION_ADDRESS)
             where = ".".join(str(part) for part in other.to_bytes(4, "big"))
@@ -142,6 +143,18 @@ class Session:
                 source=self.label,
             ) from exc
         self._ours = True
+
+    async def _is_taken(self, error: FrameSourceError) -> bool:
+        """Return whether taking control failed since somebody else has it.
+
+        A camera is to say so; aravis' fake one does not answer at all.
+        """
+        if isinstance(error, RefusedError):
+            return error.status == Status.ACCESS_DENIED
+        if isinstance(error, FrameTimeoutError):
+            privilege = await self.control.read_register(Register.CONTROL_PRIVILEGE)
+            return bool(privilege & (CONTROL | EXCLUSIVE))
+        return False
 
     async def _description(self) -> dict[str, Element]:
         """Read the description; the second URL is tried where the first one leads nowhere."""

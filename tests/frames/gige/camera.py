@@ -125,6 +125,7 @@ class Camera:
         deaf: it answers nothing.
         refuse: status that it answers writes to an address with.
         taken_by: address of another application that controls it.
+        mute_when_taken: it answers nothing instead of ACCESS_DENIED, as aravis' fake camera.
         trailer_type: payload type in leader and trailer.
         sent: numbers of the frames that it began to send.
         asked: the packets that it was asked for once more.
@@ -140,6 +141,7 @@ class Camera:
     deaf: bool = False
     refuse: dict[int, int] = field(default_factory=dict)
     taken_by: str | None = None
+    mute_when_taken: bool = False
     payload_type: int = 1
     description: bytes = DESCRIPTION.encode()
     url: bytes = b""
@@ -199,6 +201,8 @@ class Camera:
             self.again(payload, bool(flags & 0x10))
             return
         status, answer = self.answer(command, payload, sender)
+        if status == 0x8006 and self.mute_when_taken:
+            return
         if self.pending:
             pending = struct.pack(">HH", 0, int(self.pending * 1000))
             self.reply(sender, 0, 0x89, request, pending)
@@ -256,6 +260,7 @@ class Camera:
             return 0x8006
         if address == 0xA00:
             self.owner = sender if value else None
+            self.words[0xA00] = value
             self.heard = asyncio.get_running_loop().time()
         elif self.owner is None:
             return 0x8006

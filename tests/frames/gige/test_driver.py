@@ -211,6 +211,15 @@ async def test_control_taken_by_another_application_ends_the_stream() -> None:
         await one.close()
 
 
+async def test_a_camera_that_refuses_control_without_a_word_is_told_from_a_silent_one() -> None:
+    async with camera(mute_when_taken=True) as there:
+        first = driver(there)
+        await first.open()
+        with pytest.raises(FrameSourceError, match="Tester T1 is controlled by another"):
+            await driver(there).open()
+        await first.close()
+
+
 async def test_the_heartbeat_keeps_an_idle_camera_ours() -> None:
     async with camera(heartbeat=1.0) as there:
         one = driver(there)
