@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFormatError, FrameSourceError
@@ -44,6 +44,17 @@ _EXPOSURES: Final = ("ExposureTime", "ExposureTimeAbs")
 """Microseconds. Each by its name of today in the SFNC, then by that of its first editions."""
 
 
+class Open(Protocol):
+    """A camera that is open, whoever speaks with it."""
+
+    label: str
+
+    @property
+    def features(self) -> Features:
+        """What can be asked and set."""
+        ...
+
+
 class Wanted(NamedTuple):
     """What a URL asks for.
 
@@ -78,7 +89,7 @@ class Shape(NamedTuple):
     payload: int
 
 
-async def set_up(session: Session, wanted: Wanted) -> Shape:
+async def set_up(session: Open, wanted: Wanted) -> Shape:
     """Set a camera, in the order in which the URL says it; return what it streams then.
 
     Raises:
@@ -110,7 +121,7 @@ async def lock(features: Features, locked: bool) -> None:
             await features.set("TLParamsLocked", int(locked))
 
 
-async def _set_format(session: Session, name: str) -> None:
+async def _set_format(session: Open, name: str) -> None:
     entries = await session.features.entries("PixelFormat")
     for entry, number in entries.items():
         known = _known(number)
@@ -135,7 +146,7 @@ async def _set_size(features: Features, size: tuple[int, int]) -> None:
         await features.set(name, value)
 
 
-async def _set_rate(session: Session, rate: float) -> None:
+async def _set_rate(session: Open, rate: float) -> None:
     features = session.features
     for name in _RATE_SWITCHES:
         if name in features:
@@ -152,7 +163,7 @@ async def _set_rate(session: Session, rate: float) -> None:
     )
 
 
-async def _shape(session: Session) -> Shape:
+async def _shape(session: Open) -> Shape:
     features = session.features
     entry = await features.get("PixelFormat")
     entries = await features.entries("PixelFormat")

@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from typing import TYPE_CHECKING, Final
-from urllib.parse import parse_qsl
+from typing import TYPE_CHECKING
 
-from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._driver import FoundSource, FrameDriver
-from smartcam.frames._frame import Frame, Moment
-from smartcam.frames._gige._assembler import Assembler
+from smartcam.frames._gige._aravis import AravisDriver
 from smartcam.frames._gige._discovery import find, networks
-from smartcam.frames._gige._gvcp import PORT, Register
-from smartcam.frames._gige._gvsp import IP_UDP
-from smartcam.frames._gige._session import Session
-from smartcam.frames._gige._setup import FEATURE, PACKETS, Wanted, connect, lock, set_up
-from smartcam.frames._gige._stream import Stream, StreamSocket
+from smartcam.frames._gige._own import OwnDriver
+from smartcam.frames._gige._places import found, wanted
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink, StreamFormat
-    from smartcam.frames._gige._assembler import Counts
-    from smartcam.frames._gige._block import Picture
-    from smartcam.frames._gige._discovery import Camera
-    from smartcam.frames._gige._setup import Shape
-
-_PARAMETERS: Final = ("serial", "format", "size", "fps", "packet_size", "resend", "feature.NAME")
 
 
 class GigEDriver(FrameDriver):
@@ -52,204 +39,39 @@ class GigEDriver(FrameDriver):
     - ``packet_size``: bytes of the stream's IP packets, 576 to 16384; ``auto``, as it is: the
       largest that comes through in a test, or the camera's own where it sends no test packets.
     - ``resend=off``: packets that are missing are not asked for.
+    - ``through=aravis``: by the library aravis, where it is installed, instead of what smartcam
+      has itself.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        self._wanted = _wanted(address)
-        self._session: Session | None = None
-        self._shape: Shape | None = None
-        self._stream: Stream | None = None
-        self._sink: FrameSink | None = None
-        self._packet_size = 0  # that was found to come through
-        self.counts: Counts | None = None
-        """What became of the packets of the stream that is under way, or was the last."""
+        what = wanted(address)
+        kind = AravisDriver if what.said.get("through") == "aravis" else OwnDriver
+        self.inside: OwnDriver | AravisDriver = kind(address, what)
+        """What does the work."""
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
         """Return the cameras that answer on this machine's networks, within half a second."""
-        return [_found(one) for one in await find(networks())]
+        return [found(one) for one in await find(networks())]
 
     @property
     def name(self) -> str:
         """What somebody called the camera, or its model and serial number; closed: the URL."""
-        return self.address.shown if self._session is None else self._session.label
+        return self.inside.name
 
     async def open(self) -> StreamFormat:
         """Take control of the camera and set it."""
-        host, port = await self._place()
-        self._session = await Session.open(host, port, self.address.shown)
-        try:
-            self._shape = await set_up(self._session, self._wanted)
-        except BaseException:
-            await self.close()
-            raise
-        return self._shape.format
+        return await self.inside.open()
 
     async def start(self, sink: FrameSink) -> None:
         """Have it stream."""
-        if self._session is not None and self._session.lost is not None:
-            await self.close()
-        if self._session is None:
-            await self.open()
-        session, shape = self._session, self._shape
-        if session is None or shape is None:
-            raise FrameSourceError(f"{self.name}: it is not open", source=self.name)
-        self._sink = sink
-        try:
-            self._stream = await self._listen(session, shape)
-            session.on_lost = self._end
-            await lock(session.features, True)
-            await session.features.execute("AcquisitionStart")
-        except BaseException:
-            self._quiet()
-            raise
+        await self.inside.start(sink)
 
     async def stop(self) -> None:
         """Have it stream no longer."""
-        streamed, session = self._stream is not None, self._session
-        self._quiet()
-        if not streamed or session is None or session.lost is not None:
-            return
-        try:
-            await session.features.execute("AcquisitionStop")
-            await lock(session.features, False)
-            await session.control.write_register(Register.STREAM_PORT, 0)
-        except FrameSourceError as exc:  # it is gone; the next start opens it anew
-            session.lost = exc
+        await self.inside.stop()
 
     async def close(self) -> None:
         """Give it back."""
-        try:
-            await self.stop()
-        finally:
-            session, self._session = self._session, None
-            if session is not None:
-                await session.close()
-
-    async def _place(self) -> tuple[str, int]:
-        """Return where the camera is."""
-        if self.address.host:
-            return self.address.host, self.address.port or PORT
-        serial = self._wanted.said.get("serial")
-        there = await find(networks())
-        fitting = [one for one in there if serial in (None, one.info.serial)]
-        if len(fitting) != 1:
-            known = tuple(f"{_found(one).url} {one.info.label}" for one in there)
-            which = "" if serial is None else f" with the serial number {serial}"
-            raise FrameSourceError(
-                f"{self.address.shown}: expected one camera{which}, found {len(fitting)}; there "
-                f"are {', '.join(known) or 'none'}",
-                source=self.address.shown,
-                available=known,
-            )
-        return fitting[0].address, PORT
-
-    async def _listen(self, session: Session, shape: Shape) -> Stream:
-        """Have the stream come to a socket of ours."""
-        try:
-            where = StreamSocket(session.control.local_address, session.control.camera_address)
-        except OSError as exc:
-            raise FrameSourceError(
-                f"{self.name}: no socket for it: {exc}", source=self.name
-            ) from exc
-        try:
-            asked = self._wanted.packet_size or self._packet_size
-            size = self._packet_size = await connect(session, where, asked)
-            resend = session.can_resend and self._wanted.resend
-            assembler = Assembler(shape.payload, size - IP_UDP, resend=resend)
-            self.counts = assembler.counts
-            return Stream(where, assembler, self._take, session.control.resend)
-        except BaseException:
-            where.close()
-            raise
-
-    def _quiet(self) -> None:
-        """Listen no longer; what was lost is told."""
-        stream, self._stream = self._stream, None
-        sink, self._sink = self._sink, None
-        if self._session is not None:
-            self._session.on_lost = lambda _: None
-        if stream is not None:
-            stream.close()
-            if sink is not None and (lost := stream.assembler.take_lost()):
-                sink.lost(lost)
-
-    def _end(self, error: FrameSourceError) -> None:
-        sink = self._sink
-        self._quiet()
-        if sink is not None:
-            sink.ended(error)
-
-    def _take(self, pictures: list[Picture]) -> None:
-        """Take what the stream has; it may be closed by whoever takes a frame."""
-        for picture in pictures:
-            if self._sink is None or self._shape is None or self._session is None:
-                return
-            shape, leader = self._shape, picture.leader
-            if (leader.pixel_format, leader.width) != (shape.number, shape.format.width):
-                self._end(self._changed(picture, shape))
-                return
-            self._sink.frame(self._frame(picture, shape, self._session))
-        fault = None if self._stream is None else self._stream.assembler.fault
-        if fault is not None:
-            error = FrameFormatError(f"{self.name}: its stream: {fault}", source=self.name)
-            error.__cause__ = fault
-            self._end(error)
-
-    def _changed(self, picture: Picture, shape: Shape) -> FrameFormatError:
-        leader = picture.leader
-        return FrameFormatError(
-            f"{self.name}: it streams {shape.format} ({shape.number:#010x}), then came "
-            f"{leader.width}x{leader.height} of {leader.pixel_format:#010x}",
-            source=self.name,
-            available=(str(shape.format),),
-        )
-
-    def _frame(self, picture: Picture, shape: Shape, session: Session) -> Frame:
-        ticks = session.ticks_per_second
-        return Frame(
-            data=picture.data,
-            format=shape.format.format,
-            width=picture.leader.width,
-            height=picture.rows,
-            stride=picture.stride,
-            captured=picture.arrived,
-            utc=time.time() - (time.monotonic() - picture.arrived),
-            moment=Moment.ARRIVAL,
-            duration=shape.duration,
-            device_time=picture.leader.ticks / ticks if ticks else None,
-            sequence=picture.number,
-            lost=picture.lost,
-            source=session.label,
-        )
-
-
-def _found(camera: Camera) -> FoundSource:
-    remark = ""
-    if not camera.reachable:
-        remark = f"its address {camera.address} is not of the network that it answered by"
-    return FoundSource(f"gige://{camera.address}", camera.info.label, (), remark)
-
-
-def _wanted(address: FrameAddress) -> Wanted:
-    names = [name for name, _ in parse_qsl(address.query, keep_blank_values=True)]
-    features = [name for name in names if name.startswith(FEATURE) and name != FEATURE]
-    said = address.parameters([*_PARAMETERS, *features])
-    if address.path not in ("", "/"):
-        raise address.wrong("path", "gige://HOST", address.path)
-    if "serial" in said and address.host:
-        raise address.wrong("serial", "none beside an address", said["serial"])
-    resend = said.get("resend", "on")
-    if resend not in ("on", "off"):
-        raise address.wrong("resend", "on or off", resend)
-    packet_size = said.get("packet_size", "auto")
-    if packet_size != "auto":
-        packet_size = str(int(address.number("packet_size", packet_size, *PACKETS)))
-    return Wanted(
-        said,
-        address.size(said["size"]) if "size" in said else None,
-        address.number("fps", said["fps"], 0.001, 100_000) if "fps" in said else None,
-        0 if packet_size == "auto" else int(packet_size) & ~3,
-        resend == "on",
-    )
+        await self.inside.close()

@@ -43,7 +43,7 @@ async def read(frames: int, query: str) -> dict[str, object]:
     wrong, second, last, first = [], "", 0, 0
     async with source:
         try:
-            await GigEDriver(FrameAddress.parse("gige://127.0.0.1")).open()
+            await GigEDriver(FrameAddress.parse(f"gige://127.0.0.1?{query}")).open()
         except FrameSourceError as error:
             second = str(error)
         shown = str(source.format)
@@ -66,7 +66,7 @@ async def read(frames: int, query: str) -> dict[str, object]:
         "offered": account.offered,
         "delivered": account.delivered,
         "lost": account.lost,
-        "counts": repr(driver.counts),
+        "counts": repr(getattr(driver.inside, "counts", "")),
         "cpu": spent,
     }
 

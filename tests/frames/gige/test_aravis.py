@@ -34,7 +34,9 @@ def namespace() -> list[str]:
     pytest.skip("needs network namespaces: unshare -n is not allowed here")
 
 
-def read(namespace: list[str], frames: int, query: str, *arguments: str) -> dict[str, Any]:
+def read(
+    namespace: list[str], frames: int, query: str, *arguments: str, binding: str = ""
+) -> dict[str, Any]:
     done = subprocess.run(  # noqa: S603
         [*namespace, sys.executable, "-m", "tests.frames.gige.in_namespace", str(frames), query,
          *arguments],
@@ -42,7 +44,7 @@ def read(namespace: list[str], frames: int, query: str, *arguments: str) -> dict
         check=False,
         timeout=120,
         cwd=Path(__file__).parents[3],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, binding])},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr.decode()
     said: dict[str, Any] = json.loads(done.stdout)
@@ -58,6 +60,33 @@ def test_thousands_of_frames_are_whole(namespace: list[str]) -> None:
     assert said["offered"] + said["lost"] >= FRAMES
     assert said["delivered"] > FRAMES // 2
     assert said["lost"] < FRAMES // 50, said["counts"]
+
+
+@pytest.fixture(scope="module")
+def binding() -> str:
+    """Return where aravis' binding is, for the Python that runs the tests."""
+    for place in ("", "/usr/lib/python3/dist-packages"):
+        found = subprocess.run(
+            [sys.executable, "-c", "import gi; gi.require_version('Aravis', '0.8')"],
+            capture_output=True,
+            check=False,
+            env=os.environ | {"PYTHONPATH": place},
+        )
+        if found.returncode == 0:
+            return place
+    pytest.skip(
+        "needs aravis' binding for this Python: apt-get install gir1.2-aravis-0.8 python3-gi"
+    )
+
+
+def test_through_aravis_frames_are_whole(namespace: list[str], binding: str) -> None:
+    query = "format=Mono8&size=320x64&fps=200&packet_size=1400&through=aravis"
+    said = read(namespace, 600, query, binding=binding)
+    assert said["format"] == "Mono8 320x64 at 200/s"
+    assert "Fake FAKE01 is controlled by another application" in said["second"]
+    assert said["wrong"] == []
+    assert said["delivered"] > 300
+    assert said["offered"] + said["lost"] == pytest.approx(said["span"], abs=5)
 
 
 def test_with_packets_lost_frames_are_whole_or_counted(namespace: list[str]) -> None:

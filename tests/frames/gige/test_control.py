@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import struct
+import sys
 from collections.abc import Callable
 from typing import cast
 
@@ -10,7 +11,7 @@ import pytest
 
 from smartcam.exceptions import FrameSourceError, FrameTimeoutError
 from smartcam.frames import FrameAddress
-from smartcam.frames._gige import driver as drivers
+from smartcam.frames._gige import _places, driver
 from smartcam.frames._gige._control import ControlChannel, RefusedError
 from smartcam.frames._gige._discovery import Camera as Found
 from smartcam.frames._gige._discovery import Network, find, networks
@@ -167,9 +168,10 @@ async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.Monke
     async def found(_: object) -> list[Found]:
         return [info("10.0.0.8", "A"), info("10.0.0.9", "B")]
 
-    monkeypatch.setattr(drivers, "find", found)
-    driver = GigEDriver(FrameAddress.parse("gige://?serial=B"))
-    assert await driver._place() == ("10.0.0.9", 3956)
+    monkeypatch.setattr(_places, "find", found)
+    monkeypatch.setattr(driver, "find", found)
+    address = FrameAddress.parse("gige://?serial=B")
+    assert await _places.place(address, _places.wanted(address)) == ("10.0.0.9", 3956)
     for url, said in (("gige://", "expected one camera, found 2"), ("gige://?serial=C", "found 0")):
         with pytest.raises(FrameSourceError, match=said) as caught:
             await GigEDriver(FrameAddress.parse(url)).open()
@@ -178,3 +180,11 @@ async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.Monke
     assert first.url == "gige://10.0.0.8"
     assert first.remark == ""
     assert "10.0.0.9 is not of the network" in second.remark
+
+
+async def test_aravis_that_is_not_installed_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gi", None)
+    driver = GigEDriver(FrameAddress.parse("gige://127.0.0.1?through=aravis"))
+    with pytest.raises(FrameSourceError, match="not installed for this Python: apt-get install"):
+        await driver.open()
+    await driver.close()

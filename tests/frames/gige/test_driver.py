@@ -12,6 +12,7 @@ from smartcam.exceptions import (
     FrameTimeoutError,
 )
 from smartcam.frames import Frame, FrameAddress, FrameSink, Moment
+from smartcam.frames._gige._own import OwnDriver
 from smartcam.frames._gige.driver import GigEDriver
 from tests.frames.gige import camera as cameras
 from tests.frames.gige.camera import Camera, Mischief, camera, number_in
@@ -51,11 +52,13 @@ class Sink(FrameSink):
         self.over.set()
 
 
-def driver(there: Camera, query: str = SMALL) -> GigEDriver:
-    return GigEDriver(FrameAddress.parse(f"gige://127.0.0.1:{there.port}?{query}"))
+def driver(there: Camera, query: str = SMALL) -> OwnDriver:
+    inside = GigEDriver(FrameAddress.parse(f"gige://127.0.0.1:{there.port}?{query}")).inside
+    assert isinstance(inside, OwnDriver)
+    return inside
 
 
-async def streamed(there: Camera, frames: int, query: str = SMALL) -> tuple[Sink, GigEDriver]:
+async def streamed(there: Camera, frames: int, query: str = SMALL) -> tuple[Sink, OwnDriver]:
     """Stream until the camera has sent so many frames, and everything is settled."""
     one, sink = driver(there, query), Sink()
     there.last = frames
@@ -338,7 +341,7 @@ async def test_cancelled_at_each_await_it_opens_and_streams_afterwards() -> None
         while True:
             one, sink = driver(there), Sink()
 
-            async def all_of_it(one: GigEDriver = one, sink: Sink = sink) -> None:
+            async def all_of_it(one: OwnDriver = one, sink: Sink = sink) -> None:
                 await one.open()
                 await one.start(sink)
                 await one.stop()
