@@ -175,7 +175,7 @@ class Camera:
             XML_ADDRESS: data.ljust(len(data) + 512, b"\0"),
         }  # fmt: skip
         self.dice = random.Random(self.mischief.seed)  # noqa: S311 - it is to come again
-        self.number = 0
+        self.number = self.locked_at_start = 0
         self.last = 1 << 62  # frame, after which it sends none; then it is done
         self.done = asyncio.Event()
         self.block = self.first_id - 1
@@ -267,6 +267,7 @@ class Camera:
         if address not in self.words and address != START:
             return 0x8003
         if address == START:
+            self.locked_at_start = self.words[LOCKED]
             (self.start if value else self.stop)()
             return 0
         self.words[address] = value & 0xFFFF if address == 0xD04 else value

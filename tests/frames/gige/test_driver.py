@@ -1,10 +1,12 @@
 """The driver against a camera of our own: whole frames or losses, whatever the network does."""
 
 import asyncio
+import socket
 from typing import Any
 
 import pytest
 
+import smartcam.frames
 from smartcam.exceptions import (
     ConfigurationError,
     FrameFormatError,
@@ -101,6 +103,58 @@ async def test_frames_arrive_whole_with_their_times() -> None:
     assert there.words[0xA00] == 0
     assert there.words[0xD00] == 0
     assert there.words[cameras.LOCKED] == 0
+    assert there.locked_at_start == 1
+
+
+async def test_a_source_by_its_url() -> None:
+    async with (
+        camera(mischief=Mischief(drop=0.01)) as there,
+        smartcam.frames.open(f"gige://127.0.0.1:{there.port}?{SMALL}") as source,
+    ):
+        assert source.name == "Tester T1"
+        assert not there.streaming
+        numbers = []
+        async with source.reader() as reader:
+            async for frame in reader:
+                numbers.append(number_in(frame))
+                assert (frame.array() == frame.grey()).all()
+                if len(numbers) == 20:
+                    break
+            account = reader.statistics()
+        assert numbers == sorted(set(numbers))
+        assert account.delivered == 20
+        assert account.offered == 20 + account.skipped + account.waiting
+        await asyncio.sleep(1)
+        assert not there.streaming  # nobody reads
+        assert number_in(await source.newest()) > numbers[-1]
+
+
+async def test_packets_of_others_are_dropped() -> None:
+    async with camera() as there:
+        one, sink = driver(there), Sink()
+        await one.open()
+        await one.start(sink)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            other.bind(("127.0.0.9", 0))
+            for packet in there.packets(1000, 1):
+                other.sendto(packet, ("127.0.0.1", there.words[0xD00]))
+            await sink.until(5)
+        assert sink.numbers == [1, 2, 3, 4, 5]
+        assert one._stream is not None
+        assert one._stream.foreign == len(there.packets(1, 1))
+        await one.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+async def test_thousands_of_frames_of_a_bad_network_are_whole_or_lost(seed: int) -> None:
+    it = Mischief(seed=seed, drop=0.01, double=0.05, reorder=4, skip=frozenset(range(7, 2000, 97)))
+    async with camera(mischief=it, extended=seed == 2, first_id=64800) as there:
+        sink, one = await streamed(there, 1500)
+    check_account(sink, there)
+    assert len(sink.numbers) > 1400
+    assert one.counts is not None
+    assert one.counts.malformed == 0
 
 
 @pytest.mark.parametrize("extended", [False, True])
