@@ -1,0 +1,9 @@
+"""GigE Vision cameras: control (GVCP), stream (GVSP) and the GenICam description of features.
+
+Without sockets and clocks: :mod:`_gvcp`, :mod:`_gvsp`, :mod:`_block`, :mod:`_assembler`,
+:mod:`_description`, :mod:`_expressions`, :mod:`_features`. With them: :mod:`_control`,
+:mod:`_discovery`, :mod:`_stream`; then :mod:`_session`, :mod:`_setup` and :mod:`driver`.
+
+Source: GigE Vision 2.0 (packets, bootstrap registers), GenICam GenApi 2.0 (description), SFNC
+(names of features), PFNC (pixel formats); what a real peer says is aravis' fake camera, 0.8.26.
+"""

@@ -1,0 +1,196 @@
+"""The GenICam description of a camera: where it lies, unpacked, and read into elements.
+
+It comes over the wire: sizes and depth are bounded, and a document type, without which there are no
+entities, is refused.
+
+Source: GigE Vision 2.0, chapter 12.1 (URLs, ZIP); GenApi 2.0, chapter 2.8 (XML).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+import zlib
+from typing import Final, NamedTuple
+from xml.parsers import expat
+
+from smartcam.exceptions import MessageError
+
+LARGEST: Final = 16 << 20
+"""Bytes of a description, packed or not; those of large cameras have 2 MB."""
+
+DEEPEST: Final = 32
+"""Levels of its elements."""
+
+MOST_ELEMENTS: Final = 400_000
+
+
+class Location(NamedTuple):
+    """Where in the camera's memory a description lies.
+
+    Attributes:
+        name: of its file; it ends in ``.zip`` where it is packed.
+        address: of its first byte.
+        length: bytes.
+    """
+
+    name: str
+    address: int
+    length: int
+
+
+class Element:
+    """An element of a description.
+
+    Attributes:
+        kind: its tag.
+        name: its attribute ``Name``, or "".
+        attributes: all of them.
+        children: in their order.
+        text: stripped.
+    """
+
+    __slots__ = ("attributes", "children", "kind", "name", "text")
+
+    def __init__(self, kind: str, attributes: dict[str, str]) -> None:
+        self.kind, self.attributes = kind, attributes
+        self.name = attributes.get("Name", "")
+        self.children: list[Element] = []
+        self.text = ""
+
+    def all(self, *kinds: str) -> list[Element]:
+        """Return the children of these kinds."""
+        return [one for one in self.children if one.kind in kinds]
+
+    def first(self, *kinds: str) -> Element | None:
+        """Return the first child of these kinds."""
+        return next((one for one in self.children if one.kind in kinds), None)
+
+    def text_of(self, kind: str, default: str = "") -> str:
+        """Return the text of the first child of a kind."""
+        found = self.first(kind)
+        return default if found is None else found.text
+
+
+def locate(url: str) -> Location:
+    """Read a URL as a camera has it: ``Local:name.zip;ADDRESS;LENGTH``, both hexadecimal.
+
+    Raises:
+        MessageError: it is another one, or has impossible numbers.
+    """
+    found = re.fullmatch(
+        r"local:/*([^;]*);\s*(?:0x)?([0-9a-f]{1,8});\s*(?:0x)?([0-9a-f]{1,8})(?:\?.*)?",
+        url.strip(),
+        re.IGNORECASE,
+    )
+    if found is None:
+        raise MessageError(f"expected 'Local:NAME;ADDRESS;LENGTH', got {url[:80]!r}")
+    place = Location(found[1], int(found[2], 16), int(found[3], 16))
+    if not 0 < place.length <= LARGEST:
+        raise MessageError(f"{url[:80]!r}: expected 1 to {LARGEST} bytes, got {place.length}")
+    return place
+
+
+def unpack(data: bytes) -> bytes:
+    """Return a description's text; ZIP archives are unpacked, of several files the first XML.
+
+    Raises:
+        MessageError: it cannot be unpacked, or to more than :data:`LARGEST`.
+    """
+    if not data.startswith(b"PK"):
+        return data.rstrip(b"\0")
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = sorted(archive.namelist(), key=lambda name: not name.lower().endswith(".xml"))
+            if not names:
+                raise MessageError("the description's ZIP archive is empty")
+            with archive.open(names[0]) as file:
+                text = file.read(LARGEST + 1)
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+        OSError,
+        ValueError,
+    ) as exc:
+        raise MessageError(f"the description's ZIP archive cannot be read: {exc}") from exc
+    if len(text) > LARGEST:
+        raise MessageError(f"the description unpacks to more than {LARGEST} bytes")
+    return text
+
+
+def parse(text: bytes) -> dict[str, Element]:
+    """Return a description's nodes by their names.
+
+    Raises:
+        MessageError: it is no XML, has a document type, or is larger than any.
+    """
+    reader = _Reader()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = reader.start
+    parser.EndElementHandler = reader.end
+    parser.CharacterDataHandler = reader.characters
+    parser.StartDoctypeDeclHandler = reader.doctype
+    try:
+        parser.Parse(text, True)
+    except (expat.ExpatError, ValueError, LookupError) as exc:
+        raise MessageError(f"the description is no XML: {exc}", data=text) from exc
+    if reader.root.kind != "RegisterDescription":
+        raise MessageError(
+            f"the description: expected <RegisterDescription>, got <{reader.root.kind[:40]}>"
+        )
+    return _nodes(reader.root)
+
+
+class _Reader:
+    def __init__(self) -> None:
+        self.root = Element("", {})
+        self._open: list[Element] = []
+        self._count = 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        if len(self._open) >= DEEPEST or self._count > MOST_ELEMENTS:
+            raise MessageError(
+                f"the description: expected at most {MOST_ELEMENTS} elements in {DEEPEST} levels"
+            )
+        element = Element(tag.rpartition(":")[2], attributes)
+        if self._open:
+            self._open[-1].children.append(element)
+        else:
+            self.root = element
+        self._open.append(element)
+
+    def end(self, _: str) -> None:
+        element = self._open.pop()
+        element.text = element.text.strip()
+
+    def characters(self, text: str) -> None:
+        if self._open:
+            self._open[-1].text += text
+
+    def doctype(self, *_: object) -> None:
+        raise MessageError("the description has a document type, which is not read")
+
+
+def _nodes(root: Element) -> dict[str, Element]:
+    """Return what has a name; an entry of a StructReg has the register's elements besides."""
+    found: dict[str, Element] = {}
+    waiting = [root]
+    while waiting:
+        element = waiting.pop()
+        if element.kind in ("RegisterDescription", "Group"):
+            waiting += element.children
+        elif element.kind == "StructReg":
+            shared = [one for one in element.children if one.kind != "StructEntry"]
+            for entry in element.all("StructEntry"):
+                own = {one.kind for one in entry.children}
+                entry.children += [one for one in shared if one.kind not in own]
+                found[entry.name] = entry
+        elif element.name:
+            found[element.name] = element
+    return found

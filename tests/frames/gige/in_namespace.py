@@ -1,0 +1,89 @@
+"""Reads frames of aravis' fake camera; run in a network namespace of its own, by test_aravis.py.
+
+``python -m tests.frames.gige.in_namespace FRAMES QUERY [CAMERA'S ARGUMENTS]`` prints JSON.
+"""
+
+import asyncio
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import smartcam.frames
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames import FrameAddress
+from smartcam.frames._gige.driver import GigEDriver
+
+PROGRAM = "arv-fake-gv-camera-0.8"
+
+
+def wrong_in(frame: smartcam.frames.Frame) -> str:
+    """Return what is wrong in a picture of the fake camera: a ramp that moves with its id."""
+    number = (frame.sequence - 1) % 65535 + 1
+    ramp = np.arange(frame.width)[None, :] + np.arange(frame.height)[:, None]
+    wrong = frame.array() != (ramp + number) % 255
+    return f"frame {frame.sequence}: {int(wrong.sum())} pixels" if wrong.any() else ""
+
+
+async def discovered() -> list[str]:
+    """Return the cameras once the fake one is up."""
+    for _ in range(20):
+        if found := await smartcam.frames.discover("gige"):
+            return [f"{one.url} {one.name}" for one in found]
+    return []
+
+
+async def read(frames: int, query: str) -> dict[str, object]:
+    found = await discovered()
+    driver = GigEDriver(FrameAddress.parse(f"gige://127.0.0.1?{query}"))
+    source = smartcam.frames.FrameSource(driver)
+    wrong, second, last, first = [], "", 0, 0
+    async with source:
+        try:
+            await GigEDriver(FrameAddress.parse(f"gige://127.0.0.1?{query}")).open()
+        except FrameSourceError as error:
+            second = str(error)
+        shown = str(source.format)
+        async with source.reader() as reader:
+            begun = time.process_time()
+            async for frame in reader:
+                first, last = first or frame.sequence, frame.sequence
+                if text := wrong_in(frame):
+                    wrong.append(text)
+                if last - first + 1 >= frames:
+                    break
+            spent = time.process_time() - begun
+            account = reader.statistics()
+    return {
+        "found": found,
+        "format": shown,
+        "second": second,
+        "wrong": wrong[:10],
+        "span": last - first + 1,
+        "offered": account.offered,
+        "delivered": account.delivered,
+        "lost": account.lost,
+        "counts": repr(getattr(driver.inside, "counts", "")),
+        "cpu": spent,
+    }
+
+
+def main() -> None:
+    frames, query, *arguments = sys.argv[1:]
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)  # noqa: S607
+    with Path("/dev/null").open("w") as nothing:
+        fake = subprocess.Popen(  # noqa: S603
+            [PROGRAM, "-i", "127.0.0.1", "-s", "FAKE01", *arguments], stdout=nothing, stderr=nothing
+        )
+    try:
+        print(json.dumps(asyncio.run(read(int(frames), query))))  # noqa: T201
+    finally:
+        fake.terminate()
+        fake.wait(10)
+
+
+if __name__ == "__main__":
+    main()
