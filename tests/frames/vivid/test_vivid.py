@@ -15,7 +15,7 @@ def test_the_driver_does_with_the_kernel_what_it_should(tmp_path: Path) -> None:
     if (why := machine.missing()) is not None:
         pytest.skip(why)
     script = Path(__file__).with_name("guest.py")
-    status, said = machine.run(script, [], tmp_path, timeout=240)
+    status, said = machine.run(script, [], tmp_path, timeout=1500)
     results = tmp_path / "result.json"
     assert results.exists(), said
     came = json.loads(results.read_text())
