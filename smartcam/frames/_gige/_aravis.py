@@ -207,11 +207,11 @@ class AravisDriver(FrameDriver):
         self._sink = None
         self._end.set()
         pump, self._pump = self._pump, None
-        stream, self._stream = self._stream, None
+        held, self._stream = [self._stream], None
         if pump is not None:
             await asyncio.wait([pump])
-        if stream is not None:
-            await self._call("end its stream", stream.stop_thread, True)
+        if self._pool is not None:  # it ends when nobody holds it, which waits for its thread
+            await asyncio.get_running_loop().run_in_executor(self._pool, held.clear)
 
     def _resend(self) -> Any:
         kinds = self._aravis.GvStreamPacketResend
