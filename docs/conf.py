@@ -16,6 +16,7 @@ import importlib
 import inspect
 import itertools
 import json
+import re
 import struct
 import textwrap
 import tomllib
@@ -29,7 +30,14 @@ import smartcam
 from smartcam._client.handshake import load_protocol
 from smartcam.calibration._files.storage import Stored
 from smartcam.emulator import Quirks
-from smartcam.fleet._file import CameraEntry, Emulated, FleetFile, History, Retry
+from smartcam.fleet._file import (
+    CameraEntry,
+    Emulated,
+    FleetFile,
+    FramesEntry,
+    History,
+    Retry,
+)
 from smartcam.protocols._base import POLICIES
 from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
 from smartcam.protocols._framed.dialect import MAX_SURPLUS
@@ -436,6 +444,11 @@ def fleet_emulated() -> str:
     return _fields(Emulated)
 
 
+def fleet_frames() -> str:
+    """Return those of its ``frames``."""
+    return _fields(FramesEntry)
+
+
 def fleet_reconnect() -> str:
     """Return those of its ``reconnect``."""
     return _fields(Retry)
@@ -542,7 +555,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, settings, transitions, policies, layers, limits),
-        *(fleet_file, fleet_camera, fleet_emulated, fleet_reconnect, fleet_history),
+        *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
     )
 }
 """What ``{generated}`` knows."""
@@ -569,6 +582,7 @@ def setup(app: Any) -> None:
     app.add_directive("generated", Generated)
     app.connect("autodoc-skip-member", _skip)
     app.connect("autodoc-process-signature", _plain_types)
+    app.connect("autodoc-process-signature", _which_frame)
 
 
 def _plain_types(
@@ -587,6 +601,18 @@ def _plain_types(
     shown = inspect.Signature([one.replace(annotation=types[one.name]) for one in given])
     array = "numpy.ndarray[tuple[typing.Any, ...], numpy.dtype[numpy.float64]]"
     return stringify_signature(shown).replace(array, "Array"), ""
+
+
+def _which_frame(
+    _app: Any, _what: str, name: str, _member: Any, _options: Any, signature: str, gives: str
+) -> tuple[str | None, str | None]:
+    """Say whose frame it is: a camera's, or a protocol's."""
+    home = "protocols" if name.startswith("smartcam.protocols") else "frames"
+
+    def named(text: str | None) -> str | None:
+        return text and re.sub(r"(?<![\w.])Frame(?!\w)", f"~smartcam.{home}.Frame", text)
+
+    return named(signature), named(gives)
 
 
 def _skip(_app: Any, _what: str, _name: str, member: object, skip: bool, _options: Any) -> bool:

@@ -9,13 +9,18 @@ from __future__ import annotations
 import abc
 import asyncio
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, TypeVar, overload
 
 from smartcam._client.counters import ClientCounters
 from smartcam._client.interpretation import Interpretation
 from smartcam._client.listeners import Listeners
 from smartcam._client.triggering import TriggerRequest
-from smartcam.exceptions import ConfigurationError, SmartCamError, TriggerTimeoutError
+from smartcam.exceptions import (
+    ConfigurationError,
+    SmartCamError,
+    TriggerTimeoutError,
+    UnsupportedError,
+)
 from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status, ValueT
 from smartcam.observers import Observer, Observers
 from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
@@ -24,8 +29,9 @@ if TYPE_CHECKING:
     import contextlib
     from collections.abc import Callable, Coroutine, Generator, Iterable
     from types import TracebackType
-    from typing import Literal, NoReturn, Self
+    from typing import NoReturn, Self
 
+    from smartcam.frames import Frame, FrameReader
     from smartcam.interpreters._base import AnySpec, TypedSpec
     from smartcam.models import Localization
     from smartcam.settings import CameraSettings
@@ -52,6 +58,13 @@ DEFAULT_TRIGGER_TIMEOUT = 5.0
 DEFAULT_RECONNECT_TIMEOUT = 60.0
 """Seconds for a session to be there again: a reboot takes about 30 (mvBlueGEMINI manual p. 31,
 published for the sibling)."""
+
+
+FRAME_TIMEOUT = 5.0
+"""Seconds that a frame is waited for."""
+
+FrameEncoding: TypeAlias = Literal["raw", "jpeg", "png", "jpegxl"]
+"""What frames may come as."""
 
 
 class Camera(abc.ABC, Generic[ValueT]):
@@ -622,6 +635,94 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the answer is dropped when it comes.
         """
+
+    def frames(
+        self,
+        *,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float | None = FRAME_TIMEOUT,
+    ) -> contextlib.AbstractAsyncContextManager[FrameReader]:
+        """Read what the camera sees: ``async with camera.frames() as frames``, then iterate.
+
+        It is a :class:`smartcam.frames.FrameReader`: it gives the newest frame, and counts what was
+        skipped for that and what was lost. The device streams while anybody reads, and the bus has
+        one frame at a time under way for each reader.
+
+        Only a camera of a fleet has frames, where its entry in the fleet file says ``frames``.
+
+        Args:
+            encoding: ``raw`` is as the device gives them; ``jpeg``, or ``png`` and ``jpegxl``
+                without loss. They stay so until somebody asks for pixels.
+            quality: of JPEG, 1 to 100.
+            timeout: seconds that an iteration waits for a frame; None: as long as it takes.
+
+        Raises:
+            UnsupportedError: the camera has none.
+            FrameSourceError: the device is not there, in use, or was unplugged; or the agent is
+                gone. A reader ends with it, and another one tries again.
+
+        Cancellation: nothing is left.
+        """
+        raise self._no_frames()
+
+    async def newest_frame(
+        self,
+        *,
+        max_age: float = 1.0,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float = FRAME_TIMEOUT,
+    ) -> Frame:
+        """Return the newest frame.
+
+        Args:
+            max_age: seconds since it was captured at most; ``inf``: any.
+            encoding: as :meth:`frames` has it.
+            quality: the same.
+            timeout: seconds.
+
+        Raises:
+            UnsupportedError: the camera has none.
+            FrameTimeoutError: none came in time.
+            FrameSourceError: the device is not there, in use, or was unplugged.
+            ConnectionLostError: the agent is gone.
+
+        Cancellation: safe.
+        """
+        raise self._no_frames()
+
+    async def frame_after(
+        self,
+        moment: float | None = None,
+        *,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float = FRAME_TIMEOUT,
+    ) -> Frame:
+        """Return the first frame whose exposure began after a moment, or after this call.
+
+        Where clocks or the source leave a doubt, it is the first one of which that is sure.
+
+        Args:
+            moment: of ``time.monotonic()``; None: now.
+            encoding: as :meth:`frames` has it.
+            quality: the same.
+            timeout: seconds.
+
+        Raises:
+            SmartCamError: as :meth:`newest_frame`.
+
+        Cancellation: safe.
+        """
+        raise self._no_frames()
+
+    def _no_frames(self) -> UnsupportedError:
+        return UnsupportedError(
+            f"{self.name}: a camera at the wire gives results, no frames: open what takes its "
+            "pictures by smartcam.frames.open(URL), or share the camera by a fleet file with "
+            "frames: URL"
+        )
 
     @abc.abstractmethod
     async def get_clock(self, *, timeout: float | None = None) -> datetime:

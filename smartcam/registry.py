@@ -217,6 +217,7 @@ FRAMES = Registry(
     "smartcam.frames",
     {
         "file": "smartcam.frames._video:VideoDriver",
+        "fleet": "smartcam.fleet._frame_driver:FleetFrameDriver",
         "gige": "smartcam.frames._gige.driver:GigEDriver",
         "http": "smartcam.frames._video:VideoDriver",
         "insight": "smartcam.frames._insight:InSightDriver",
@@ -224,5 +225,5 @@ FRAMES = Registry(
         "synthetic": "smartcam.frames._synthetic:SyntheticDriver",
         "v4l2": "smartcam.frames._v4l2.driver:V4L2Driver",
     },
-    aliases={"https": "http", "rtsps": "rtsp"},
+    aliases={"fleet+tls": "fleet", "https": "http", "rtsps": "rtsp"},
 )

@@ -27,6 +27,7 @@ from smartcam.camera import (
     DEFAULT_MAX_QUEUE_BYTES,
     DEFAULT_RECONNECT_TIMEOUT,
     DEFAULT_TRIGGER_TIMEOUT,
+    FRAME_TIMEOUT,
     Camera,
 )
 from smartcam.connecting import connect as connect_async
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Literal, NoReturn, Self, Unpack
 
+    from smartcam.camera import FrameEncoding
+    from smartcam.frames import Frame, FrameReader, ReaderStatistics
     from smartcam.interpreters._base import AnySpec, TypedSpec
     from smartcam.models import (
         CameraEvent,
@@ -53,7 +56,7 @@ if TYPE_CHECKING:
     from smartcam.settings import CameraOptions, CameraSettings, OtherOptions
     from smartcam.streams import BatchSubscription, Subscription
 
-__all__ = ["SyncCamera", "SyncSubscription", "connect"]
+__all__ = ["SyncCamera", "SyncFrameReader", "SyncSubscription", "connect"]
 
 T = TypeVar("T")
 ItemT = TypeVar("ItemT")
@@ -519,6 +522,54 @@ class SyncCamera(Generic[ValueT]):
         """Return the last picture: :meth:`smartcam.Camera.read_image`."""
         return self._wait(lambda: self._camera.read_image(timeout=timeout))
 
+    @contextlib.contextmanager
+    def frames(
+        self,
+        *,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float | None = FRAME_TIMEOUT,
+    ) -> Generator[SyncFrameReader]:
+        """Read what the camera sees, in a ``with``: :meth:`smartcam.Camera.frames`."""
+        inside = self._camera.frames(encoding=encoding, quality=quality, timeout=timeout)
+        reader = self._wait(inside.__aenter__)
+        try:
+            yield SyncFrameReader(reader, self)
+        except BaseException as exc:
+            self._leave(inside, exc)
+            raise
+        self._leave(inside, None)
+
+    def newest_frame(
+        self,
+        *,
+        max_age: float = 1.0,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float = FRAME_TIMEOUT,
+    ) -> Frame:
+        """Return the newest frame: :meth:`smartcam.Camera.newest_frame`."""
+        return self._wait(
+            lambda: self._camera.newest_frame(
+                max_age=max_age, encoding=encoding, quality=quality, timeout=timeout
+            )
+        )
+
+    def frame_after(
+        self,
+        moment: float | None = None,
+        *,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float = FRAME_TIMEOUT,
+    ) -> Frame:
+        """Return the first frame exposed after a moment: :meth:`smartcam.Camera.frame_after`."""
+        return self._wait(
+            lambda: self._camera.frame_after(
+                moment, encoding=encoding, quality=quality, timeout=timeout
+            )
+        )
+
     def get_clock(self, *, timeout: float | None = None) -> datetime:
         """Return the camera's clock: :meth:`smartcam.Camera.get_clock`."""
         return self._wait(lambda: self._camera.get_clock(timeout=timeout))
@@ -695,6 +746,48 @@ class SyncSubscription(Generic[ItemT]):
     def __del__(self) -> None:
         # in the loop's thread, which goes through the subscribers
         self._thread.post(self._subscription.close)
+
+
+class SyncFrameReader:
+    """A reader of frames: ``for frame in frames``; as :class:`smartcam.frames.FrameReader`."""
+
+    def __init__(self, reader: FrameReader, camera: SyncCamera[Any]) -> None:
+        self._reader, self._camera = reader, camera
+
+    def statistics(self) -> ReaderStatistics:
+        """Return the account as it is now."""
+        return self._camera._do(self._reader.statistics)  # noqa: SLF001 - the two are one
+
+    def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
+        """Return the newest frame: :meth:`smartcam.frames.FrameReader.newest`."""
+        return self._camera._wait(  # noqa: SLF001
+            lambda: self._reader.newest(max_age=max_age, timeout=timeout)
+        )
+
+    def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
+        """Return the first frame after a moment: :meth:`smartcam.frames.FrameReader.after`."""
+        return self._camera._wait(  # noqa: SLF001
+            lambda: self._reader.after(moment, timeout=timeout)
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self
+
+    def __next__(self) -> Frame:
+        """Return the newest frame that was not returned yet.
+
+        Raises:
+            StopIteration: the source ended in order.
+            FrameTimeoutError: none came in time; it may be waited for again.
+            FrameSourceError: how the source ended.
+        """
+        frame = self._camera._wait(self._take)  # noqa: SLF001
+        if frame is None:
+            raise StopIteration
+        return frame
+
+    async def _take(self) -> Frame | None:
+        return await anext(self._reader, None)
 
 
 _END: Any = object()

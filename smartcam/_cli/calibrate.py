@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import json
+import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,21 +11,27 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.calibrate_files import OWN, OwnContext, WithFiles, compare, draw
+from smartcam._cli.calibrate_lens import lens as calibrate_lens
+from smartcam._cli.calibrate_lens import read_target
 from smartcam._cli.calibrate_terminal import drive, listing_text
+from smartcam._cli.frames import is_source, opened
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import CalibrationError, ConfigurationError, UnsupportedError
+from smartcam.frames import FrameAddress
 from smartcam.models import Localization
+from smartcam.registry import FRAMES, PROTOCOLS
+from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import AsyncIterator, Mapping
 
     from smartcam.calibration._files.directory import Folder
     from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration._targets import Target
     from smartcam.calibration.wizards._sequence import Wizard
     from smartcam.calibration.wizards._services import CalibrationService
+    from smartcam.frames import FrameSource
 
 ABORTED = 130
 """Exit code after an abort: as after Ctrl-C there is no calibration."""
@@ -33,9 +39,9 @@ ABORTED = 130
 STALE = 7
 """Exit code after a check that found the calibration stale."""
 
-MAX_DESCRIPTION = 65_536
-"""Bytes of a target's description."""
-
+LINGER = 30.0
+"""Seconds that a source of frames streams on after a picture: the next one needs no new start, and
+finds exposure and white balance as they were."""
 
 HELP = "Calibrate a camera against a robot: where its localizations lie in the robot's space. "
 
@@ -50,10 +56,12 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
     "With --check it asks for some touches only, and tells whether a calibration is still true: "
     f"exit code {STALE} if it is stale. "
     "With --wizard sheet or hand-eye the camera's own pictures are looked at: those of a camera "
-    "that sends them, or those that come into the folder of --pictures; then no URL is needed. "
+    "that sends them, or those of --pictures, which come into a folder or are the frames of a "
+    "source (see smartcam frames); then no URL is needed. "
     f"The camera is connected for each picture only. {CONNECTS} "
-    "smartcam calibrate compare A B compares calibrations that are in files, and smartcam "
-    "calibrate draw FILE draws one; --help behind each tells more."
+    "smartcam calibrate lens PICTURES calibrates a lens, smartcam calibrate compare A B compares "
+    "calibrations that are in files, and smartcam calibrate draw FILE draws one; --help behind "
+    "each tells more."
 )
 @click.argument("url", required=False)
 @click.option("--name", "called", metavar="NAME", help="Its name.  [default: that of the wizard]")
@@ -65,9 +73,10 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
 )
 @click.option(
     "--pictures",
-    metavar="FOLDER",
+    metavar="FOLDER|URL",
     type=click.Path(file_okay=False),
-    help="Take the next picture that comes into this folder, as by FTP.",
+    help="Take the next picture that comes into this folder, as by FTP; or the first frame of this "
+    "source that is exposed when it is wanted, such as v4l2:///dev/video0.",
 )
 @click.option(
     "--target",
@@ -134,17 +143,39 @@ async def wizard_command(
         raise click.UsageError("--check names the calibration: no --name beside it")
     if wizard is not None and check is not None:
         raise click.UsageError("--check asks for touches of marks: no --wizard beside it")
+    if url is not None and _only_frames(url):
+        said = FrameAddress.parse(url).shown
+        raise ConfigurationError(
+            f"{said} gives frames, no localizations: expected the URL of a camera that does, or "
+            f"--pictures {said} with --wizard sheet or --wizard hand-eye"
+        )
     if url is None and (pictures is None or wizard in {None, "plane"}):
         raise click.UsageError(
             "a URL is missing: only --wizard sheet and --wizard hand-eye do without one, with "
-            "--pictures FOLDER"
+            "--pictures FOLDER or --pictures URL"
         )
+    async with _frames_of(pictures, options) as source:
+        sources = _Sources(options, url, pictures, source, target, lens)
+        await _run(sources, called, wizard, check, folder, feature, fresh, web)
+
+
+async def _run(
+    sources: _Sources,
+    called: str | None,
+    wizard: str | None,
+    check: str | None,
+    folder: str,
+    feature: str | None,
+    fresh: bool,
+    web: PageOptions,
+) -> None:
+    """Go through the wizard to its end."""
     from smartcam.calibration.wizards._verification import WIZARD
 
-    sources = _Sources(options, url, pictures, target, lens)
+    options = sources.options
     started = WIZARD if check is not None else wizard or "plane"
     parameters: dict[str, Any] = {} if feature is None else {"feature": feature}
-    if target is not None and started in {"sheet", "hand-eye"}:
+    if sources.target is not None and started in {"sheet", "hand-eye"}:
         parameters["target"] = sources.described
     named = next(one for one in (check, called, started) if one is not None)
     try:
@@ -163,9 +194,30 @@ async def wizard_command(
         raise ConfigurationError(str(exc)) from exc
 
 
+def _only_frames(url: str) -> bool:
+    """Tell whether a URL is that of a source of frames, and of no camera."""
+    scheme = url.partition("://")[0] if is_source(url) else ""
+    return scheme in FRAMES and scheme not in PROTOCOLS and not is_fleet(url)
+
+
+@contextlib.asynccontextmanager
+async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[FrameSource | None]:
+    """Have the source of frames open that ``--pictures`` names, None where it names none.
+
+    Raises ConfigurationError: the URL is wrong; FrameSourceError: it is not there.
+    """
+    if pictures is None or not is_source(pictures):
+        yield None
+        return
+    async with opened(pictures, options, linger=LINGER) as source:
+        yield source
+
+
 wizard_command.context_class = OwnContext
 calibrate = WithFiles(
-    "calibrate", commands={OWN: wizard_command, "compare": compare, "draw": draw}, help=HELP
+    "calibrate",
+    commands={OWN: wizard_command, "lens": calibrate_lens, "compare": compare, "draw": draw},
+    help=HELP,
 )
 
 
@@ -216,6 +268,7 @@ class _Sources:
     options: Options
     url: str | None
     pictures: str | None
+    source: FrameSource | None
     target: str | None
     lens: str | None
 
@@ -224,7 +277,7 @@ class _Sources:
         """What is on the sheet, as it is described."""
         from smartcam.calibration._targets import target_to_data
 
-        return target_to_data(_read_target(str(self.target)))
+        return target_to_data(read_target(str(self.target)))
 
     def wizards(self, folder: Folder) -> list[Wizard]:
         """Return the wizards that can work with what there is; the first is the page's default.
@@ -259,7 +312,7 @@ class _Sources:
                     y_down=y_down,
                 ),
             ]
-        target = None if self.target is None else _read_target(self.target)
+        target = None if self.target is None else read_target(self.target)
         lens = None if self.lens is None else _read_lens(self.lens)
         pictures: dict[str, Any] = {
             **self._taking(),
@@ -291,6 +344,8 @@ class _Sources:
         """Return what takes pictures, and which ones are waited for."""
         from smartcam.calibration.wizards._pictures import PictureFolder
 
+        if self.source is not None:
+            return {"take_picture": self.source}
         if self.pictures is None:
             return {"take_picture": self.take_picture}
         folder = PictureFolder(self.pictures)
@@ -313,25 +368,6 @@ class _Sources:
                 data = await camera.read_image(timeout=wait)
                 name = camera.name
         return await asyncio.to_thread(decode_picture, data, name)
-
-
-def _read_target(path: str) -> Target:
-    from smartcam.calibration._targets import target_from_data
-
-    try:
-        with Path(path).open("rb") as stream:
-            data: object = json.loads(stream.read(MAX_DESCRIPTION))
-    except OSError as exc:
-        raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
-    except (ValueError, RecursionError) as exc:
-        raise ConfigurationError(f"--target {path}: no JSON: {exc}") from exc
-    if not isinstance(data, dict):
-        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
-    described: dict[str, Any] = data
-    try:
-        return target_from_data(described)
-    except CalibrationError as exc:
-        raise ConfigurationError(f"--target {path}: {exc}") from exc
 
 
 def _read_lens(path: str) -> CameraModel:

@@ -22,6 +22,8 @@ from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
     ConnectionLostError,
+    FrameFormatError,
+    FrameSourceError,
     InterpretationError,
     LayoutError,
     LinkError,
@@ -42,14 +44,17 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (CalibrationError, 2),
     (InterpretationError, 6),
     (TimeoutError, 4),
+    (FrameFormatError, 5),
+    (FrameSourceError, 3),
     (CommandRejectedError, 5),
     (UnsupportedError, 5),
     (CameraFaultError, 5),
     (TriggerError, 5),
 )
-"""First match decides. 0 done; 1 a fault of ours; 2 wrong usage; 3 no session or a broken one; 4 a
-wait in a session ran out; 5 the camera refused or is not running; 6 a result is not interpretable;
-7 ``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143: cut off by Ctrl-C
+"""First match decides. 0 done; 1 a fault of ours; 2 wrong usage; 3 no session or a broken one, or a
+source of frames that is not there, in use or gone; 4 a wait in a session, or for a frame, ran out;
+5 the camera refused, is not running or has no such pixels; 6 a result is not interpretable; 7
+``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143: cut off by Ctrl-C
 or SIGTERM."""
 
 

@@ -17,6 +17,7 @@ from smartcam._cli.decode import decode, from_hex
 from smartcam._cli.dissector import dissector
 from smartcam._cli.doctor import doctor
 from smartcam._cli.fleet import fleet
+from smartcam._cli.frames import frames
 from smartcam._cli.image import image
 from smartcam._cli.live import live, serve_page
 from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, application, runs
@@ -49,15 +50,17 @@ if TYPE_CHECKING:
 
 EPILOG = (
     "Exit codes: 0 done; 1 a fault of ours; 2 wrong usage, a bad layout text included; 3 no "
-    "session: nothing listens, silence or garbage, connection lost; 4 a wait in a session ran "
-    "out; 5 the camera refused or is not running; 6 a result is not interpretable; 7 a calibration "
-    "that was checked is stale, or two differ."
+    "session: nothing listens, silence or garbage, connection lost, no such source of frames; 4 a "
+    "wait in a session, or for a frame, ran out; 5 the camera refused, is not running or has no "
+    "such pixels; 6 a result is not interpretable; 7 a calibration that was checked is stale, or "
+    "two differ."
 )
 
 
 TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
     "A fleet": ("serve", "fleet"),
+    "Pictures": ("frames",),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
     "Recordings": ("record", "replay", "pcap", "dissector"),
@@ -303,7 +306,7 @@ async def demo_command(pick: bool, shared: bool, picture: str, seed: int, option
 
 for _one in (
     *(live, probe, doctor, image, decode, calibrate, sheet),
-    *(record, replay, pcap, dissector, serve, fleet),
+    *(record, replay, pcap, dissector, serve, fleet, frames),
 ):
     command.add_command(_one)
 

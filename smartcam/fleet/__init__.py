@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         FleetEvent,
         FleetResults,
     )
+    from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._opening import open, serve
     from smartcam.fleet._server import FleetServer
 
@@ -39,6 +40,7 @@ __all__ = [
     "FleetCamera",
     "FleetEvent",
     "FleetFile",
+    "FleetFrame",
     "FleetResults",
     "FleetServer",
     "fleet_schema",
@@ -54,6 +56,7 @@ if not TYPE_CHECKING:
             "_camera": "FleetCamera",
             "_file": "FleetFile fleet_schema load_fleet",
             "_fleet": "AgentJoined AgentLeft CameraJoined CameraLeft Fleet FleetEvent FleetResults",
+            "_frame_wire": "FleetFrame",
             "_opening": "open serve",
             "_server": "FleetServer",
         },

@@ -22,6 +22,9 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._calls import ACTIONS, PASSES_GATE, ProgramCall, now
 from smartcam.fleet._errors import late, to_fields
+from smartcam.fleet._frame_encoding import FrameEncoder
+from smartcam.fleet._frame_sender import FrameSender
+from smartcam.fleet._frames import NO_FRAMES, SharedFrames
 from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._plain import Plain
@@ -37,10 +40,11 @@ from smartcam.fleet._wire import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from typing import Self
 
     from smartcam.fleet._bus import Bus, Handle
+    from smartcam.fleet._frames import FramesOf
     from smartcam.fleet._keys import Keys
     from smartcam.models import CameraEvent
     from smartcam.settings import CameraSettings
@@ -107,6 +111,7 @@ class Agent:
         cameras: options of the client of each camera, by the camera's name.
         history: results that are kept for each camera, and their bytes.
         on_event: is told what happens to the cameras.
+        frames: where the frames of each camera come from that has any, by the camera's name.
     """
 
     def __init__(
@@ -118,8 +123,11 @@ class Agent:
         *,
         history: tuple[int, int] = (10_000, 1 << 24),
         on_event: Callable[[CameraEvent], None] = lambda _: None,
+        frames: Mapping[str, FramesOf] | None = None,
     ) -> None:
         self.name = name
+        self._frames = dict(frames or {})
+        self._sender, self._encoder = FrameSender(bus, keys), FrameEncoder()
         self.epoch: int = time.time_ns()
         self._keys, self._bus = keys, bus
         self._cameras, self._history, self._on_event = cameras, history, on_event
@@ -175,7 +183,9 @@ class Agent:
             await asyncio.gather(*self._tasks, return_exceptions=True)
             closing = (host.close() for host in self.hosts.values())
             await asyncio.gather(*closing, return_exceptions=True)
+            await self._encoder.close()
         finally:
+            self._sender.close()
             await self._bus.close()
 
     def share(self, name: str, settings: CameraSettings) -> Host:
@@ -185,7 +195,10 @@ class Agent:
             ConfigurationError: an option of it cannot work.
         """
         bus, keys, topics = self._bus, self._keys, self._plain.topics
-        host = Host(name, settings, bus, keys, self.epoch, self._history, self._on_event, topics)
+        found = self._frames.get(name, NO_FRAMES)
+        frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
+        events = self._on_event
+        host = Host(name, settings, bus, keys, self.epoch, self._history, events, topics, frames)
         host.numbers = self._numbers_at.pop(name, host.numbers)
         self.hosts[name] = host
         running = self.begin(host.run(), f"smartcam.fleet.{name}")
@@ -239,8 +252,10 @@ class Agent:
             del self._gone[next(iter(self._gone))]
         for task in guest.tasks.values():
             self._end(task)
+        self._sender.forget(program)
         for host in self.hosts.values():
             host.gate.forget(program)
+            host.frames.forget(program)
         if going_back:
             for camera, before in guest.entered.values():
                 camera.leave(before)
@@ -281,6 +296,9 @@ class Agent:
     def _on_call(self, host: Host, message: BusMessage, command: bool) -> None:
         fields = message.fields
         program, number = str(fields["program"]), int(fields["call"])
+        if "come" in fields:
+            self._sender.come(program, number, fields["come"])
+            return
         if "cancel" in fields:
             self._cancel(host, program, int(fields["cancel"]))
             self._reply(program, number, {"answer": {}})
@@ -355,6 +373,7 @@ class Agent:
         task = guest.tasks.pop(number, None)
         if task is not None:
             self._end(task)
+        self._sender.come(program, number, None)
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
         if entered is not None:  # it was done, and its program does not know

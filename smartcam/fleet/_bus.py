@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Self
 
+Data = bytes | bytearray | memoryview
+
 
 class Handle(abc.ABC):
     """Something that lasts until it is closed."""
@@ -44,7 +46,14 @@ class Publisher(Handle):
 
 
 class Bus(abc.ABC):
-    """One end of a bus: a program's, or an agent's."""
+    """One end of a bus: a program's, or an agent's.
+
+    Attributes:
+        local: all ends are in this event loop: what is said in parts is handed on as it is, and the
+            clocks of all are one.
+    """
+
+    local: bool = False
 
     @abc.abstractmethod
     async def open(self, timeout: float) -> Self:
@@ -61,6 +70,17 @@ class Bus(abc.ABC):
     @abc.abstractmethod
     def put(self, key: str, payload: bytes) -> None:
         """Say something that somebody waits for; never blocks."""
+
+    @abc.abstractmethod
+    def put_part(self, key: str, head: bytes, data: Data) -> None:
+        """Say a part of something large behind all else, with what there is to say of it.
+
+        It is dropped where there is no room; never blocks. Nobody may write into ``data`` later.
+        """
+
+    @abc.abstractmethod
+    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+        """Have ``hear(key, head, data)`` called for parts that are said under ``pattern``."""
 
     @abc.abstractmethod
     def publisher(
@@ -170,8 +190,11 @@ class _MemoryDeclared(Handle):
 class MemoryEnd(Bus):
     """One end of a :class:`MemoryBus`."""
 
+    local = True
+
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
+        self.heard_parts: list[_MemoryDeclared] = []
         self.heard: list[_MemoryDeclared] = []
         self.answered: list[_MemoryDeclared] = []
         self.watched: list[_MemoryDeclared] = []
@@ -190,7 +213,8 @@ class MemoryEnd(Bus):
 
     async def close(self) -> None:
         self.detach()
-        for place in (self.heard, self.answered, self.watched, self.present_here):
+        places = (self.heard, self.heard_parts, self.answered, self.watched, self.present_here)
+        for place in places:
             place.clear()
 
     def attach(self) -> None:
@@ -211,6 +235,14 @@ class MemoryEnd(Bus):
         for end in self._others():
             for one in end.matching(end.heard, key):
                 self._loop.call_soon(_call, one, key, payload)
+
+    def put_part(self, key: str, head: bytes, data: Data) -> None:
+        for end in self._others():
+            for one in end.matching(end.heard_parts, key):
+                self._loop.call_soon(_call, one, key, head, data)
+
+    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+        return _MemoryDeclared(self.heard_parts, pattern, hear)
 
     def publisher(
         self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import (
@@ -88,6 +89,8 @@ class Caller:
         self._task: asyncio.Task[None] | None = None
         self._ahead = 0.0  # the agent's clock is at least so far ahead of the loop's
         self._measured = 0.0
+        self._most = math.inf  # and at most so far
+        self._bounded = 0.0
         self._insisting: set[asyncio.Task[None]] = set()
 
     # ------------------------------------------------------------------ life
@@ -190,6 +193,8 @@ class Caller:
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"the agent {agent} says no proper hello: {exc}") from exc
         self._ahead, self._measured = clock - loop.time(), loop.time()
+        self._most = math.inf
+        self.bound(clock, begun)
         if agent in self._agents:
             self.met = Met(agent, epoch, hello)
             self.trouble = None
@@ -202,6 +207,27 @@ class Caller:
         now = asyncio.get_running_loop().time()
         least = self._ahead - DRIFT * (now - self._measured)
         self._ahead, self._measured = max(least, clock - now), now
+
+    def bound(self, clock: float, said: float) -> None:
+        """The agent's clock said ``clock`` after it had heard what was said at a time of ours."""
+        now = asyncio.get_running_loop().time()
+        most = self._most + DRIFT * (now - self._bounded)
+        self._most, self._bounded = min(most, clock - said), now
+
+    def here(self, clock: float) -> tuple[float, float]:
+        """Return between which times of the loop's it was when the agent's clock said ``clock``."""
+        if self.program.bus.local:
+            return clock, clock
+        now = asyncio.get_running_loop().time()
+        least = self._ahead - DRIFT * max(0.0, now - self._measured)
+        most = max(least, self._most + DRIFT * max(0.0, now - self._bounded))
+        return clock - most, clock - least
+
+    def clock_at_most(self, at: float) -> float:
+        """Return what the agent's clock says at a time of the loop's: that, or a little more."""
+        self.require()
+        earliest, _ = self.here(0.0)
+        return at - earliest
 
     def clock(self, at: float) -> float:
         """Return what the agent's clock says at a time of the loop's: that, or a little less."""
@@ -357,6 +383,12 @@ class Caller:
         if self.met is not None:
             fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
             self._insist(self._key(self.met.agent, do), fields)
+
+    def come(self, number: int, offset: int | None) -> None:
+        """Say up to where the frame of a call has come; None: no more of it is wanted."""
+        if self.met is not None:
+            fields = {"call": number, "come": offset}
+            self.program.send(self._key(self.met.agent, "frame"), fields)
 
     def _cancel(self, key: str, number: int) -> None:
         self._insist(key, {"cancel": number})

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._frame_wire import FrameForm
+from smartcam.fleet._frames import FrameOrder
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Carrier, Owner
 from smartcam.fleet._wire import TriggerOrder, encode_runs
@@ -210,6 +212,40 @@ async def _request(call: ProgramCall) -> Answer:
     return {}, [] if answer is None else [answer]
 
 
+def _frame_order(call: ProgramCall) -> FrameOrder:
+    name = call.host.name
+    encoding = FrameForm.checked(
+        call.argument("encoding", str) or "raw", call.argument("quality", int), name
+    )
+    return FrameOrder(call.program, call.owner.call, encoding, call.timeout)
+
+
+async def _frame(call: ProgramCall) -> Answer:
+    return await call.host.frames.one(
+        _frame_order(call),
+        max_age=call.argument("max_age", int, float),
+        after=call.argument("after", int, float),
+        fresh=bool(call.argument("fresh", bool)),
+    ), []
+
+
+async def _next_frame(call: ProgramCall) -> Answer:
+    return await call.host.frames.next(_frame_order(call), call.wanted("stream", int)), []
+
+
+async def _leave_frames(call: ProgramCall) -> Answer:
+    call.host.frames.leave(call.program, call.wanted("stream", int))
+    return NOTHING
+
+
+async def _about_frames(call: ProgramCall) -> Answer:
+    return await call.host.frames.about(call.timeout), []
+
+
+async def _lens(call: ProgramCall) -> Answer:
+    return call.host.frames.lens(call.wanted("lens", int)), []
+
+
 async def _refresh(call: ProgramCall) -> Answer:
     return {"asked": await call.host.require().refresh(call.timeout)}, []
 
@@ -274,6 +310,11 @@ ACTIONS: dict[str, Callable[[ProgramCall], Awaitable[Answer]]] = {
     "wait_ready": _wait_ready,
     "read_image": _read_image,
     "get_clock": _get_clock,
+    "about_frames": _about_frames,
+    "frame": _frame,
+    "next_frame": _next_frame,
+    "leave_frames": _leave_frames,
+    "lens": _lens,
     "leave": _leave,
     "trigger": _trigger,
     "switch_application": _switch_application,

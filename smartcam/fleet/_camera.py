@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.interpretation import Interpretation
-from smartcam.camera import DEFAULT_RECONNECT_TIMEOUT, Camera
+from smartcam.camera import DEFAULT_RECONNECT_TIMEOUT, FRAME_TIMEOUT, Camera
 from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
@@ -24,6 +25,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._caller import Caller, Met
 from smartcam.fleet._errors import from_fields
+from smartcam.fleet._frame_wire import FrameForm
 from smartcam.fleet._receiver import FleetListeners, Own, Receiver
 from smartcam.fleet._wire import grace
 from smartcam.models import (
@@ -45,8 +47,12 @@ if TYPE_CHECKING:
 
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
+    from smartcam.camera import FrameEncoding
+    from smartcam.fleet._frame_caller import FrameCaller
+    from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._program import Program
     from smartcam.fleet._wire import BusMessage
+    from smartcam.frames import FrameReader
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
@@ -164,11 +170,12 @@ class FleetCamera(Camera[ValueT]):
             raise
         return self
 
-    async def attend(self, timeout: float) -> None:
+    async def attend(self, timeout: float, *, session: bool = True) -> None:
         """Begin to hear of the camera; whether it is there yet or not.
 
         Args:
             timeout: seconds for the way to the bus, and for the first answer of an agent.
+            session: wait also until the agent has tried to have a session with it.
         """
         self._opened = True
         deadline = self._deadline(timeout)
@@ -179,17 +186,20 @@ class FleetCamera(Camera[ValueT]):
                 raise self._not_reached(str(exc)) from exc
         self._receiver.open()
         self._caller.open()
-        await self._settle(deadline)
+        await self._settle(deadline, session=session)
         if self._observed:
             self._listens(self._listeners.results)
 
-    async def _settle(self, deadline: float) -> None:
+    async def _settle(self, deadline: float, *, session: bool) -> None:
         """Wait until the agent has a session with the camera, or has tried in vain; bounded."""
+
+        def settled() -> bool:
+            met = self._caller.met is not None
+            return self.ended or (met and not (session and self._trying))
+
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(deadline):
-                await self._stirred_until(
-                    lambda: self.ended or (self._caller.met is not None and not self._trying)
-                )
+                await self._stirred_until(settled)
 
     async def _stirred_until(self, condition: Callable[[], bool]) -> None:
         """Wait until something is true of what the agent says."""
@@ -665,6 +675,63 @@ class FleetCamera(Camera[ValueT]):
 
     async def read_image(self, *, timeout: float | None = None) -> bytes:
         return (await self._do("read_image", timeout)).blobs[0]
+
+    @functools.cached_property
+    def frame_caller(self) -> FrameCaller:
+        """What asks the camera's agent for frames."""
+        from smartcam.fleet._frame_caller import FrameCaller
+
+        return FrameCaller(self.name, self._caller)
+
+    @contextlib.asynccontextmanager
+    async def frames(
+        self,
+        *,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float | None = FRAME_TIMEOUT,
+    ) -> AsyncGenerator[FrameReader]:
+        from smartcam.fleet._frame_caller import SharedFrameDriver
+        from smartcam.frames import FrameAddress, FrameSource
+
+        wanted = FrameForm.checked(encoding, quality, self.name)
+        driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, wanted)
+        async with (
+            FrameSource(driver, timeout=timeout, stall=None) as source,
+            source.reader() as reader,
+        ):
+            yield reader
+
+    async def newest_frame(
+        self,
+        *,
+        max_age: float = 1.0,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float = FRAME_TIMEOUT,
+    ) -> FleetFrame:
+        self._deadline(timeout)
+        if not max_age >= 0:
+            raise ConfigurationError(f"{self.name}: max_age: expected seconds, got {max_age!r}")
+        wanted = FrameForm.checked(encoding, quality, self.name)
+        age = None if math.isinf(max_age) else max_age
+        return await self.frame_caller.one(wanted, timeout, max_age=age)
+
+    async def frame_after(
+        self,
+        moment: float | None = None,
+        *,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        timeout: float = FRAME_TIMEOUT,
+    ) -> FleetFrame:
+        self._deadline(timeout)
+        wanted = FrameForm.checked(encoding, quality, self.name)
+        if moment is None:
+            return await self.frame_caller.one(wanted, timeout, fresh=True)
+        if not math.isfinite(moment):
+            raise ConfigurationError(f"{self.name}: moment: expected seconds, got {moment!r}")
+        return await self.frame_caller.one(wanted, timeout, moment=moment)
 
     async def get_clock(self, *, timeout: float | None = None) -> datetime:
         reply = await self._do("get_clock", timeout)

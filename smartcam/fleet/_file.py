@@ -36,6 +36,9 @@ from smartcam.settings import CameraSettings, Seconds, masked, parse_address
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.frames import FrameSource
+
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 MOST_CAMERAS = 10_000
@@ -129,6 +132,73 @@ class Emulated(_Fields):
     seed: int = Field(1, ge=0, description="of the first one's noise; each next one has one more")
 
 
+class FramesEntry(_Fields):
+    """Where a camera's frames come from."""
+
+    url: str = Field(description="v4l2:///dev/video0, rtsp://HOST/..., or a file beside this one")
+    linger: float = Field(
+        2.0, ge=0, le=3600, description="seconds that it goes on streaming after the last who looks"
+    )
+    stall: Seconds | None = Field(
+        5.0,
+        description="seconds without a frame after which it counts as stuck; null: it waits for "
+        "triggers",
+    )
+    camera_info: str | None = Field(
+        None,
+        description="file with the lens, beside this one: a calibration of smartcam's, or ROS' "
+        "camera_info",
+    )
+
+    def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
+        """Show all of it but a password, which is not for logs."""
+        for name, value in super().__repr_args__():
+            yield name, masked(value) if name == "url" else value
+
+    def source(self, folder: Path) -> FrameSource:
+        """Return the source; it is not open.
+
+        Args:
+            folder: that the file is in.
+
+        Raises:
+            SmartCamError: the URL, or the lens, cannot work.
+            OSError: the lens cannot be read.
+        """
+        from smartcam import frames
+
+        url = self.url if "://" in self.url else str(folder / self.url)
+        return frames.open(url, camera_info=self.lens(folder), stall=self.stall, linger=self.linger)
+
+    def lens(self, folder: Path) -> CameraModel | None:
+        """Return the lens, None where none is said.
+
+        Raises:
+            CalibrationError: the file is no lens.
+            OSError: it cannot be read.
+        """
+        if self.camera_info is None:
+            return None
+        from smartcam.calibration import IntrinsicCalibration
+        from smartcam.calibration.formats import read_cameras
+
+        path = folder / self.camera_info
+        with path.open("rb") as file:
+            ours = file.read(64).lstrip()[:1] == b"{"
+        if ours:
+            return IntrinsicCalibration.load(path).camera
+        return read_cameras(path, "camera_info").cameras[0]
+
+
+def _frames(given: object) -> object:
+    """Take a URL alone for a mapping with nothing else in it."""
+    return {"url": given} if isinstance(given, str) else given
+
+
+def _or_url(schema: dict[str, Any]) -> None:
+    schema["anyOf"].append({"type": "string"})
+
+
 class CameraEntry(_Fields):
     """A camera, or several emulated ones."""
 
@@ -158,6 +228,11 @@ class CameraEntry(_Fields):
     liveness_timeout: Seconds | None = Field(
         5.0, description="until a camera that gives no sign of life counts as gone"
     )
+    frames: Annotated[FramesEntry | None, BeforeValidator(_frames)] = Field(
+        None,
+        description="where its pictures come from: a URL, or a mapping with more",
+        json_schema_extra=_or_url,
+    )
     reconnect: Annotated[Retry | None, BeforeValidator(_never)] = Field(
         Retry.model_validate({}),
         description="when a lost camera is tried again; false: never",
@@ -182,7 +257,7 @@ class CameraEntry(_Fields):
         Raises:
             ConfigurationError: an option cannot work.
         """
-        own = {"url", "emulated", "model", "reconnect"}
+        own = {"url", "emulated", "model", "reconnect", "frames"}
         options: dict[str, Any] = self.model_dump(exclude=own)
         reconnect = None if self.reconnect is None else self.reconnect.backoff()
         return CameraSettings.make(
@@ -385,6 +460,8 @@ def _of_entry(
         yield ("model",), "is for a url"
     elif entry.emulated is not None and entry.emulated.scenario is not None:
         yield from _of_scenario(folder / entry.emulated.scenario)
+    if entry.frames is not None:
+        yield from _of_frames(entry.frames, folder)
     if entry.reconnect is not None:
         try:
             entry.reconnect.backoff()
@@ -400,6 +477,18 @@ def _of_entry(
             except SmartCamError as exc:
                 numbered = () if application is None else (application,)
                 yield ("interpret_as", *numbered), str(exc)
+
+
+def _of_frames(entry: FramesEntry, folder: Path) -> Iterator[Mistake]:
+    try:
+        entry.lens(folder)
+    except (SmartCamError, OSError) as exc:
+        yield ("frames", "camera_info"), str(exc)
+        return
+    try:
+        entry.source(folder)
+    except SmartCamError as exc:
+        yield ("frames", "url"), str(exc)
 
 
 def _of_scenario(path: Path) -> Iterator[Mistake]:

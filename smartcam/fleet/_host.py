@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Sequence
 
     from smartcam.fleet._bus import Bus, Publisher
+    from smartcam.fleet._frames import SharedFrames
     from smartcam.fleet._keys import Keys
     from smartcam.fleet._shared import Carried, Owner
     from smartcam.fleet._topics import Topics
@@ -70,6 +71,7 @@ class Host:
         history: results that are kept, and their bytes.
         on_event: is told what happens to the camera.
         topics: where it is said in JSON.
+        frames: its frames.
 
     Attributes:
         gate: whose commands may pass.
@@ -77,6 +79,7 @@ class Host:
         states: the last things that happened.
         outcomes: the runs of triggers under way, by whose they are; for who has put a list there.
         topics: says in JSON what comes, for other programs.
+        frames: its frames.
         failure: why there is no session yet, None where there is or was one.
     """
 
@@ -90,8 +93,10 @@ class Host:
         history: tuple[int, int],
         on_event: Callable[[CameraEvent], None],
         topics: Topics,
+        frames: SharedFrames,
     ) -> None:
         self.name = name
+        self.frames = frames
         self.settings = settings
         self.gate = Gate()
         self.results = AgentLog(*history)
@@ -174,7 +179,10 @@ class Host:
     async def close(self) -> None:
         """End the session with Disconnect; bounded."""
         self._opened.clear()  # what is said from now on is no news
-        await self._camera.close()
+        try:
+            await self.frames.close()
+        finally:
+            await self._camera.close()
         if self._reminder is not None:
             self._reminder.cancel()
         self.flush()

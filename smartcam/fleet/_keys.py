@@ -87,6 +87,10 @@ class Keys:
         """Replies to a program."""
         return f"{self.root}/reply/{program}"
 
+    def frames(self, program: str) -> str:
+        """Bytes of frames, to a program that has asked for them."""
+        return f"{self.root}/frames/{program}"
+
     def states(self, camera: str) -> str:
         """What happens to a camera."""
         return f"{self.root}/states/{camera}"

@@ -18,6 +18,7 @@ from smartcam.exceptions import (
     ConnectionClosedError,
     ProtocolError,
 )
+from smartcam.fleet._frame_collector import FrameCollector
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._wire import BusMessage, TriggerReply, decode, decode_outcome, encode
 
@@ -59,6 +60,7 @@ class Program:
     Attributes:
         name: which no other program has; it begins with what a person would call it.
         keys: of the fleet, once it is open.
+        frames: takes the bytes of frames.
     """
 
     keys: Keys
@@ -70,6 +72,7 @@ class Program:
         self._calls = 0
         self._pending: dict[int, Pending] = {}
         self._declared: list[Handle] = []
+        self.frames: FrameCollector = FrameCollector(self)
 
     async def open(self, timeout: float) -> Self:
         """Come to the bus.
@@ -116,6 +119,7 @@ class Program:
             if not reply.done():
                 reply.set_exception(ConnectionClosedError("closed"))
         declared, self._declared = self._declared, []
+        self.frames.close()
         for handle in declared:
             handle.close()
         await self.bus.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +13,10 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._file import FleetFile, load_fleet
+from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
+from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
 from smartcam.streams import Subscribers, Subscription
 
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus
     from smartcam.fleet._file import Planned
     from smartcam.fleet._host import Host
+    from smartcam.settings import CameraSettings
 
 OPEN_TIMEOUT = 10.0
 """Seconds for coming to the bus."""
@@ -68,10 +72,16 @@ class FleetServer(Server):
             return
         file = self.file
         async with contextlib.AsyncExitStack() as stack:
-            cameras = {}
+            cameras: dict[str, CameraSettings] = {}
+            frames: dict[str, FramesOf] = {}
             for planned in self._plan:
                 url = planned.entry.url or await self._emulate(planned, stack)
                 cameras[planned.name] = planned.entry.settings(planned.name, url)
+                entry = planned.entry.frames
+                if entry is not None:
+                    make = functools.partial(entry.source, self._folder)
+                    make()  # what cannot work is told now
+                    frames[planned.name] = FramesOf(make, FrameAddress.parse(entry.url).shown)
             history = (file.history.results, file.history.bytes)
             agent = Agent(
                 file.agent_name,
@@ -80,6 +90,7 @@ class FleetServer(Server):
                 cameras,
                 history=history,
                 on_event=self._tell,
+                frames=frames,
             )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)

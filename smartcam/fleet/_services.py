@@ -12,8 +12,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 
 from smartcam._client.triggering import TriggerRequest
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
-from smartcam.exceptions import UnsupportedError
+from smartcam.exceptions import FrameFormatError, UnsupportedError
 from smartcam.fleet._calls import ACTIONS, MOST_FILLED, ProgramCall, outcomes
+from smartcam.fleet._frame_wire import FrameForm, to_fields
+from smartcam.fleet._frames import FrameOrder
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._reading import result_fields, singles
 from smartcam.fleet._shared import Carrier
@@ -35,6 +37,9 @@ MOST_RESULTS = 1000
 """Results that one answer brings."""
 
 MOST_INPUT = 1 << 16
+MOST_PICTURE = 1 << 20
+"""Bytes of a frame in an answer."""
+
 MOST_ID = 200
 
 
@@ -107,6 +112,13 @@ class _PlainClock(PlainRequest):
 class _PlainResults(PlainRequest):
     first: Annotated[int, Field(ge=1)] | None = None
     most: Annotated[int, Field(ge=1, le=MOST_RESULTS)] = 100
+
+
+class _PlainFrame(PlainRequest):
+    encoding: Literal["jpeg", "png", "jpegxl"] = "jpeg"
+    quality: Annotated[int, Field(ge=1, le=100)] | None = None
+    max_age: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    fresh: bool = False
 
 
 class Work(NamedTuple):
@@ -218,6 +230,24 @@ async def _results(work: Work) -> dict[str, Any]:
     return {"first": part.first, "next_result": part.following, "results": results}
 
 
+async def _frame(work: Work) -> dict[str, Any]:
+    request, host = work.request, work.host
+    encoding = FrameForm.checked(request.encoding, request.quality, host.name)
+    order = FrameOrder("", work.owner.call, encoding, work.timeout)
+    frame, took = await host.frames.get(
+        order, max_age=request.max_age, after=None, fresh=request.fresh
+    )
+    if len(frame.data) > MOST_PICTURE:
+        raise FrameFormatError(
+            f"{host.name}: the frame has {len(frame.data)} bytes as {encoding.name}, expected "
+            f"{MOST_PICTURE} at most",
+            source=host.name,
+        )
+    said = to_fields(frame, 0.0, took, 0)
+    own = {name: value for name, value in said.items() if name not in {"captured", "lens"}}
+    return {"frame": {**own, "data": base64.b64encode(frame.data).decode()}}
+
+
 async def _unknown(work: Work) -> dict[str, Any]:
     raise UnsupportedError(f"{work.host.name}: there is no such service")
 
@@ -248,6 +278,7 @@ SERVICES: dict[str, Service] = {
     "trigger": Service(_PlainTrigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
     "status": Service(PlainRequest, _status, command=False),
     "results": Service(_PlainResults, _results, command=False),
+    "frame": Service(_PlainFrame, _frame, command=False),
     **{do: Service(kind, _same(do), do in COMMANDS) for do, kind in _REQUESTS.items()},
 }
 """The plain services by name."""

@@ -255,6 +255,7 @@ class CameraTopics:
             "interpret_as": jsonable(self.interpret_as),
             "y_down": host.settings.y_down,
             "lenient": host.settings.lenient,
+            "frames": host.frames.url,
             "next_result": host.results.following,
         }
 

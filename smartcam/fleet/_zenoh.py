@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from typing import Self
 
+    from smartcam.fleet._bus import Data
+
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 RUNTIME = (
@@ -111,7 +113,7 @@ class BusLink:
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
             "transport/unicast/open_timeout": max(1, int(1e3 * timeout)),
         }
-        for queue in ("data", "interactive_high"):
+        for queue in ("data", "interactive_high", "data_low"):
             found[f"transport/link/tx/queue/size/{queue}"] = 16
         if self.certificates is not None:
             tls = f"{self.certificates.rstrip('/')}/"
@@ -225,6 +227,11 @@ class ZenohEnd(Bus):
             }
             for one in (control.DROP, control.BLOCK)
         )
+        self._behind_all = {
+            "priority": zenoh.Priority.DATA_LOW,
+            "express": True,
+            "congestion_control": control.DROP,
+        }
 
     # ------------------------------------------------------------------ life
 
@@ -356,6 +363,22 @@ class ZenohEnd(Bus):
             session.put(key, payload, **self._dropping[express])
         except self._zenoh.ZError as exc:  # it ends meanwhile
             logger.debug("the fleet's bus: %s", exc)
+
+    def put_part(self, key: str, head: bytes, data: Data) -> None:
+        if self._session is not None:
+            said = bytes(data) if isinstance(data, memoryview) else data
+            _quietly(self._session.put, key, said, attachment=head, **self._behind_all)
+
+    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+        def on_sample(sample: Any) -> None:
+            head = sample.attachment
+            data = sample.payload.to_bytes()
+            if head is not None and not self._full(len(data)):
+                said, key = head.to_bytes(), str(sample.key_expr)
+                self._in_loop(declared.call, len(data), hear, key, said, data)
+
+        declared = _ZenohDeclared(self)
+        return declared.of(lambda session: session.declare_subscriber(pattern, _direct(on_sample)))
 
     def _hand_over(
         self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]

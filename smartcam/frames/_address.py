@@ -28,6 +28,7 @@ class FrameAddress:
         query: what stands behind ``?``.
         user: before the host, or "".
         password: the same; it stands in no text.
+        fragment: what stands behind ``#``: our parameters, where the query is the server's.
     """
 
     url: str
@@ -38,6 +39,7 @@ class FrameAddress:
     query: str
     user: str
     password: str
+    fragment: str = ""
 
     @classmethod
     def parse(cls, url: str) -> FrameAddress:
@@ -65,6 +67,7 @@ class FrameAddress:
             parts.query,
             unquote(parts.username or ""),
             unquote(parts.password or ""),
+            parts.fragment,
         )
 
     @property
@@ -76,14 +79,16 @@ class FrameAddress:
         """Return it without the password."""
         return f"FrameAddress({self.shown!r})"
 
-    def parameters(self, known: Sequence[str]) -> dict[str, str]:
-        """Return what the query says.
+    def parameters(self, known: Sequence[str], said_in: str | None = None) -> dict[str, str]:
+        """Return what the query says, or another part of the URL.
 
         Raises:
             ConfigurationError: it has a name that is not known, or one twice.
         """
         said: dict[str, str] = {}
-        for name, value in parse_qsl(self.query, keep_blank_values=True):
+        for name, value in parse_qsl(
+            self.query if said_in is None else said_in, keep_blank_values=True
+        ):
             if name not in known:
                 raise ConfigurationError(
                     f"frame source {self.shown!r}: unknown parameter {name!r}; known are "
@@ -129,4 +134,5 @@ class FrameAddress:
 
 
 def _masked(url: str) -> str:
-    return re.sub(r"(//[^/?#@:]*):[^/?#@]*@", r"\1:***@", url)
+    url = re.sub(r"(//[^/?#@:]*):[^/?#@]*@", r"\1:***@", url)
+    return re.sub(r"(?i)([?&#][^=&#]*(?:pass|pwd|token|secret|key)[^=&#]*=)[^&#]*", r"\1***", url)

@@ -15,6 +15,9 @@ PIECE: Final = 0.5
 FAST: Final = 0.05
 """Seconds; a frame that comes sooner than the clock allows by more means that the clock jumped."""
 
+SETTLED: Final = 4
+"""Pieces from which on one is sure of that: before, the frames may all have been late."""
+
 SLOW: Final = 1.0
 """Seconds; frames that all come later by more mean the same: no way here takes that long."""
 
@@ -86,7 +89,8 @@ class DeviceClock:
             return True
         late = arrival - device - self._offset(device)
         self._slow = self._slow + 1 if late > SLOW else 0
-        return late < -FAST or self._slow >= PATIENCE
+        settled = len(self._lowest) >= SETTLED
+        return (late < -FAST and settled) or self._slow >= PATIENCE
 
     def _remember(self, device: float, offset: float) -> None:
         if not self._lowest or device - self._piece_began >= PIECE:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 if TYPE_CHECKING:
     from smartcam.exceptions import FrameSourceError
@@ -62,9 +62,18 @@ class FrameSink(ABC):
     def lost(self, count: int) -> None:
         """Take that frames were lost; the next frame does not count them again."""
 
+    def skipped(self, count: int) -> None:  # noqa: B027 - most drivers have none
+        """Take that frames came to the far end of a link, where newer ones took their place."""
+
     @abstractmethod
     def ended(self, error: FrameSourceError | None) -> None:
         """Take that nothing more comes: None at the end of a file. Readers get the error."""
+
+    async def taken(self) -> None:  # noqa: B027 - who has no readers waits for none
+        """Return once every reader has taken the last frame: for a recording that is to lose none.
+
+        Cancellation: safe.
+        """
 
 
 class FrameDriver(ABC):
@@ -77,7 +86,13 @@ class FrameDriver(ABC):
     Args:
         address: what the URL says. A wrong parameter is a
             :exc:`~smartcam.ConfigurationError` that names the known ones.
+
+    Attributes:
+        times_frames: ``captured`` of its frames is their time on our clock, also where they have a
+            ``device_time``; else the source finds it out.
     """
+
+    times_frames: ClassVar[bool] = False
 
     def __init__(self, address: FrameAddress) -> None:
         self.address = address

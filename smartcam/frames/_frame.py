@@ -89,6 +89,9 @@ class Frame:
     def grey(self) -> NDArray[Any]:
         """Return the brightness: the plane that the camera sent, where it sent one.
 
+        Of RGB it is made, BT.601's Y, and of a Bayer pattern by demosaicing:
+        :attr:`PixelFormat.grey_is_sent` tells. Of YUV it is Y with the range it came in.
+
         Returns:
             (H, W), uint8 or uint16, read-only where it is the camera's own plane.
 
@@ -100,6 +103,9 @@ class Frame:
 
     def rgb(self) -> NDArray[Any]:
         """Return the colours, (H, W, 3), red first; Bayer patterns are demosaiced.
+
+        YUV is BT.601 of limited range, unless the format's name says ``709`` or ``full``; grey is
+        given three times.
 
         Raises:
             FrameFormatError: the format has no colours, or its bytes are wrong.

@@ -32,15 +32,16 @@ class Runs(Protocol):
 
     def __call__(self, work: Callable[[], T], /) -> Awaitable[T]:
         """Return what it returns."""
+        ...
 
 
 class H264Encoder:
     """One stream of H.264; made by :meth:`Codecs.h264_encoder`.
 
     Each frame gives its own bytes at once. Instead of key frames, which are large, a column of each
-    frame is sent whole (intra refresh); the parameter sets are repeated, so who joins late sees
-    pictures within two times ``keyint`` frames. Another size or format begins the stream anew, and
-    so does a cancelled call, whose bytes nobody has.
+    frame is sent whole (intra refresh); the parameter sets are repeated, so one can join late.
+    Another size or format begins the stream anew, with a key frame, and so does a cancelled call,
+    whose bytes nobody has.
 
     U and V are shared by four pixels. Y goes in as the camera sent it, with its range told; only
     RGB is converted, to BT.601 of limited range. A JPEG is decoded to RGB before.
@@ -79,6 +80,10 @@ class H264Encoder:
         self._broken = 0  # calls whose bytes nobody has
         self._count = 0
 
+    def begin_anew(self) -> None:
+        """Have the next frame be a key frame, for who joins or has lost something."""
+        self._broken += 1
+
     async def encode(self, frame: Frame) -> Frame:
         """Return a frame of format ``H264`` with all that was known of the one given.
 
@@ -92,7 +97,7 @@ class H264Encoder:
             try:
                 return await self._run(partial(self._encode, frame, self._broken))
             except BaseException:
-                self._broken += 1
+                self.begin_anew()
                 raise
 
     def _encode(self, frame: Frame, broken: int) -> Frame:
@@ -124,7 +129,13 @@ class H264Encoder:
 
 
 class H264Decoder:
-    """One stream of H.264; made by :meth:`Codecs.h264_decoder`."""
+    """One stream of H.264; made by :meth:`Codecs.h264_decoder`.
+
+    Its pictures are whole: it begins at a key frame, or where a refresh is complete that began when
+    it had decoded something before (FFmpeg alone can take one for complete whose first frame it had
+    no reference for). That takes up to three times the encoder's ``keyint`` in the midst of a
+    stream, two after a loss, and none after :meth:`H264Encoder.begin_anew`.
+    """
 
     def __init__(self, run: Runs) -> None:
         load("av")
@@ -132,8 +143,10 @@ class H264Decoder:
         self._turn = asyncio.Lock()
         self._one = threading.Lock()
         self._codec: Any = None
+        self._size = (0, 0)
         self._losses = self._losses_seen = 0
-        self._whole = False
+        self._missing: int | None = None  # frames until the picture is whole; None: unknown
+        self._begun = False  # something was decoded that a refresh can refer to
         self._held: dict[int, Frame] = {}
         self._count = 0
 
@@ -155,8 +168,7 @@ class H264Decoder:
             after a loss.
 
         Raises:
-            FrameFormatError: damaged, or of another size than the frame says; the pictures after it
-                wait until the stream is whole again.
+            FrameFormatError: damaged, or of another size than the frame says; it counts as a loss.
             LocalProtocolError: the codecs are closed.
 
         Cancellation: safe; it counts as a loss.
@@ -170,34 +182,57 @@ class H264Decoder:
 
     def _decode(self, frame: Frame, losses: int) -> Frame | None:
         with self._one:
-            if self._codec is None or losses != self._losses_seen:
+            if self._size != (frame.width, frame.height):
                 self._begin(frame)
-                self._losses_seen = losses
-            packet = load("av").Packet(frame.data)
-            self._count += 1
-            packet.pts = self._count
-            self._held[self._count] = frame
-            if len(self._held) > HELD:
-                del self._held[next(iter(self._held))]
+            if losses != self._losses_seen:
+                self._losses_seen, self._missing = losses, None
+            missing = self._follow(bytes(frame.data))
+            packet = self._packet(frame)
             try:
                 pictures = self._codec.decode(packet)
             except load("av").FFmpegError as exc:
-                if not self._whole:
+                if self._missing is None:
                     return None
                 raise _damaged(frame, str(exc)) from exc
-            whole = [self._made(picture) for picture in pictures if not picture.is_corrupt]
-            if len(whole) < len(pictures) and self._whole:
+            self._begun = True
+            made = [self._made(picture) for picture in pictures]
+            if any(picture.is_corrupt for picture in pictures) and missing == 0:
                 raise _damaged(frame, "a picture with holes")
-            self._whole = self._whole or bool(whole)
-            return whole[-1] if whole else None
+            return made[-1] if made and missing == 0 else None
 
     def _begin(self, frame: Frame) -> None:
         self._codec = codec = load("av").CodecContext.create("h264", "r")
         codec.thread_count = 1
+        self._size = (frame.width, frame.height)
         room = (frame.width + 64) * (frame.height + 64)
-        codec.options = {"flags": "low_delay", "max_pixels": str(room)}
+        codec.options = {
+            "flags": "low_delay",
+            "max_pixels": str(room),
+            "err_detect": "explode",  # half a picture is none
+        }
         self._held.clear()
-        self._whole = False
+        self._missing, self._begun = None, False
+
+    def _follow(self, data: bytes) -> int | None:
+        """Return how many frames after this one the picture is whole; None: it cannot be told."""
+        if self._missing:
+            self._missing -= 1
+        if self._missing is None:
+            key, refresh = entry_point(data)
+            if key:
+                self._missing = 0
+            elif refresh is not None and self._begun:
+                self._missing = refresh
+        return self._missing
+
+    def _packet(self, frame: Frame) -> Any:
+        packet = load("av").Packet(frame.data)
+        self._count += 1
+        packet.pts = self._count
+        self._held[self._count] = frame
+        if len(self._held) > HELD:
+            del self._held[next(iter(self._held))]
+        return packet
 
     def _made(self, picture: Any) -> Frame:
         frame = self._held.pop(picture.pts)
@@ -205,6 +240,55 @@ class H264Decoder:
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise _damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
         return replace(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
+
+
+SLICES, KEY, SEI, RECOVERY_POINT = (1, 2, 3, 4), 5, 6, 6
+"""Kinds of units (ITU-T H.264, table 7-1), and a kind of message in one (annex D)."""
+
+
+def entry_point(data: bytes) -> tuple[bool, int | None]:
+    """Return whether an encoded frame is a key frame, and after how many others a refresh is over.
+
+    The second is None where no refresh begins with it.
+    """
+    refresh = None
+    place = data.find(b"\0\0\1")
+    while 0 <= place < len(data) - 3:
+        kind, after = data[place + 3] & 0x1F, data.find(b"\0\0\1", place + 3)
+        if kind == KEY or kind in SLICES:
+            return kind == KEY, refresh
+        if kind == SEI:
+            end = after if after >= 0 else len(data)
+            found = _recovery(data[place + 4 : end].replace(b"\0\0\3", b"\0\0"))
+            refresh = refresh if found is None else found
+        place = after
+    return False, refresh
+
+
+def _recovery(messages: bytes) -> int | None:
+    """Return recovery_frame_cnt of a unit's messages."""
+    place = 0
+    while place + 2 <= len(messages) and messages[place] != 0x80:
+        numbers = []
+        for _ in range(2):  # the kind and the size, each of bytes 255 and a last one
+            number = 0
+            while place < len(messages) and messages[place] == 0xFF:
+                number, place = number + 0xFF, place + 1
+            if place == len(messages):
+                return None
+            numbers.append(number + messages[place])
+            place += 1
+        kind, size = numbers
+        if kind == RECOVERY_POINT:
+            return _exp_golomb(messages[place : place + size])
+        place += size
+    return None
+
+
+def _exp_golomb(data: bytes) -> int | None:
+    bits = "".join(f"{byte:08b}" for byte in data[:8])
+    zeros = len(bits) - len(bits.lstrip("0"))
+    return int(bits[zeros : 2 * zeros + 1], 2) - 1 if len(bits) > 2 * zeros else None
 
 
 def _colours(video: Any) -> tuple[int, int]:

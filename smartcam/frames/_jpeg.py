@@ -26,7 +26,7 @@ def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, i
     simplejpeg = load("simplejpeg")
     try:
         height, width, colours, _ = simplejpeg.decode_jpeg_header(data, strict=False)
-    except ValueError as exc:
+    except (ValueError, KeyError) as exc:  # the second of what has no known kind of colours
         raise _wrong(what, data, exc) from exc
     return width, height, colours != "Gray"
 
@@ -68,7 +68,7 @@ def _strictly(decode: Any, data: bytes | bytearray | memoryview, colours: str) -
         return decode(data, colours, strict=False)
 
 
-def _wrong(what: str, data: bytes | bytearray | memoryview, exc: ValueError) -> FrameFormatError:
+def _wrong(what: str, data: bytes | bytearray | memoryview, exc: Exception) -> FrameFormatError:
     return FrameFormatError(
         f"{what}: expected a whole JPEG, got {len(data)} bytes that are none "
         f"(they begin with {bytes(data[:4]).hex(' ')}): {exc}"

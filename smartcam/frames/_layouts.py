@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-class Picture(NamedTuple):
+class RawPicture(NamedTuple):
     """The bytes of a frame and what is said of them.
 
     Attributes:
@@ -41,7 +41,7 @@ class Picture(NamedTuple):
         )
 
 
-class Layout(ABC):
+class PixelLayout(ABC):
     """How the pixels of a format lie."""
 
     @property
@@ -58,22 +58,22 @@ class Layout(ABC):
         """Return the bytes of a picture at the least; 0: it is compressed."""
 
     @abstractmethod
-    def array(self, picture: Picture) -> NDArray[Any]:
+    def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return the pixels as they are."""
 
     @abstractmethod
-    def grey(self, picture: Picture) -> NDArray[Any]:
+    def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return the brightness."""
 
     @abstractmethod
-    def rgb(self, picture: Picture) -> NDArray[Any]:
+    def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
 
-    def planes(self, picture: Picture) -> tuple[NDArray[np.uint8], ...]:
+    def planes(self, picture: RawPicture) -> tuple[NDArray[np.uint8], ...]:
         """Return Y, U and V, where they are what was sent."""
         raise picture.wrong("a format of Y, U and V", "one without")
 
-    def check(self, picture: Picture) -> None:
+    def check(self, picture: RawPicture) -> None:
         """See that the bytes can be such a picture."""
         _, data, width, height, stride = picture
         if width < 1 or height < 1:
@@ -88,7 +88,11 @@ class Layout(ABC):
 
 
 def _view(
-    picture: Picture, dtype: str, shape: tuple[int, ...], strides: tuple[int, ...], offset: int = 0
+    picture: RawPicture,
+    dtype: str,
+    shape: tuple[int, ...],
+    strides: tuple[int, ...],
+    offset: int = 0,
 ) -> NDArray[Any]:
     view: NDArray[Any] = np.ndarray(shape, dtype, picture.data, offset, strides)
     view.flags.writeable = False
@@ -96,7 +100,7 @@ def _view(
 
 
 @dataclass(frozen=True, slots=True)
-class Samples(Layout):
+class SampleLayout(PixelLayout):
     """One or more samples a pixel, one pixel after the other.
 
     A packed format with a stride of 0 has rows that follow each other within a byte.
@@ -130,14 +134,14 @@ class Samples(Layout):
             return self.least_stride(width * height)
         return stride * (height - 1) + self.least_stride(width)
 
-    def check(self, picture: Picture) -> None:
+    def check(self, picture: RawPicture) -> None:
         """See that the bytes can be such a picture."""
         if self.packing is not None and picture.stride == 0:
             width = picture.width * picture.height
             picture = picture._replace(width=width, height=1, stride=self.least_stride(width))
-        Layout.check(self, picture)
+        PixelLayout.check(self, picture)
 
-    def array(self, picture: Picture) -> NDArray[Any]:
+    def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return (H, W) or (H, W, C), a view; packed ones unpacked to uint16."""
         self.check(picture)
         _, _, width, height, stride = picture
@@ -152,13 +156,13 @@ class Samples(Layout):
         unpacked.flags.writeable = False
         return unpacked
 
-    def grey(self, picture: Picture) -> NDArray[Any]:
+    def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return the brightness; of colours BT.601's Y, of a Bayer pattern a demosaiced one."""
         if self.colours.grey is None:
             raise picture.wrong("a format with brightness", "distances")
         return self.colours.grey(self.array(picture))
 
-    def rgb(self, picture: Picture) -> NDArray[Any]:
+    def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours; of a grey format its grey three times."""
         if self.colours.rgb is None:
             raise picture.wrong("a format with colours", "distances")
@@ -166,7 +170,7 @@ class Samples(Layout):
 
 
 @dataclass(frozen=True, slots=True)
-class YuvPairs(Layout):
+class YuvPairs(PixelLayout):
     """Two pixels in four bytes: each has its Y, both share U and V.
 
     Attributes:
@@ -185,13 +189,13 @@ class YuvPairs(Layout):
         """Return the bytes up to the last pair."""
         return stride * (height - 1) + self.least_stride(width)
 
-    def array(self, picture: Picture) -> NDArray[Any]:
+    def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return (H, W, 2): Y and, by turns, U and V, in the order of the format."""
         self.check(picture)
         _, _, width, height, stride = picture
         return _view(picture, "u1", (height, width, 2), (stride, 2, 1))
 
-    def planes(self, picture: Picture) -> tuple[NDArray[np.uint8], ...]:
+    def planes(self, picture: RawPicture) -> tuple[NDArray[np.uint8], ...]:
         """Return (H, W), (H, W/2) and (H, W/2), views."""
         self.check(picture)
         _, _, width, height, stride = picture
@@ -200,18 +204,18 @@ class YuvPairs(Layout):
         u, v = (_view(picture, "u1", pairs, (stride, 4), 1 - self.y + more) for more in (0, 2))
         return y, u, v
 
-    def grey(self, picture: Picture) -> NDArray[Any]:
+    def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return Y, a view."""
         return self.planes(picture)[0]
 
-    def rgb(self, picture: Picture) -> NDArray[Any]:
+    def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
         y, u, v = self.planes(picture)
         return yuv_to_rgb(y, u, v, MATRICES[self.matrix])
 
 
 @dataclass(frozen=True, slots=True)
-class Planes(Layout):
+class Planes(PixelLayout):
     """Y, then U and V of every pixel, pair or four; the rows of all follow from Y's stride.
 
     Attributes:
@@ -240,13 +244,13 @@ class Planes(Layout):
         _, rows, own = self._chroma(width, height, stride)
         return stride * height + own * rows * (1 if self.woven else 2)
 
-    def array(self, picture: Picture) -> NDArray[Any]:
+    def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return the bytes, (N,)."""
         self.check(picture)
         size = self.size(picture.width, picture.height, picture.stride)
         return _view(picture, "u1", (size,), (1,))
 
-    def planes(self, picture: Picture) -> tuple[NDArray[np.uint8], ...]:
+    def planes(self, picture: RawPicture) -> tuple[NDArray[np.uint8], ...]:
         """Return Y, U and V, views."""
         self.check(picture)
         _, _, width, height, stride = picture
@@ -259,18 +263,18 @@ class Planes(Layout):
         )
         return y, u, v
 
-    def grey(self, picture: Picture) -> NDArray[Any]:
+    def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return Y, a view."""
         return self.planes(picture)[0]
 
-    def rgb(self, picture: Picture) -> NDArray[Any]:
+    def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
         y, u, v = self.planes(picture)
         return yuv_to_rgb(y, u, v, MATRICES[self.matrix])
 
 
 @dataclass(frozen=True, slots=True)
-class Compressed(Layout):
+class Compressed(PixelLayout):
     """Bytes that only a codec reads.
 
     Attributes:
@@ -292,15 +296,15 @@ class Compressed(Layout):
         """Return 0."""
         return 0
 
-    def array(self, picture: Picture) -> NDArray[Any]:
+    def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return the bytes, (N,)."""
         return _view(picture, "u1", (memoryview(picture.data).nbytes,), (1,))
 
-    def grey(self, picture: Picture) -> NDArray[Any]:
+    def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Raise."""
         raise picture.wrong(f"pixels, which {self.reader} makes", "compressed bytes")
 
-    def rgb(self, picture: Picture) -> NDArray[Any]:
+    def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Raise."""
         raise picture.wrong(f"pixels, which {self.reader} makes", "compressed bytes")
 
@@ -316,13 +320,13 @@ class Jpeg(Compressed):
         """Whether: the luma is read, and no colour made."""
         return True
 
-    def grey(self, picture: Picture) -> NDArray[Any]:
+    def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return the luma."""
         return self._decoded(picture, "GRAY")[..., 0]
 
-    def rgb(self, picture: Picture) -> NDArray[Any]:
+    def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
         return self._decoded(picture, "RGB")
 
-    def _decoded(self, picture: Picture, colours: str) -> NDArray[np.uint8]:
+    def _decoded(self, picture: RawPicture, colours: str) -> NDArray[np.uint8]:
         return decode_jpeg(picture.data, colours, (picture.width, picture.height), picture.format)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import Any, Final
 
 from smartcam.exceptions import MissingExtraError
@@ -21,8 +22,10 @@ def load(name: str) -> Any:
 
     Raises MissingExtraError: it is not installed.
     """
+    if (there := sys.modules.get(name)) is not None:
+        return there  # import_module looks for longer than a small picture takes
     try:
         return importlib.import_module(name)
     except ImportError as exc:
-        reason, extra = EXTRAS[name]
+        reason, extra = EXTRAS[name.partition(".")[0]]
         raise MissingExtraError(f'{reason}: pip install "smartcam[{extra}]"', extra=extra) from exc

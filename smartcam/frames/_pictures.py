@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._jpeg import decode_jpeg, jpeg_header
-from smartcam.frames._layouts import Planes, Samples, YuvPairs
+from smartcam.frames._layouts import Planes, SampleLayout, YuvPairs
 from smartcam.frames._optional_imports import load
 from smartcam.frames._pixels import find_format
 
@@ -64,7 +64,7 @@ def to_jpeg(frame: Frame, quality: int) -> Frame:
         raise _no_way(frame, "JPEG, which has 8 bits a sample", "png, jpegxl or converted")
     if isinstance(layout, YuvPairs | Planes):
         data = _planes_to_jpeg(frame, layout.matrix, quality)
-    elif isinstance(layout, Samples) and frame.format.name in _JPEG_COLOURS:
+    elif isinstance(layout, SampleLayout) and frame.format.name in _JPEG_COLOURS:
         pixels = frame.array()
         pixels = pixels if pixels.ndim == 3 else pixels[..., None]
         data = _samples_to_jpeg(pixels, _JPEG_COLOURS[frame.format.name], quality)
@@ -129,7 +129,7 @@ def to_jpegxl(frame: Frame) -> Frame:
 
 def _lossless(frame: Frame, to: str) -> NDArray[Any]:
     """Return the samples that are written."""
-    if not isinstance(frame.format.layout, Samples):
+    if not isinstance(frame.format.layout, SampleLayout):
         raise _no_way(frame, to, "converted")
     pixels = frame.rgb() if frame.format.name == "BGR8" else frame.array()
     return np.ascontiguousarray(pixels)
@@ -201,7 +201,7 @@ def _samples_named(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
         name = usual.get((pixels.ndim, pixels.dtype.itemsize), "RGB8")
     wanted = find_format(name)
     layout = wanted.layout
-    if not isinstance(layout, Samples) or layout.packing is not None:
+    if not isinstance(layout, SampleLayout) or layout.packing is not None:
         return None
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     fits = (layout.size_of, layout.channels) == (pixels.dtype.itemsize, channels)

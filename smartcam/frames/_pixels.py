@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any, Final
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._colours import COLOURS
-from smartcam.frames._layouts import Compressed, Jpeg, Layout, Picture, Planes, Samples, YuvPairs
+from smartcam.frames._layouts import (
+    Compressed,
+    Jpeg,
+    PixelLayout,
+    Planes,
+    RawPicture,
+    SampleLayout,
+    YuvPairs,
+)
 from smartcam.frames._unpacking import PACKINGS
 
 if TYPE_CHECKING:
@@ -34,7 +42,7 @@ class PixelFormat:
     bits: int
     code: int = 0
     depth: int = 8
-    layout: Layout = field(kw_only=True, repr=False, compare=False)
+    layout: PixelLayout = field(kw_only=True, repr=False, compare=False)
 
     @property
     def compressed(self) -> bool:
@@ -69,13 +77,13 @@ class PixelFormat:
         Raises:
             FrameFormatError: there are not.
         """
-        self.layout.check(Picture(self.name, data, width, height, stride))
+        self.layout.check(RawPicture(self.name, data, width, height, stride))
 
     def array(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> NDArray[Any]:
         """Return the pixels as they are; see :meth:`smartcam.frames.Frame.array`."""
-        return self.layout.array(Picture(self.name, data, width, height, stride))
+        return self.layout.array(RawPicture(self.name, data, width, height, stride))
 
     def planes(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
@@ -85,19 +93,19 @@ class PixelFormat:
         Raises:
             FrameFormatError: it has none, or there are too few bytes.
         """
-        return self.layout.planes(Picture(self.name, data, width, height, stride))
+        return self.layout.planes(RawPicture(self.name, data, width, height, stride))
 
     def grey(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> NDArray[Any]:
         """Return the brightness; see :meth:`smartcam.frames.Frame.grey`."""
-        return self.layout.grey(Picture(self.name, data, width, height, stride))
+        return self.layout.grey(RawPicture(self.name, data, width, height, stride))
 
     def rgb(
         self, data: bytes | bytearray | memoryview, width: int, height: int, stride: int
     ) -> NDArray[Any]:
         """Return the colours; see :meth:`smartcam.frames.Frame.rgb`."""
-        return self.layout.rgb(Picture(self.name, data, width, height, stride))
+        return self.layout.rgb(RawPicture(self.name, data, width, height, stride))
 
 
 def _samples(
@@ -105,7 +113,7 @@ def _samples(
 ) -> PixelFormat:
     """Return a format of samples in whole bytes."""
     size = (depth + 7) // 8
-    layout = Samples(COLOURS[colours], size, channels)
+    layout = SampleLayout(COLOURS[colours], size, channels)
     return PixelFormat(name, fourcc, 8 * size * channels, code, depth, layout=layout)
 
 
@@ -113,7 +121,7 @@ def _packed(name: str, code: int, colours: str) -> PixelFormat:
     """Return a format whose samples share bytes; the code's third digits are its bits."""
     packing = PACKINGS[next(end for end in PACKINGS if name.endswith(end))]
     depth = 10 if "10" in name else 12
-    layout = Samples(COLOURS[colours], 2, packing=packing)
+    layout = SampleLayout(COLOURS[colours], 2, packing=packing)
     return PixelFormat(name, "", code >> 16 & 0xFF, code, depth, layout=layout)
 
 

@@ -95,7 +95,7 @@ class FrameReader:
         self._last: Frame | None = None  # the last one that was taken
         self._ended = False
         self._error: FrameSourceError | None = None
-        self._came = asyncio.Event()
+        self._waiters: list[asyncio.Future[bool]] = []
         self._offered = self._delivered = self._skipped = self._lost = 0
 
     def statistics(self) -> ReaderStatistics:
@@ -208,42 +208,69 @@ class FrameReader:
 
     async def _take(self, end: float | None, what: str) -> Frame | None:
         """Return the next frame as soon as there is one; None at the end of the source."""
-        try:
-            async with asyncio.timeout_at(end):
-                while self._next is None and not self._ended:
-                    self._came.clear()
-                    await self._came.wait()
-        except TimeoutError:
-            raise FrameTimeoutError(
-                f"{self._name}: expected {what}, got none in time", source=self._name
-            ) from None
+        while self._next is None and not self._ended:
+            if not await self._woken(end):
+                raise FrameTimeoutError(
+                    f"{self._name}: expected {what}, got none in time", source=self._name
+                )
         if self._next is not None:
             return self._taken(self._next)
         if self._error is not None:
             raise self._error
         return None
 
+    async def _woken(self, end: float | None) -> bool:
+        """Wait until something came, or return False when its time is over.
+
+        A future and a timer: what asyncio has for it costs twice as much, for each frame.
+        """
+        loop = asyncio.get_running_loop()
+        waiter: asyncio.Future[bool] = loop.create_future()
+        timer = None if end is None else loop.call_at(end, _settle, waiter, False)
+        self._waiters.append(waiter)
+        try:
+            return await waiter or self._next is not None
+        finally:
+            self._waiters.remove(waiter)
+            if timer is not None:
+                timer.cancel()
+
+    def _wake(self) -> None:
+        for waiter in self._waiters:
+            _settle(waiter, True)
+
     def _offer(self, frame: Frame) -> None:
         self._offered += 1
         if self._next is not None:
             self._skipped += 1
         self._next = frame
-        self._came.set()
+        self._wake()
 
     def _miss(self, count: int) -> None:
         self._lost += count
 
+    def _skip(self, count: int) -> None:
+        self._offered += count
+        self._skipped += count
+
     def _end(self, error: FrameSourceError | None) -> None:
         if not self._ended:
             self._ended, self._error = True, error
-        self._came.set()
+        self._wake()
 
     def _taken(self, frame: Frame) -> Frame:
         if frame is self._next:
             self._next = None
             self._delivered += 1
+            if self._source is not None:
+                self._source._took.set()  # noqa: SLF001 - the two are one
         self._last = frame
         return frame
+
+
+def _settle(waiter: asyncio.Future[bool], came: bool) -> None:
+    if not waiter.done():
+        waiter.set_result(came)
 
 
 class FrameSource(FrameSink):
@@ -285,6 +312,8 @@ class FrameSource(FrameSink):
         self._format: StreamFormat | None = None
         self._task: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()  # readers came or went, or the driver ended
+        self._took = asyncio.Event()  # a reader took a frame, or went
+        self._held_up = False  # the driver waits for readers
         self._streaming = False
         self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
         self._frames = self._lost = self._started = self._ahead = 0
@@ -296,6 +325,11 @@ class FrameSource(FrameSink):
     def name(self) -> str:
         """The camera's name."""
         return self._driver.name
+
+    @property
+    def driver(self) -> FrameDriver:
+        """The device's driver, for what only its kind can, such as a V4L2 device's controls."""
+        return self._driver
 
     @property
     def format(self) -> StreamFormat:
@@ -432,7 +466,7 @@ class FrameSource(FrameSink):
     def _timed(self, frame: Frame, now: float) -> Frame:
         """Return a frame with its time on our clock, not later than now."""
         captured = frame.captured
-        if frame.device_time is not None:
+        if frame.device_time is not None and not self._driver.times_frames:
             if self._clock is None:
                 self._clock = DeviceClock()
             jumps = self._clock.statistics().jumps
@@ -455,10 +489,27 @@ class FrameSource(FrameSink):
         for reader in self._alive():
             reader._miss(count)  # noqa: SLF001
 
+    def skipped(self, count: int) -> None:
+        """Take from the driver that frames were skipped before they came here."""
+        self._frames += count
+        for reader in self._alive():
+            reader._skip(count)  # noqa: SLF001
+
     def ended(self, error: FrameSourceError | None) -> None:
         """Take from the driver that nothing more comes."""
         self._over = (error,)
         self._changed.set()
+
+    async def taken(self) -> None:
+        """Wait until every reader has taken the last frame; meanwhile nothing is stuck."""
+        self._held_up = True
+        try:
+            while any(reader._next is not None for reader in self._alive()):  # noqa: SLF001
+                self._took.clear()
+                await self._took.wait()
+        finally:
+            self._held_up = False
+            self._last_came = asyncio.get_running_loop().time()
 
     def _alive(self) -> list[FrameReader]:
         return [reader for one in self._readers if (reader := one()) is not None]
@@ -468,6 +519,7 @@ class FrameSource(FrameSink):
         if not self._readers and self._task is not None:
             self._idle_since = self._task.get_loop().time()
         self._changed.set()
+        self._took.set()
 
     def _forget(self, reader: FrameReader) -> None:
         self._dropped(weakref.ref(reader))
@@ -517,6 +569,8 @@ class FrameSource(FrameSink):
                 await self._until_changed(lambda: not self._readers)
             else:
                 left = self._last_came + self._stall - asyncio.get_running_loop().time()
+                if left <= 0 and self._held_up:
+                    left = self._stall
                 if left <= 0:
                     raise FrameSourceError(
                         f"{self.name}: it streams, but gave no frame for {self._stall:g} s",

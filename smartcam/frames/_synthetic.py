@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._frame import Frame, Moment
+from smartcam.frames._optional_imports import load
 from smartcam.frames._pixels import find_format
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
+    from smartcam.frames._pixels import PixelFormat
 
 
 BITS: Final = 64
@@ -30,7 +34,9 @@ LEAST: Final = (BITS * CELL, 4 * CELL)
 
 
 class SyntheticDriver(FrameDriver):
-    """Moving stripes with a stamp: ``synthetic://?size=640x480&fps=30``.
+    """Moving stripes with a stamp: ``synthetic://?size=640x480&fps=30&format=YUYV``.
+
+    Formats are Mono8, YUYV, RGB8, Z16 (distances in millimetres) and MJPEG.
 
     The stamp is two rows of cells in the upper left corner: the frame's number, and the nanoseconds
     of ``time.monotonic_ns()`` at its capture. :func:`read_stamp` reads it at the far end, also
@@ -39,12 +45,13 @@ class SyntheticDriver(FrameDriver):
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        said = address.parameters(["size", "fps", "name"])
+        said = address.parameters(["size", "fps", "name", "format"])
         self._size = address.size(said.get("size", "640x480"))
         if self._size[0] < LEAST[0] or self._size[1] < LEAST[1]:
             raise address.wrong(
                 "size", f"{LEAST[0]}x{LEAST[1]} or more, room for the stamp", said["size"]
             )
+        self._format = _format(address, said.get("format", "Mono8"))
         self._rate = address.number("fps", said.get("fps", "30"), 0.01, 10_000)
         self._name = said.get("name", "synthetic")
         self._task: asyncio.Task[None] | None = None
@@ -56,8 +63,13 @@ class SyntheticDriver(FrameDriver):
         return self._name
 
     async def open(self) -> StreamFormat:
-        """Return what it draws."""
-        return StreamFormat(find_format("Mono8"), *self._size, (self._rate,))
+        """Return what it draws.
+
+        Raises:
+            MissingExtraError: MJPEG, and the extra ``frames`` is not installed.
+        """
+        _FORMATS[self._format.name](stripes(*self._size))
+        return StreamFormat(self._format, *self._size, (self._rate,))
 
     async def start(self, sink: FrameSink) -> None:
         """Begin to draw."""
@@ -77,7 +89,7 @@ class SyntheticDriver(FrameDriver):
     async def _draw(self, sink: FrameSink) -> None:
         width, height = self._size
         picture = stripes(width, height)
-        grey = find_format("Mono8")
+        coded = _FORMATS[self._format.name]
         loop = asyncio.get_running_loop()
         began, drawn = loop.time(), 0
         while True:
@@ -93,11 +105,11 @@ class SyntheticDriver(FrameDriver):
             write_stamp(shown, self._number, now)
             sink.frame(
                 Frame(
-                    data=shown.tobytes(),
-                    format=grey,
+                    data=coded(shown),
+                    format=self._format,
                     width=width,
                     height=height,
-                    stride=width,
+                    stride=self._format.stride(width),
                     captured=now / 1e9,
                     utc=time.time() - (time.monotonic_ns() - now) / 1e9,
                     moment=Moment.EXPOSURE_START,
@@ -106,6 +118,33 @@ class SyntheticDriver(FrameDriver):
                     source=self.name,
                 )
             )
+
+
+def _pairs(picture: NDArray[np.uint8]) -> bytes:
+    even = np.pad(picture, ((0, 0), (0, picture.shape[1] % 2)))
+    return np.stack((even, np.full_like(even, 128)), axis=-1).tobytes()
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+    data: bytes = load("simplejpeg").encode_jpeg(picture[..., None], 85, "GRAY", "Gray")
+    return data
+
+
+_FORMATS: Final[dict[str, Callable[[NDArray[np.uint8]], bytes]]] = {
+    "Mono8": lambda picture: picture.tobytes(),
+    "YUV422_8": _pairs,
+    "RGB8": lambda picture: np.repeat(picture[..., None], 3, axis=2).tobytes(),
+    "Coord3D_C16": lambda picture: (picture.astype("<u2") * 16).tobytes(),
+    "MJPEG": _jpeg,
+}
+"""What makes bytes of a grey picture."""
+
+
+def _format(address: FrameAddress, name: str) -> PixelFormat:
+    found = find_format(name)
+    if found.name not in _FORMATS:
+        raise address.wrong("format", f"one of {', '.join(_FORMATS)}", name)
+    return found
 
 
 def stripes(width: int, height: int) -> NDArray[np.uint8]:
@@ -127,11 +166,11 @@ def write_stamp(picture: NDArray[np.uint8], number: int, nanoseconds: int) -> No
             band[...] = cells if picture.ndim == 2 else cells[:, None]
 
 
-def read_stamp(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
+def read_stamp(picture: NDArray[Any]) -> tuple[int, int] | None:
     """Return the number and the ``time.monotonic_ns()`` that a picture was stamped with.
 
     Args:
-        picture: (H, W) or (H, W, C), also after a lossy codec.
+        picture: (H, W) or (H, W, C), also after a lossy codec; of depth the distances.
 
     Returns:
         None where there is no stamp, or it is damaged.
@@ -140,7 +179,8 @@ def read_stamp(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
         return None
     grey = picture if picture.ndim == 2 else picture.mean(axis=2)
     cells = grey[: 4 * CELL, : BITS * CELL].reshape(4, CELL, BITS, CELL)
-    bits = cells[:, 1:-1, :, 1:-1].mean(axis=(1, 3)) > 127
+    means = cells[:, 1:-1, :, 1:-1].mean(axis=(1, 3))
+    bits = means > (means.min() + means.max()) / 2
     if (bits[0::2] == bits[1::2]).any():
         return None
     weights = [1 << place for place in range(BITS)]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-class Part(NamedTuple):
+class PixelBits(NamedTuple):
     """Some bits of a pixel: ``(byte >> right & mask) << left``."""
 
     byte: int
@@ -33,38 +33,38 @@ class Packing(NamedTuple):
     """
 
     size: int
-    pixels: tuple[tuple[Part, ...], ...]
+    pixels: tuple[tuple[PixelBits, ...], ...]
 
 
 PACKINGS: Final = {
     "10p": Packing(
         5,
         (
-            (Part(0, 0, 0xFF, 0), Part(1, 0, 0x03, 8)),
-            (Part(1, 2, 0x3F, 0), Part(2, 0, 0x0F, 6)),
-            (Part(2, 4, 0x0F, 0), Part(3, 0, 0x3F, 4)),
-            (Part(3, 6, 0x03, 0), Part(4, 0, 0xFF, 2)),
+            (PixelBits(0, 0, 0xFF, 0), PixelBits(1, 0, 0x03, 8)),
+            (PixelBits(1, 2, 0x3F, 0), PixelBits(2, 0, 0x0F, 6)),
+            (PixelBits(2, 4, 0x0F, 0), PixelBits(3, 0, 0x3F, 4)),
+            (PixelBits(3, 6, 0x03, 0), PixelBits(4, 0, 0xFF, 2)),
         ),
     ),
     "12p": Packing(
         3,
         (
-            (Part(0, 0, 0xFF, 0), Part(1, 0, 0x0F, 8)),
-            (Part(1, 4, 0x0F, 0), Part(2, 0, 0xFF, 4)),
+            (PixelBits(0, 0, 0xFF, 0), PixelBits(1, 0, 0x0F, 8)),
+            (PixelBits(1, 4, 0x0F, 0), PixelBits(2, 0, 0xFF, 4)),
         ),
     ),
     "10Packed": Packing(
         3,
         (
-            (Part(0, 0, 0xFF, 2), Part(1, 0, 0x03, 0)),
-            (Part(2, 0, 0xFF, 2), Part(1, 4, 0x03, 0)),
+            (PixelBits(0, 0, 0xFF, 2), PixelBits(1, 0, 0x03, 0)),
+            (PixelBits(2, 0, 0xFF, 2), PixelBits(1, 4, 0x03, 0)),
         ),
     ),
     "12Packed": Packing(
         3,
         (
-            (Part(0, 0, 0xFF, 4), Part(1, 0, 0x0F, 0)),
-            (Part(2, 0, 0xFF, 4), Part(1, 4, 0x0F, 0)),
+            (PixelBits(0, 0, 0xFF, 4), PixelBits(1, 0, 0x0F, 0)),
+            (PixelBits(2, 0, 0xFF, 4), PixelBits(1, 4, 0x0F, 0)),
         ),
     ),
 }

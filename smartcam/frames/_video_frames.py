@@ -51,7 +51,11 @@ _OF_OURS: Final = {
 }
 """What FFmpeg calls ours; the range and the matrix stand beside it there."""
 
+CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
+"""Formats that FFmpeg converts to for who asks, and what it calls them."""
+
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
+_RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # as PyAV calls them
 BT709, BT601 = 1, 6  # AVCOL_SPC_BT709, AVCOL_SPC_SMPTE170M
 
 
@@ -164,9 +168,13 @@ def to_video(frame: Frame) -> Any:
     video = _filled(frame, _OF_OURS[base])
     if base in ("I420", "NV12"):
         return video
-    kept = video.color_range
-    to_range = LIMITED if name in ("RGB8", "BGR8") else kept
-    return video.reformat(format="yuv420p", src_color_range=kept, dst_color_range=to_range)
+    kept, space = colour_properties(frame.format)
+    to = LIMITED if name in ("RGB8", "BGR8") else kept
+    made = video.reformat(
+        format="yuv420p", src_color_range=_RANGES[kept], dst_color_range=_RANGES[to]
+    )
+    made.color_range, made.colorspace = to, space
+    return made
 
 
 def _new(width: int, height: int, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: the emulator's, which controls it, a camera's, the wizard's.
+"""Pages and HTTP calls: the emulator's, which controls it, a camera's, the wizard's, frames.
 
 ::
 
@@ -18,13 +18,20 @@ from smartcam.exceptions import MissingExtraError
 
 if TYPE_CHECKING:
     from smartcam.web._emulator import EmulatorSite
+    from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
     from smartcam.web._wizard import WizardSite
 
-__all__ = ["EmulatorSite", "LiveSite", "WizardSite"]
+__all__ = ["EmulatorSite", "FramesSite", "LiveSite", "WizardSite"]
 
 _resolve = lazy(
-    __name__, {"_emulator": "EmulatorSite", "_live": "LiveSite", "_wizard": "WizardSite"}
+    __name__,
+    {
+        "_emulator": "EmulatorSite",
+        "_frames": "FramesSite",
+        "_live": "LiveSite",
+        "_wizard": "WizardSite",
+    },
 )
 
 

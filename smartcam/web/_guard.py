@@ -7,7 +7,8 @@ neither read nor change anything here, whatever name it gives this machine:
   point here (DNS rebinding) is another one.
 - *Origin*, which a browser sends with whatever changes something, must be the site itself;
   *Sec-Fetch-Site* must not tell of another.
-- With a token, each call carries it in ``Authorization``. A page elsewhere does not know it.
+- With a token, each call carries it in ``Authorization``; a WebSocket, for which a browser's page
+  can set no header, among its protocols. A page elsewhere does not know it.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 MIN_TOKEN = 16
 """Characters of a token at least, so that nobody guesses it; made ones have 32."""
+
+BEARER = "bearer."
+"""Begins the protocol of a WebSocket that is a token."""
 
 HEADERS: Mapping[str, str] = {
     "Content-Security-Policy": (
@@ -62,7 +66,7 @@ class Guard:
             _check_host(request.host)
         if is_call:
             _check_origin(request)
-            self._check_token(request.headers.get("Authorization"))
+            self._check_token(_authorization(request))
 
     def _check_token(self, given: str | None) -> None:
         if self.token is None:
@@ -77,6 +81,15 @@ class Guard:
                 "Authorization: Bearer TOKEN, with the token that stands in the page's address",
                 headers={"WWW-Authenticate": 'Bearer realm="smartcam"'},
             )
+
+
+def _authorization(request: web.Request) -> str | None:
+    given = request.headers.get("Authorization")
+    if given is None and request.headers.get("Upgrade", "").lower() == "websocket":
+        offered = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
+        tokens = [one.strip() for one in offered if one.strip().startswith(BEARER)]
+        return f"Bearer {tokens[0].removeprefix(BEARER)}" if tokens else None
+    return given
 
 
 def _check_host(given: str) -> None:

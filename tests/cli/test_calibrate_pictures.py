@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import shlex
 from pathlib import Path
@@ -21,7 +22,11 @@ from smartcam.calibration._targets import Checkerboard, target_to_data
 from smartcam.calibration.formats._cameras import write_camera_info
 from smartcam.calibration.simulation._images import render
 from smartcam.emulator._insight.camera import EmulatedInSight
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames import FrameDriver, FrameSink, StreamFormat, find_format
+from smartcam.registry import FRAMES
 from tests.cli.commandline import closed_port, emulators, run
+from tests.frames.drivers import frame
 from tests.processes import Outcome, Process, printed_by
 
 pytestmark = pytest.mark.long
@@ -171,6 +176,66 @@ def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_says_so(
     )
 
 
+class Sheet(FrameDriver):
+    """Shows the sheet, ten times a second."""
+
+    _task: asyncio.Task[None] | None = None
+
+    async def open(self) -> StreamFormat:
+        if self.address.host == "gone":
+            raise FrameSourceError("sheet: no such device")
+        return StreamFormat(find_format("Mono8"), 640, 480)
+
+    async def start(self, sink: FrameSink) -> None:
+        self._task = asyncio.create_task(self._show(sink))
+
+    async def _show(self, sink: FrameSink) -> None:
+        data = render(TARGET, CAMERA, SEEN).tobytes()
+        about: dict[str, Any] = {"format": find_format("Mono8"), "width": 640, "height": 480}
+        for number in itertools.count(1):
+            sink.frame(frame(number, data=data, stride=640, **about))
+            await asyncio.sleep(0.02)
+
+    async def stop(self) -> None:
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def close(self) -> None:
+        await self.stop()
+
+
+@pytest.fixture
+def sheet_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have ``sheet://``."""
+    monkeypatch.setattr(FRAMES, "_registered", {"sheet": Sheet})
+    monkeypatch.setattr(FRAMES, "_loaded", {})
+
+
+@pytest.mark.usefixtures("sheet_source")
+def test_calibrate_by_a_sheet_looks_at_frames(tmp_path: Path, files: list[str]) -> None:
+    lines = [*answers(ABOUT, {}, {}), {"do": "abort"}]
+    options = ["--wizard", "sheet", *files[:4], "--pictures", "sheet://"]
+    done = calibrating(tmp_path, lines, *options)
+    assert [view.get("step") for view in done.lines] == [
+        "about", "rulers", "picture", "touch-1", None,
+    ]  # fmt: skip
+    assert done.lines[2]["button"] == "Take a picture"
+    assert done.lines[3]["notes"][0] == "54 of 54 points of the target seen"
+
+
+@pytest.mark.usefixtures("sheet_source")
+def test_calibrate_by_a_source_that_is_not_there_ends_before_anything_is_asked(
+    tmp_path: Path, files: list[str]
+) -> None:
+    options = ["--wizard", "hand-eye", *files[:4], "--pictures"]
+    done = calibrating(tmp_path, [], *options, "sheet://gone").failed(3, "no such device")
+    assert done.out == ""
+    calibrating(tmp_path, [], *options, "synthetic://?fbs=3").failed(2, "did you mean 'fps'")
+    assert not (tmp_path / "kept").exists()
+
+
 @pytest.mark.real_time
 async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
     tmp_path: Path, files: list[str]
@@ -194,6 +259,7 @@ async def test_calibrate_by_a_sheet_reads_the_picture_of_an_in_sight(
         (["--wizard", "sheet"], "a URL is missing"),
         (["--pictures", "."], "a URL is missing"),
         (["bvs://x", "--check", "t", "--wizard", "sheet"], "no --wizard beside it"),
+        (["v4l2:///dev/video0", "--wizard", "sheet"], "--pictures v4l2:///dev/video0 with"),
     ],
 )
 def test_calibrate_with_options_that_contradict_says_so(

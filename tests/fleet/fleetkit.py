@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, Self
 
 from smartcam import Backoff
@@ -12,9 +12,11 @@ from smartcam.emulator import Application, EmulatedCamera, Run
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._bus import Bus, MemoryBus, MemoryEnd
 from smartcam.fleet._camera import FleetCamera
+from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._program import Program
 from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
+from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
 
 FLEET = "plant"
@@ -80,6 +82,7 @@ class Plant:
         zenoh: the bus is Zenoh's, on a free port of this computer.
         engine: settings of the agent's end of it.
         history: results, and their bytes, that the agent keeps.
+        frames: makes the source of the camera's frames.
         session: options of the agent's session with the camera.
     """
 
@@ -91,12 +94,14 @@ class Plant:
         zenoh: bool = False,
         engine: Mapping[str, Any] | None = None,
         history: tuple[int, int] = (10_000, 1 << 24),
+        frames: Callable[[], FrameSource] | None = None,
         **session: Any,
     ) -> None:
         self.box = NumberedCamera() if box is None else box
         self.bus = MemoryBus() if bus is None else bus
         self.places = with_ports(["tcp/127.0.0.1:0"]) if zenoh else ()
         self._engine = engine
+        self._frames = frames
         self.session = {"reconnect": FAST, "name": NAME, **session}
         self.history = history
         self.agent: Agent
@@ -119,7 +124,15 @@ class Plant:
         else:
             self.end = self.bus.end()
         settings = CameraSettings.make(self.box.url, None, self.session)
-        self.agent = Agent(name, Keys(FLEET), self.end, {NAME: settings}, history=self.history)
+        frames = {} if self._frames is None else {NAME: FramesOf(self._frames, "scripted")}
+        self.agent = Agent(
+            name,
+            Keys(FLEET),
+            self.end,
+            {NAME: settings},
+            history=self.history,
+            frames=frames,
+        )
         await self.agent.open(PATIENCE)
         await self.agent.wait_tried()
 

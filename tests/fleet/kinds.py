@@ -54,9 +54,9 @@ class OwnAgentCamera(FleetCamera[Any]):
             observers=observers,
         )
 
-    async def attend(self, timeout: float) -> None:
+    async def attend(self, timeout: float, *, session: bool = True) -> None:
         await self.agent.open(timeout)
-        await super().attend(timeout)
+        await super().attend(timeout, session=session)
 
     async def close(self) -> None:
         try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from random import Random
 
-from smartcam.fleet._bus import MemoryBus, MemoryEnd
+from smartcam.fleet._bus import Data, MemoryBus, MemoryEnd
 
 Fate = Callable[[str, bytes], Sequence[float]]
 """Tells after how many seconds each copy of something said arrives; none: it is lost."""
@@ -20,11 +20,16 @@ def as_said(key: str, payload: bytes) -> Sequence[float]:
 
 
 class LossyBus(MemoryBus):
-    """A bus whose ends misbehave as ``fate`` says; it may be changed at any time."""
+    """A bus whose ends misbehave as ``fate`` says; it may be changed at any time.
 
-    def __init__(self, fate: Fate = as_said) -> None:
+    Args:
+        fate: what becomes of what is said.
+        local: frames are handed on as they are; else they go in parts, as between processes.
+    """
+
+    def __init__(self, fate: Fate = as_said, *, local: bool = True) -> None:
         super().__init__()
-        self.fate = fate
+        self.fate, self.local = fate, local
         self.said = 0  # copies that arrived
         self.lost = 0
         self.doubled = 0
@@ -37,7 +42,14 @@ class LossyBus(MemoryBus):
 class _LossyEnd(MemoryEnd):
     def __init__(self, bus: LossyBus) -> None:
         super().__init__(bus)
-        self._lossy = bus
+        self._lossy, self.local = bus, bus.local
+
+    def put_part(self, key: str, head: bytes, data: Data) -> None:
+        """Say a part; what is late of it would be broken, so it arrives at once or not at all."""
+        if self._lossy.fate(key, head):
+            super().put_part(key, head, data)
+        else:
+            self._lossy.lost += 1
 
     def put(self, key: str, payload: bytes) -> None:
         bus = self._lossy

@@ -1,7 +1,7 @@
-"""An agent, or a program with a reservation, in a process of its own, to be stopped and killed.
+"""An agent, or a program that has a camera or looks, in a process of its own, to be killed.
 
-``python -m tests.fleet.partner agent PLACE CAMERA_URL``, or ``... holder FLEET_URL``. It says when
-it is ready, and goes on until its end.
+``python -m tests.fleet.partner agent PLACE CAMERA_URL``, or ``... holder FLEET_URL``, or ``...
+viewer FLEET_URL``. It says when it is ready, and goes on until its end.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import AsyncIterator
+from typing import Any
 
 import smartcam
 from smartcam.fleet._agent import Agent
@@ -71,10 +72,17 @@ async def _holder(url: str) -> None:
             await _ready()
 
 
+async def _viewer(url: str) -> None:
+    async with smartcam.connect(url) as camera, camera.frames(timeout=PATIENCE) as frames:
+        await anext(frames)
+        await _ready()
+
+
 async def _ready() -> None:
     print("ready", flush=True)  # noqa: T201
     await asyncio.Event().wait()
 
 
 if __name__ == "__main__":
-    asyncio.run(_agent(*sys.argv[2:]) if sys.argv[1] == "agent" else _holder(sys.argv[2]))
+    programs: dict[str, Any] = {"agent": _agent, "holder": _holder, "viewer": _viewer}
+    asyncio.run(programs[sys.argv[1]](*sys.argv[2:]))

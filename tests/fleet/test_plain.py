@@ -51,6 +51,7 @@ async def test_list_has_every_camera_under_its_key() -> None:
             "interpret_as": {str(COUNTER): LAYOUT, str(TEXTS): "strings50"},
             "y_down": False,
             "lenient": False,
+            "frames": None,
             "next_result": 1,
         }
         assert int(said["epoch"]) > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 from typing import Any
 
 import pytest
@@ -44,6 +45,24 @@ async def test_services_do_what_the_camera_s_methods_do() -> None:
         await call("set_input", input="00ff")
         await call("query_application")
         assert heard(place.camera, m.SetInput) == 1
+
+
+@pytest.mark.both_buses
+async def test_frame_comes_as_a_picture_with_what_is_known_of_it() -> None:
+    async with plant(frames="synthetic://?size=300x200&fps=50&name=x") as place:
+        assert (await place.client.ask("cameras/**"))[0][1]["frames"].startswith("synthetic://")
+        frame = (await place.client.call("frame", quality=50, fresh=True))["frame"]
+        picture = base64.b64decode(frame["data"])
+        assert picture[:2] == b"\xff\xd8"
+        assert len(picture) == frame["size"]
+        assert (frame["format"], frame["width"], frame["height"]) == ("MJPEG", 300, 200)
+        assert 0 <= frame["age"] < PATIENCE
+        assert (frame["moment"], frame["lost"]) == ("EXPOSURE_START", 0)
+        png = await place.client.call("frame", encoding="png", max_age=60)
+        assert base64.b64decode(png["frame"]["data"])[1:4] == b"PNG"
+        assert (await place.client.call("frame", encoding="bmp"))["kind"] == "ConfigurationError"
+    async with plant() as place:
+        assert (await place.client.call("frame"))["kind"] == "UnsupportedError"
 
 
 @pytest.mark.both_buses

@@ -92,3 +92,32 @@ async def test_discovery_asks_each_kind_once() -> None:
     assert await frames.discover("synthetic") == []
     with pytest.raises(ConfigurationError, match="unknown scheme"):
         await frames.discover("nothing")
+
+
+@pytest.mark.parametrize(
+    ("format", "shape"),
+    [
+        ("Mono8", (64, 301)),
+        ("YUYV", (64, 301, 2)),
+        ("RGB8", (64, 301, 3)),
+        ("Z16", (64, 301)),
+        ("MJPEG", None),
+    ],
+)
+async def test_drawn_frames_have_their_stamp_in_every_format(
+    format: str, shape: tuple[int, ...] | None
+) -> None:
+    async with frames.open(f"synthetic://?size=301x64&fps=30&format={format}") as source:
+        frame = await source.newest()
+        assert frame.format is frames.find_format(format) is source.format.format
+    assert shape is None or frame.array().shape == shape
+    depth = frame.format.name == "Coord3D_C16"
+    stamp = read_stamp(frame.array() if depth else frame.grey())
+    assert stamp is not None
+    assert stamp[0] == frame.sequence
+    assert depth or read_stamp(frame.rgb()) == stamp
+
+
+def test_format_that_is_not_drawn_lists_those_that_are() -> None:
+    with pytest.raises(ConfigurationError, match=r"format: expected one of Mono8, .* got 'NV12'"):
+        frames.open("synthetic://?format=NV12")

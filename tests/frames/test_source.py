@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import sys
 import time
 from typing import Any
 
@@ -361,3 +362,21 @@ async def test_lens_travels_with_the_frames_and_has_their_size() -> None:
 def test_times_that_are_none_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError, match=f"{next(iter(options))}: expected"):
         FrameSource(ScriptedDriver(), **options)
+
+
+@pytest.mark.long
+async def test_memory_is_flat_over_100_000_frames() -> None:
+    driver, source = scripted()
+    async with source, source.reader() as fast, source.reader() as slow:
+        await driver.streams()
+        held = []
+        for number in range(100_000):
+            driver.give(frame(number, data=bytes(1000), device_time=number / 100))
+            await anext(fast)
+            await asyncio.sleep(0)
+            if number % 7 == 0:
+                await anext(slow)
+            if number % 10_000 == 9_999:
+                gc.collect()
+                held.append(sys.getallocatedblocks())
+        assert max(held[1:]) - held[0] < 1_000  # of memory, of which a frame takes four

@@ -289,6 +289,8 @@ CALLS: dict[str, Call] = {
     "query_status": asked("query_status", dialects=ID),
     "reset_errors": Call(reset, ("reset_errors",), before=dropped, dialects=ID),
     "read_image": asked("read_image", raises=(smartcam.UnsupportedError,)),
+    "newest_frame": asked("newest_frame", raises=(smartcam.UnsupportedError,)),
+    "frame_after": asked("frame_after", raises=(smartcam.UnsupportedError,)),
     "get_clock": asked("get_clock"),
     "set_clock": Call(
         lambda b: b.camera.set_clock(datetime(2024, 1, 1)),  # noqa: DTZ001 - it has no zone

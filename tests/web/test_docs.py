@@ -23,6 +23,8 @@ from smartcam.web import _routes as routes
 from smartcam.web import _serialize as serialize
 from smartcam.web import _streams as streams
 from smartcam.web._emulator import CALLS
+from smartcam.web._frames import CALLS as FRAMES_CALLS
+from smartcam.web._frames import MAX_VIEWERS
 from smartcam.web._live import CALLS as LIVE_CALLS
 from smartcam.web._live import MAX_NEWS
 from smartcam.web._live_view import FAIL_WORDS, MAX_RESULTS, NOT_WORDS, PASS_WORDS
@@ -32,6 +34,7 @@ from tests.web.sitekit import TOKEN
 
 PAGE = (ROOT / "docs" / "control.md").read_text(encoding="utf-8")
 LIVE_PAGE = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
+FRAMES_PAGE = (ROOT / "docs" / "frames.md").read_text(encoding="utf-8")
 WIZARD_PAGE = (ROOT / "docs" / "calibrating.md").read_text(encoding="utf-8")
 CURL = [
     line
@@ -51,10 +54,20 @@ def test_live_page_has_its_numbers() -> None:
     assert {one.removesuffix("ed") for one in words} | NOT_WORDS == named
 
 
+def test_frames_page_has_its_numbers() -> None:
+    assert f"There may be {MAX_VIEWERS} of them" in FRAMES_PAGE
+    assert f"takes no picture for {streams.SLOW:g} s" in FRAMES_PAGE
+
+
 @pytest.mark.parametrize(
     ("page", "calls"),
-    [(PAGE, CALLS), (LIVE_PAGE, LIVE_CALLS), (WIZARD_PAGE, WIZARD_CALLS)],
-    ids=["control", "live", "calibrating"],
+    [
+        (PAGE, CALLS),
+        (LIVE_PAGE, LIVE_CALLS),
+        (WIZARD_PAGE, WIZARD_CALLS),
+        (FRAMES_PAGE, FRAMES_CALLS),
+    ],
+    ids=["control", "live", "calibrating", "frames"],
 )
 def test_table_has_every_call(page: str, calls: routes.Calls[Any]) -> None:
     table = page.partition("\n## Calls\n")[2].partition("\n`GET /api")[0]

@@ -42,7 +42,7 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
 
     Args:
         image: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; 16 to 20,000 pixels wide
-            and high.
+            and high. Or a :class:`~smartcam.frames.Frame`, whose brightness counts.
         target: what is printed on the sheet.
         name: of the image, for messages.
 
@@ -56,7 +56,8 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
             TARGET_NOT_FOUND; AMBIGUOUS_ORIGIN: the mark is not darker than the other corners by 30
             grey levels of 255; MIRRORED: the image shows the target as in a mirror, or, where only
             its black corners tell, as a negative or with columns and rows exchanged.
-        MissingExtraError: OpenCV is not installed.
+        MissingExtraError: OpenCV is not installed, or what reads a compressed frame.
+        FrameFormatError: a frame has no brightness, or its bytes are wrong.
     """
     grey = grey_image(image)
     match target:

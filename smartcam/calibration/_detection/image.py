@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -29,6 +29,15 @@ In a larger one it takes seconds and finds less.
 Level = TypeVar("Level", np.uint8, np.float32)
 
 
+@runtime_checkable
+class HasGrey(Protocol):
+    """What knows its brightness, as a frame of a camera does."""
+
+    def grey(self) -> NDArray[Any]:
+        """Return the brightness, (H, W), uint8 or uint16."""
+        ...
+
+
 class GreyImage(NamedTuple):
     """An image without its colours."""
 
@@ -45,9 +54,12 @@ class GreyImage(NamedTuple):
 def grey_image(image: Any) -> GreyImage:
     """Return an image's grey levels.
 
-    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; else SHAPE is raised. The
-    brightest level of uint16 becomes 255, whether the camera fills 10, 12 or 16 bits.
+    ``image``: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red, or what has its ``grey``
+    levels; else SHAPE is raised. The brightest level of uint16 becomes 255, whether the camera
+    fills 10, 12 or 16 bits.
     """
+    if isinstance(image, HasGrey):
+        image = image.grey()
     shape = np.shape(image) if isinstance(image, np.ndarray) else ()
     kind = getattr(image, "dtype", None)
     fits = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)

@@ -23,7 +23,12 @@ from smartcam.calibration._hand_eye.closed_forms import LEAST_POSES
 from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
-from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT, how_to_take
+from smartcam.calibration.wizards._pictures import (
+    MAX_PREVIEW,
+    PICTURE_TIMEOUT,
+    how_to_take,
+    taker,
+)
 from smartcam.calibration.wizards._points import Calibrated, ask_to_save, review_step
 from smartcam.calibration.wizards._sequence import Wizard, ask
 from smartcam.calibration.wizards._steps import Number, Option, Step, pick
@@ -42,7 +47,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import Target
-    from smartcam.calibration.wizards._pictures import TakePicture
+    from smartcam.calibration.wizards._pictures import Pictures, TakePicture
     from smartcam.calibration.wizards._steps import Answers
     from smartcam.calibration.wizards._view_suggestions import Suggestion
 
@@ -69,7 +74,7 @@ SUGGESTIONS = tuple(look.text for look in LOOKS)
 
 def hand_eye_wizard(
     *,
-    take_picture: TakePicture,
+    take_picture: TakePicture | Pictures,
     save_to: Callable[[str], Path],
     target: Target | None = None,
     suggested: Target | None = None,
@@ -88,7 +93,8 @@ def hand_eye_wizard(
     translation_error_mm, rotation_error_deg, remarks``, and lines that ``use`` it.
 
     Args:
-        take_picture: takes a picture; the robot stands still.
+        take_picture: takes a picture; the robot stands still. Or a source of frames that is open,
+            of which the first one counts that is exposed after the button.
         save_to: returns the file for a name.
         target: what is on the sheet, with the lengths that it has on paper; None: it is asked.
         suggested: the default of what is asked.
@@ -106,7 +112,7 @@ def hand_eye_wizard(
         there = target
         if there is None:
             there = await ask_target(suggested, known=parameters.get("target"))
-        views = _Views(there, setup, take_picture, read_robot or robot, camera, awaited)
+        views = _Views(there, setup, taker(take_picture), read_robot or robot, camera, awaited)
         calibration = await views.run()
         name = str(parameters.get("name", KIND))
         preview = {"svg": draw_scene(calibration, title="Where camera and sheet were")}

@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
 from smartcam.calibration._codes import Code
-from smartcam.calibration._detection.image import LARGEST
+from smartcam.calibration._detection.image import LARGEST, HasGrey
 from smartcam.calibration._optional_imports import load
 from smartcam.exceptions import CalibrationError
 
@@ -23,6 +24,31 @@ if TYPE_CHECKING:
 
 TakePicture = Callable[[], Awaitable[Any]]
 """Takes a picture and returns it: uint8 or uint16, (H, W) or (H, W, 3)."""
+
+
+class Pictures(Protocol):
+    """A source of frames, as :func:`smartcam.frames.open` gives it; somebody has it open."""
+
+    def after(self, moment: float, /) -> Awaitable[HasGrey]:
+        """Return the first frame whose exposure began after a moment of ``time.monotonic()``."""
+        ...
+
+
+def taker(pictures: TakePicture | Pictures) -> TakePicture:
+    """Return what takes a picture; of a source of frames the first one that is exposed then.
+
+    Its brightness counts. The source's errors are the picture's: no such device, none in time.
+    """
+    if callable(pictures):
+        return pictures
+    source = pictures
+
+    async def take() -> NDArray[Any]:
+        frame = await source.after(time.monotonic())
+        return await asyncio.to_thread(frame.grey)
+
+    return take
+
 
 MAX_PREVIEW: Final = 700_000
 """Bytes of a picture's preview, which is kept with its step: a line of a journal holds 1 MiB."""

@@ -24,7 +24,12 @@ from smartcam.calibration._sheet.plane import look_at_sheet
 from smartcam.calibration._targets import Charuco
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.wizards._marks import Mark
-from smartcam.calibration.wizards._pictures import MAX_PREVIEW, PICTURE_TIMEOUT, how_to_take
+from smartcam.calibration.wizards._pictures import (
+    MAX_PREVIEW,
+    PICTURE_TIMEOUT,
+    how_to_take,
+    taker,
+)
 from smartcam.calibration.wizards._points import (
     MAX_POINTS,
     Calibrated,
@@ -45,7 +50,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._plane.calibration import PlaneCalibration
     from smartcam.calibration._targets import Target
-    from smartcam.calibration.wizards._pictures import TakePicture
+    from smartcam.calibration.wizards._pictures import Pictures, TakePicture
     from smartcam.calibration.wizards._sequence import StepAnswer
     from smartcam.calibration.wizards._steps import Answers
     from smartcam.calibration.wizards._touches import ReadRobot, Touch
@@ -56,7 +61,7 @@ _DIAGONALS: Final = ((-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0))
 
 def sheet_wizard(
     *,
-    take_picture: TakePicture,
+    take_picture: TakePicture | Pictures,
     save_to: Callable[[str], Path],
     read_robot: ReadRobot | None = None,
     suggested: Target | None = None,
@@ -75,7 +80,8 @@ def sheet_wizard(
     (of them about their plane); ``predicted_mm`` is at the points that were seen.
 
     Args:
-        take_picture: takes a picture.
+        take_picture: takes a picture; or a source of frames that is open, of which the first one
+            counts that is exposed after the button.
         save_to: returns the file for a name.
         read_robot: reads the robot's pose; None: it is typed.
         suggested: the target that lies there, as the default of what is asked.
@@ -106,7 +112,7 @@ def sheet_wizard(
         source = _SheetSource(about, read_robot, target)
         # pixels count down, positions that are mapped count up
         source.connect = None if connect is None else {**connect, "y_down": True}
-        await source.ask_picture(take_picture, camera, awaited)
+        await source.ask_picture(taker(take_picture), camera, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
 
     return Wizard(name=KIND, version=1, script=script)

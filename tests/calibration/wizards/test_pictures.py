@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,11 @@ import pytest
 
 from smartcam.calibration._optional_imports import load
 from smartcam.calibration.wizards import _pictures as pictures
-from smartcam.calibration.wizards._pictures import PictureFolder, decode_picture
+from smartcam.calibration.wizards._pictures import PictureFolder, decode_picture, taker
+from smartcam.exceptions import FrameTimeoutError, LocalProtocolError
 from tests.calibration.scenes import refused
+from tests.frames.drivers import GoneError, frame, scripted
+from tests.handmade import until
 
 GREY = (np.arange(32 * 48) % 251).reshape(32, 48).astype(np.uint8)
 
@@ -152,3 +156,48 @@ async def test_folder_take_cancelled_leaves_nothing_behind(tmp_path: Path) -> No
     task.cancel()
     await asyncio.wait({task})
     assert task.cancelled()
+
+
+# ---------------------------------------------------------------------- sources of frames
+
+
+async def test_picture_of_a_source_is_the_first_exposed_after_it_was_wanted() -> None:
+    driver, source = scripted(stall=None, linger=60.0)
+    take = taker(source)
+    async with source, source.reader() as reader:
+        await driver.streams()
+        driver.give(frame(1))
+        assert (await anext(reader)).sequence == 1  # here before the button
+        taking = asyncio.ensure_future(take())
+        await until(lambda: source.statistics().readers == 2)
+        driver.give(frame(2, captured=time.monotonic() - 1.0))  # exposed before, here after it
+        await asyncio.sleep(1.0)
+        assert not taking.done()
+        driver.give(frame(3))
+        picture = await taking
+        assert picture.shape == (2, 4)
+        assert (picture == 3).all()
+
+
+async def test_picture_of_a_source_that_dies_or_is_silent_is_its_error() -> None:
+    driver, source = scripted(stall=None)
+    take = taker(source)
+    async with source:
+        with pytest.raises(FrameTimeoutError):
+            await take()
+        await driver.rests()
+        taking = asyncio.ensure_future(take())
+        await driver.streams()
+        assert driver.sink is not None
+        driver.sink.ended(GoneError("scripted: it was unplugged"))
+        with pytest.raises(GoneError, match="unplugged"):
+            await taking
+    with pytest.raises(LocalProtocolError, match="not open"):
+        await take()
+
+
+async def test_what_takes_pictures_stays_what_it_is() -> None:
+    async def take() -> Any:
+        return GREY
+
+    assert taker(take) is take

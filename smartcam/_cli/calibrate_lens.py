@@ -1,0 +1,310 @@
+"""``smartcam calibrate lens``: a lens from picture files, or from a source of frames."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+import numpy as np
+
+from smartcam._cli.frames import is_source, opened
+from smartcam._cli.options import OUTPUT, Options, naming, option, runs
+from smartcam._cli.texts import table_text
+from smartcam.exceptions import CalibrationError, ConfigurationError, FrameTimeoutError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration._views import TargetView
+    from smartcam.frames import FrameSource
+
+STILL: Final = 1.0
+"""Pixels by which points may move from a frame to the next one of a target that is held still."""
+
+MOVED: Final = 0.05
+"""Of the image's width: by how much points are elsewhere, on average, in a view that is another."""
+
+MOST_VIEWS: Final = 200
+
+MAX_DESCRIPTION: Final = 65_536
+"""Bytes of a target's description."""
+
+
+@dataclass(slots=True)
+class Collecting:
+    """Takes views of a target that somebody moves before a camera, when it is held still."""
+
+    views: list[TargetView] = field(default_factory=list["TargetView"])
+    _last: TargetView | None = None
+
+    def offer(self, view: TargetView) -> bool:
+        """Take a view if the target stands still, and where it was not seen before."""
+        last, self._last = self._last, view
+        still = last is not None and _apart(last, view) <= STILL
+        far = MOVED * view.size[0]
+        if not still or any(_apart(one, view) < far for one in self.views):
+            return False
+        self.views.append(view)
+        return True
+
+    def gone(self) -> None:
+        """The target was not seen."""
+        self._last = None
+
+
+def _apart(one: TargetView, other: TargetView) -> float:
+    """Return by how many pixels common points are apart, root of the mean square."""
+    _, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
+    if not len(here):
+        return np.inf
+    off = one.points[here] - other.points[there]
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def _output(_context: object, _option: object, file: str) -> str:
+    if Path(file).suffix.lower() not in {".json", ".yaml", ".yml"}:
+        raise click.BadParameter(f"{file}: expected a name that ends with .yaml or .json")
+    return file
+
+
+@click.command(
+    help="Calibrate a lens from pictures of a printed target: of files, of a folder's files, or of "
+    "a source of frames (see smartcam frames). Of a source a view is taken whenever the target is "
+    "held still where it was not seen before, and what comes next is suggested; it ends after "
+    "--count views, or with --seconds. Pictures without the target are named and left out."
+)
+@click.argument("pictures", metavar="FILE...|FOLDER|URL", nargs=-1, required=True)
+@click.option(
+    "--target",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    required=True,
+    help="What is on the sheet, as smartcam sheet --describe writes it.",
+)
+@option(
+    "--output",
+    required=True,
+    callback=_output,
+    help="Where the lens goes: .yaml is a camera_info of ROS, .json has the views, too, and what "
+    "smartcam calibrate compare wants.",
+)
+@option("--force")
+@click.option(
+    "--model",
+    type=click.Choice(["plumb_bob", "rational_polynomial", "equidistant"]),
+    default="plumb_bob",
+    show_default=True,
+    help="Of the distortion: for most lenses, for wide ones, for fisheyes.",
+)
+@option(
+    "--count",
+    type=click.IntRange(3, MOST_VIEWS),
+    help="How many views of a source.  [default: 15]",
+)
+@option("--seconds", help="Calibrate after so many seconds from the views of a source so far.")
+@option("--timeout", help="Bound of the wait for a frame.  [default: 5]")
+@runs(*OUTPUT)
+async def lens(
+    pictures: tuple[str, ...], target: str, output: str, force: bool, model: Any, options: Options
+) -> None:
+    """Calibrate a lens."""
+    from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
+
+    sources = [one for one in pictures if is_source(one)]
+    if sources and len(pictures) > 1:
+        raise click.UsageError("expected files and folders, or one URL")
+    if not sources and (options.count or options.seconds):
+        raise click.UsageError("--count and --seconds are for a source of frames")
+    _check_free(output, force)
+    described = read_target(target)
+    try:
+        if sources:
+            async with opened(sources[0], options) as source:
+                views = await _from_source(source, described, options)
+        else:
+            views = await _from_files(pictures, described, options)
+        found = await asyncio.to_thread(calibrate_intrinsics, views, distortion_model=model)
+        await asyncio.to_thread(_save, output, found)
+    except CalibrationError as exc:
+        raise ConfigurationError(str(exc)) from exc
+    options.show(_value(output, found), _text(output, found))
+
+
+def read_target(path: str) -> Target:
+    """Return the target that a file describes; ConfigurationError: it does not."""
+    from smartcam.calibration._targets import target_from_data
+
+    try:
+        with Path(path).open("rb") as stream:
+            data: object = json.loads(stream.read(MAX_DESCRIPTION))
+    except OSError as exc:
+        raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
+    except (ValueError, RecursionError) as exc:
+        raise ConfigurationError(f"--target {path}: no JSON: {exc}") from exc
+    if not isinstance(data, dict):
+        raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
+    described: dict[str, Any] = data
+    try:
+        return target_from_data(described)
+    except CalibrationError as exc:
+        raise ConfigurationError(f"--target {path}: {exc}") from exc
+
+
+def _check_free(file: str, force: bool) -> None:
+    if Path(file).exists() and not force:
+        raise ConfigurationError(f"{file}: the file is there already; --force takes its place")
+    if not Path(file).parent.is_dir():
+        raise ConfigurationError(f"{file}: there is no folder {Path(file).parent}")
+
+
+async def _from_files(
+    pictures: Sequence[str], target: Target, options: Options
+) -> list[TargetView]:
+    """Return the views of files that show the target."""
+    views: list[TargetView] = []
+    for path in _files(pictures):
+        try:
+            view = await asyncio.to_thread(_view_of_file, path, target)
+        except CalibrationError as exc:
+            _show_view(str(path), None, str(exc).removeprefix(f"{path.name}: "), options)
+        else:
+            views.append(view)
+            _show_view(str(path), view, "", options)
+    return views
+
+
+def _files(pictures: Sequence[str]) -> Iterator[Path]:
+    """Yield the files that are named, and those of folders, in the order of their names."""
+    from smartcam.calibration.wizards._pictures import SUFFIXES
+
+    for one in map(Path, pictures):
+        if not one.is_dir():
+            yield one
+            continue
+        inside = sorted(file for file in one.iterdir() if file.suffix.lower() in SUFFIXES)
+        if not inside:
+            raise ConfigurationError(
+                f"{one}: expected pictures ({', '.join(sorted(SUFFIXES))}), found none"
+            )
+        yield from inside
+
+
+def _view_of_file(path: Path, target: Target) -> TargetView:
+    from smartcam.calibration._detection.find import find_target
+    from smartcam.calibration.wizards._pictures import MAX_PICTURE, decode_picture
+
+    with naming(str(path)), path.open("rb") as stream:
+        data = stream.read(MAX_PICTURE + 1)
+    return find_target(decode_picture(data, path.name), target, name=path.name)
+
+
+async def _from_source(source: FrameSource, target: Target, options: Options) -> list[TargetView]:
+    """Return the views that are taken while somebody moves the target."""
+    from smartcam.calibration._detection.find import find_target
+    from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
+
+    wanted = options.count or 15
+    taken, told = Collecting(), set[str]()
+    if not options.as_json:
+        click.echo(f"view 1 of {wanted}: hold the target {LOOKS[0].text}; Ctrl-C gives up")
+    try:
+        async with asyncio.timeout(options.seconds), source.reader() as reader:
+            async for frame in reader:
+                name = f"view {len(taken.views) + 1}"
+                try:
+                    view = await asyncio.to_thread(find_target, frame, target, name=name)
+                except CalibrationError as exc:
+                    taken.gone()
+                    _tell_once(exc, told)
+                    continue
+                if not taken.offer(view):
+                    continue
+                _show_view(f"{name} of {wanted}", view, "", options)
+                if len(taken.views) == wanted:
+                    break
+                following = await asyncio.to_thread(suggestion, taken.views, lens_known=False)
+                if not options.as_json:
+                    click.echo(f"  next: {following.text}")
+    except TimeoutError as exc:
+        if isinstance(exc, FrameTimeoutError):  # else --seconds are over
+            raise
+    return taken.views
+
+
+def _tell_once(error: CalibrationError, told: set[str]) -> None:
+    """Say why no view can be had of frames that show something; raise what no frame can mend."""
+    from smartcam.calibration._codes import Code
+
+    if error.code == Code.SHAPE:
+        raise error
+    if error.code != Code.TARGET_NOT_FOUND and error.code not in told:
+        told.add(error.code)
+        click.echo(f"note: {error}", err=True)
+
+
+def _show_view(name: str, view: TargetView | None, why: str, options: Options) -> None:
+    points = 0 if view is None else len(view.ids)
+    value = {"picture": name, "used": view is not None, "points": points, "reason": why}
+    options.show(
+        value, f"{name}: " + (f"{points} points" if view is not None else f"not used: {why}")
+    )
+
+
+def _save(output: str, found: IntrinsicCalibration) -> None:
+    from smartcam.calibration.formats._cameras import write_camera_info
+
+    if Path(output).suffix.lower() == ".json":
+        found.save(output)
+    else:
+        write_camera_info(output, found.camera)
+
+
+def _value(output: str, found: IntrinsicCalibration) -> dict[str, Any]:
+    """Return what came out, for JSON."""
+    matrix = found.camera.matrix
+    return {
+        "file": output,
+        "views": len(found.views),
+        "held_out_px": found.held_out,
+        "rms_px": found.rms,
+        "lens": {
+            "fx": matrix[0, 0],
+            "fy": matrix[1, 1],
+            "cx": matrix[0, 2],
+            "cy": matrix[1, 2],
+        },
+        "deviations": found.deviations,
+        "distortion": found.camera.distortion.tolist(),
+        "lacking": list(found.coverage.lacking),
+        "remarks": [f"{one.code}: {one.text}" for one in found.warnings],
+    }
+
+
+def _text(output: str, found: IntrinsicCalibration) -> str:
+    value = _value(output, found)
+    rows = [
+        (name, round(number, 3), round(value["deviations"].get(name, 0.0), 3))
+        for name, number in value["lens"].items()
+    ]
+    lines = [
+        f"{output}: {value['views']} views, error {value['held_out_px']:.3g} px in views left out",
+        table_text(("", "pixels", "sigma"), rows),
+    ]
+    if value["lacking"]:
+        lines.append(f"  lacking: {', '.join(_LACKING[one] for one in value['lacking'])}")
+    lines += [f"  {one}" for one in value["remarks"]]
+    return "\n".join(lines)
+
+
+_LACKING = {
+    "x": "views at the left and right",
+    "y": "views above and below",
+    "size": "views near and far",
+    "skew": "views of a tilted target",
+}

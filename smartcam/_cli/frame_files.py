@@ -1,0 +1,117 @@
+"""A frame as the bytes of a file, by the file's suffix; nothing is lost that nobody named."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.frames._optional_imports import load
+from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from smartcam.frames import Frame
+
+DIGITS: Final = 4
+"""Of the number that a file of several gets; more where that is not enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """How frames become files.
+
+    Attributes:
+        suffix: a key of :data:`SUFFIXES`.
+        quality: of a JPEG, 1 to 100.
+        grey: the brightness alone.
+        eight: of more than 8 bits the upper 8.
+    """
+
+    suffix: str
+    quality: int
+    grey: bool = False
+    eight: bool = False
+
+    def encode(self, frame: Frame) -> bytes:
+        """Return a file's bytes; it takes milliseconds, and belongs into a thread.
+
+        Raises:
+            ConfigurationError: bits would be lost, which nobody asked for.
+            FrameFormatError: the frame's bytes are wrong.
+            MissingExtraError: a codec is not installed.
+        """
+        return SUFFIXES[self.suffix](frame, self)
+
+
+def numbered(file: str, count: int) -> list[str]:
+    """Return the names of so many files: ``x-0001.png``; of a single one its own."""
+    if count == 1:
+        return [file]
+    path, digits = Path(file), max(DIGITS, len(str(count)))
+    return [str(path.with_stem(f"{path.stem}-{one:0{digits}}")) for one in range(1, count + 1)]
+
+
+def _levels(frame: Frame, how: Encoding) -> NDArray[Any]:
+    seen = picture(frame, grey=how.grey)
+    if how.eight and seen.dtype != np.uint8:
+        seen = (seen >> (frame.format.depth - 8)).astype(np.uint8)
+    return seen
+
+
+def _raw(frame: Frame, _how: Encoding) -> bytes:
+    return bytes(frame.data)
+
+
+def _npy(frame: Frame, how: Encoding) -> bytes:
+    levels = _levels(frame, how) if how.grey or how.eight else frame.array()
+    stream = io.BytesIO()
+    np.save(stream, levels, allow_pickle=False)
+    return stream.getvalue()
+
+
+def _jpeg(frame: Frame, how: Encoding) -> bytes:
+    if not how.grey and is_whole_jpeg(frame):
+        return bytes(frame.data)
+    levels = _levels(frame, how)
+    if levels.dtype != np.uint8:
+        raise ConfigurationError(
+            f"{frame.source} sends {frame.format.name}, and a JPEG has 8 bits: expected a name "
+            "that ends with .png, .jxl, .npy or .raw, which keep all bits, or --8-bit, which keeps "
+            "the upper 8"
+        )
+    return encoded(frame, levels, how.quality)
+
+
+def _png(frame: Frame, how: Encoding) -> bytes:
+    return _lossless(frame, how, "PNG", "png_encode")
+
+
+def _jxl(frame: Frame, how: Encoding) -> bytes:
+    return _lossless(frame, how, "JPEGXL", "jpegxl_encode", lossless=True)
+
+
+def _lossless(frame: Frame, how: Encoding, format: str, encode: str, **options: Any) -> bytes:
+    if frame.format.name == format and not (how.grey or how.eight):
+        return bytes(frame.data)
+    levels = np.ascontiguousarray(_levels(frame, how))
+    made: bytes = getattr(load("imagecodecs"), encode)(levels, **options)
+    return made
+
+
+SUFFIXES: Mapping[str, Callable[[Frame, Encoding], bytes]] = {
+    ".jpeg": _jpeg,
+    ".jpg": _jpeg,
+    ".jxl": _jxl,
+    ".npy": _npy,
+    ".png": _png,
+    ".raw": _raw,
+}
+"""What makes a file, by its suffix in small letters."""

@@ -1,0 +1,208 @@
+"""What a source of frames is worth: rate, jitter, age, latency, losses, processor."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames._synthetic import read_stamp
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.frames import Frame, FrameReader, FrameSource
+
+STAMP_PERIOD: Final = 0.1
+"""Seconds between two looks for a stamp: the processor's time is to be the source's."""
+
+STAMP_ROWS: Final = 16
+"""Rows of a picture that a stamp has."""
+
+STRANGE: Final = 60.0
+"""Seconds of latency that only another machine's clock makes; below 0 as well."""
+
+
+async def measure(source: FrameSource, seconds: float) -> dict[str, Any]:
+    """Read a source for some time, from its first frame on, and return what came out.
+
+    Raises:
+        FrameSourceError: it gave not a frame, or ended with an error.
+
+    Cancellation: safe; it reads no longer.
+    """
+    async with source.reader() as reader:
+        try:
+            first = await anext(reader)
+        except StopAsyncIteration:
+            raise FrameSourceError(f"{source.name}: it ended before its first frame") from None
+        taken = _Taken(first)
+        begun, cpu = time.monotonic(), time.process_time()
+        try:
+            async with asyncio.timeout(seconds):
+                await taken.read(reader)
+        except TimeoutError as exc:
+            if isinstance(exc, FrameSourceError):  # a FrameTimeoutError is both
+                raise
+        finally:
+            elapsed = time.monotonic() - begun
+            used = time.process_time() - cpu
+            await taken.stamps.settle()
+        return {
+            "source": source.name,
+            **_picture(first),
+            "seconds": elapsed,
+            **taken.figures(),
+            "cpu_percent": 100 * used / elapsed if elapsed else None,
+        }
+
+
+def _picture(frame: Frame) -> dict[str, Any]:
+    return {"format": frame.format.name, "width": frame.width, "height": frame.height}
+
+
+@dataclass(slots=True)
+class _Stamps:
+    """Latencies by the stamp in the picture, read beside the reading."""
+
+    latencies: list[float] = field(default_factory=list[float])
+    _last: float = -math.inf
+    _task: asyncio.Task[None] | None = None
+
+    def offer(self, frame: Frame, now: float) -> None:
+        """Look for the stamp of a frame that came at ``now``, now and then."""
+        if now - self._last < STAMP_PERIOD or not (self._task is None or self._task.done()):
+            return
+        self._last = now
+        self._task = asyncio.create_task(self._look(frame, now))
+
+    async def settle(self) -> None:
+        """Wait for the last look."""
+        if self._task is not None:
+            await asyncio.wait([self._task])
+
+    async def _look(self, frame: Frame, now: float) -> None:
+        found = await asyncio.to_thread(_stamp_of, frame)
+        if found is not None and 0 <= now - found < STRANGE:
+            self.latencies.append(now - found)
+
+
+def _stamp_of(frame: Frame) -> float | None:
+    try:
+        found = read_stamp(frame.grey()[:STAMP_ROWS])
+    except FrameSourceError:  # of no brightness, or wrong bytes: no stamp
+        return None
+    return None if found is None else found[1] / 1e9
+
+
+class _Taken:
+    """What was taken of a reader, the first frame among it."""
+
+    def __init__(self, first: Frame) -> None:
+        self.stamps = _Stamps()
+        self._first = self._last = first
+        self._intervals: list[float] = []
+        self._ages: list[float] = []
+        self._came = 1
+        self._delivered = self._skipped = self._lost = 0
+        self._note(first)
+
+    async def read(self, reader: FrameReader) -> None:
+        """Read to the end of the source."""
+        lost = reader.statistics().lost
+        self._delivered = 1
+        async for frame in reader:
+            account = reader.statistics()
+            if account.skipped == self._skipped and not frame.lost:
+                self._intervals.append(frame.captured - self._last.captured)
+            self._came = account.delivered + account.skipped
+            self._delivered, self._skipped = account.delivered, account.skipped
+            self._lost = account.lost - lost
+            self._last = frame
+            self._note(frame)
+
+    def _note(self, frame: Frame) -> None:
+        now = time.monotonic()
+        self._ages.append(now - frame.captured)
+        self.stamps.offer(frame, now)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures; None where too few frames came to tell."""
+        span = self._last.captured - self._first.captured
+        return {
+            "frames": self._delivered,
+            "lost": self._lost,
+            "skipped": self._skipped,
+            "rate": (self._came - 1) / span if span > 0 else None,
+            "interval_ms": _ms(_mean(self._intervals)),
+            "jitter_ms": _ms(_deviation(self._intervals)),
+            "longest_ms": _ms(max(self._intervals, default=None)),
+            "moment": self._first.moment.value,
+            "age_ms": _spread(self._ages),
+            "latency_ms": _spread(self.stamps.latencies),
+            "stamps": len(self.stamps.latencies),
+        }
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else round(1e3 * seconds, 4)
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _deviation(values: Sequence[float]) -> float | None:
+    mean = _mean(values)
+    if mean is None or len(values) < 2:
+        return None
+    return math.sqrt(sum((one - mean) ** 2 for one in values) / (len(values) - 1))
+
+
+def _spread(seconds: Sequence[float]) -> dict[str, float | None] | None:
+    """Return median, 99th of a hundred, and the worst; milliseconds."""
+    if not seconds:
+        return None
+    ordered = sorted(seconds)
+    places = {"median": 0.5, "p99": 0.99, "worst": 1.0}
+    return {name: _ms(ordered[round(part * (len(ordered) - 1))]) for name, part in places.items()}
+
+
+def measured_text(value: dict[str, Any]) -> str:
+    """Return what was measured, for people."""
+    head = f"{value['source']}: {value['format']} {value['width']}x{value['height']}"
+    rows = [
+        f"{head}, {value['frames']} frames in {value['seconds']:.1f} s",
+        f"  rate      {_told(value['rate'], 'a second')}",
+        f"  interval  {_told(value['interval_ms'], 'ms')}, jitter "
+        f"{_told(value['jitter_ms'], 'ms rms')}, longest {_told(value['longest_ms'], 'ms')}",
+        f"  age       {_spread_text(value['age_ms'])}, since the {value['moment']}",
+    ]
+    if value["latency_ms"] is not None:
+        rows.append(
+            f"  latency   {_spread_text(value['latency_ms'])}, by the stamp in {value['stamps']} "
+            "pictures"
+        )
+    else:
+        rows.append("  latency   not known: the pictures have no stamp of this machine's clock")
+    rows += [
+        f"  lost      {value['lost']}, skipped {value['skipped']}",
+        f"  CPU       {_told(value['cpu_percent'], '% of a core')}",
+    ]
+    return "\n".join(rows)
+
+
+def _told(number: float | None, unit: str) -> str:
+    return "not known" if number is None else f"{number:.4g} {unit}"
+
+
+def _spread_text(spread: dict[str, float | None] | None) -> str:
+    if spread is None:
+        return "not known"
+    return (
+        f"median {_told(spread['median'], 'ms')}, p99 {_told(spread['p99'], 'ms')}, "
+        f"worst {_told(spread['worst'], 'ms')}"
+    )

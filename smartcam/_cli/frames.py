@@ -1,0 +1,370 @@
+"""``smartcam frames``: pictures of any camera, listed, written, shown and measured."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.frame_files import SUFFIXES, Encoding, numbered
+from smartcam._cli.frame_measure import measure, measured_text
+from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.page import PageOptions, page_options
+from smartcam._cli.running import JsonErrors, first
+from smartcam.backoff import Backoff
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameFormatError,
+    FrameSourceError,
+    SmartCamError,
+)
+from smartcam.frames import FrameDriver, discover
+from smartcam.frames import open as open_frames
+from smartcam.frames._source import FRAME_TIMEOUT
+from smartcam.models import jsonable
+from smartcam.registry import FRAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.frames import FoundSource, Frame, FrameSource
+    from smartcam.web import FramesSite
+
+MOST_SHOWN = 4
+"""Sources side by side on a page."""
+
+MOST_GRABBED = 100_000
+"""Files of one command."""
+
+TIMEOUT = (
+    "Bound of the wait for a frame, and of a device that streams and gives none.  [default: 5]"
+)
+
+
+class FrameCommands(JsonErrors, click.Group):
+    """Its commands tell a wrong use as JSON, too."""
+
+
+@click.group(
+    cls=FrameCommands,
+    help="Pictures of any camera. URL is v4l2:///dev/video0, gige://HOST, rtsp://HOST/PATH, "
+    "http://HOST/PATH, insight://HOST, synthetic:// (which needs no camera), or the path of a "
+    "video; ?format=YUYV&size=640x480&fps=30 and the like say how it is to stream. A device "
+    "streams while somebody reads.",
+)
+def frames() -> None:
+    """Have the commands of frames."""
+
+
+def is_source(text: str) -> bool:
+    """Tell whether a text is the URL of a source, and no file or folder."""
+    return "://" in text
+
+
+def opened(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
+    """Return an unopened source; one without a frame for ``--timeout`` counts as stuck.
+
+    Raises ConfigurationError: the URL is wrong.
+    """
+    seconds = options.step(FRAME_TIMEOUT)
+    return open_frames(url, timeout=seconds, stall=seconds, linger=linger)
+
+
+# ---------------------------------------------------------------------- list
+
+
+@frames.command(
+    name="list",
+    help="List the devices that are found on this machine and its network: the URL that opens "
+    "each, its formats, and what keeps it from being opened.",
+)
+@click.option("--scheme", metavar="SCHEME", help="Only what is found by this one, such as v4l2.")
+@option("--timeout", help="Bound of the search.  [default: 5]")
+@runs(*OUTPUT)
+async def list_(scheme: str | None, options: Options) -> None:
+    known = [info.name for info in FRAMES.available()]
+    schemes = known if scheme is None else [scheme]
+    looks = await asyncio.gather(*(_look(one, options.step(FRAME_TIMEOUT)) for one in schemes))
+    shown: set[str] = set()
+    searched = [name for name, look in zip(schemes, looks, strict=True) if look is not None]
+    for name, look in zip(schemes, looks, strict=True):
+        if look is None:
+            continue
+        if isinstance(look, Exception):
+            if isinstance(look, ConfigurationError) and scheme is not None:
+                raise look
+            _show_broken(name, look, options)
+            continue
+        for one in look:
+            if one.url not in shown:
+                shown.add(one.url)
+                options.show(_found(one), _found_text)
+    if not shown and not options.as_json:
+        click.echo(
+            f"nothing found; looked for: {', '.join(searched)}"
+            if searched
+            else f"{scheme}:// is not looked for: its sources are opened by their URLs"
+        )
+
+
+async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
+    """Return what is found by a scheme, None where its driver does not look for anything.
+
+    A broken one costs only its own line.
+    """
+    try:
+        if scheme in FRAMES and _usual_discover(FRAMES.load(scheme)):
+            return None
+        async with asyncio.timeout(seconds):
+            return await discover(scheme)
+    except TimeoutError:
+        return FrameSourceError(f"the search took longer than {seconds:g} s")
+    except Exception as exc:  # noqa: BLE001 - a plug-in's, whatever it is
+        return exc
+
+
+def _usual_discover(driver: Any) -> bool:
+    return next(kind for kind in driver.__mro__ if "discover" in vars(kind)) is FrameDriver
+
+
+def _show_broken(scheme: str, error: Exception, options: Options) -> None:
+    reason = str(error) if isinstance(error, (SmartCamError, OSError)) else repr(error)
+    options.show({"scheme": scheme, "error": reason}, f"{scheme}: cannot be looked for: {reason}")
+
+
+def _found(one: FoundSource) -> dict[str, Any]:
+    """Return what is known of a source, for JSON."""
+    return {
+        "url": one.url,
+        "name": one.name,
+        "formats": [
+            {
+                "format": each.format.name,
+                "width": each.width,
+                "height": each.height,
+                "rates": list(each.rates),
+            }
+            for each in one.formats
+        ],
+        "remark": one.remark,
+    }
+
+
+def _found_text(value: dict[str, Any]) -> str:
+    lines = [f"{value['url']}  {value['name']}"]
+    for one in value["formats"]:
+        rates = f" at {', '.join(f'{rate:g}' for rate in one['rates'])}/s" if one["rates"] else ""
+        lines.append(f"  {one['format']} {one['width']}x{one['height']}{rates}")
+    if value["remark"]:
+        lines.append(f"  {value['remark']}")
+    return "\n".join(lines)
+
+
+# ---------------------------------------------------------------------- grab
+
+
+def _suffix(_context: object, _option: object, file: str) -> str:
+    if Path(file).suffix.lower() not in SUFFIXES:
+        raise click.BadParameter(f"{file}: expected a name that ends with {', '.join(SUFFIXES)}")
+    return file
+
+
+@frames.command(
+    help="Write the newest frame to a file, or several. What the file is, its suffix says: .png "
+    "and .jxl (JPEG XL) lose nothing, with 16 bits where the camera sends more than 8; .jpg; .npy "
+    "(the array of numpy) and .raw have the pixels as the camera sends them. A camera that sends "
+    'JPEGs has them written as they come. Needs the extra "frames", but for .npy and .raw.'
+)
+@click.argument("url")
+@option("--output", required=True, callback=_suffix)
+@option("--force")
+@option(
+    "--count",
+    type=click.IntRange(1, MOST_GRABBED),
+    help="Write so many, one after the other; with more than one the names get numbers.",
+)
+@click.option(
+    "--after-now",
+    is_flag=True,
+    help="The first one whose exposure begins after it is asked for, not one that was on its way.",
+)
+@click.option("--grey", is_flag=True, help="The brightness alone.")
+@click.option("--8-bit", "eight", is_flag=True, help="Of more than 8 bits the upper 8.")
+@click.option(
+    "--quality",
+    type=click.IntRange(1, 100),
+    default=90,
+    show_default=True,
+    help="Of a JPEG that is made here.",
+)
+@option("--timeout", help=TIMEOUT)
+@runs(*OUTPUT)
+async def grab(
+    url: str,
+    output: str,
+    force: bool,
+    after_now: bool,
+    grey: bool,
+    eight: bool,
+    quality: int,
+    options: Options,
+) -> None:
+    suffix = Path(output).suffix.lower()
+    if suffix == ".raw" and (grey or eight):
+        raise click.UsageError("a .raw file has the bytes as they came: no --grey or --8-bit")
+    files = numbered(output, options.count or 1)
+    _check_free(files, force)
+    encoding = Encoding(suffix, quality, grey, eight)
+    async with opened(url, options) as source, source.reader() as reader:
+        wait = options.step(FRAME_TIMEOUT)
+        coming = reader.after(time.monotonic(), timeout=wait) if after_now else anext(reader)
+        frame = await _next(coming, source, 0, len(files))
+        for done, file in enumerate(files, 1):
+            data = await asyncio.to_thread(encoding.encode, frame)
+            await asyncio.to_thread(_write, file, data)
+            options.show(*_grabbed(file, len(data), frame))
+            if done < len(files):
+                frame = await _next(anext(reader), source, done, len(files))
+        account = reader.statistics()
+    if len(files) > 1 and (account.skipped or account.lost):
+        click.echo(f"note: {account.skipped} skipped, {account.lost} lost", err=True)
+
+
+async def _next(coming: Any, source: FrameSource, done: int, wanted: int) -> Frame:
+    try:
+        frame: Frame = await coming
+    except StopAsyncIteration:
+        raise FrameSourceError(
+            f"{source.name}: it ended after {done} frames; expected {wanted}", source=source.name
+        ) from None
+    return frame
+
+
+def _grabbed(file: str, size: int, frame: Frame) -> tuple[dict[str, Any], str]:
+    """Return what was written, as JSON and as text."""
+    value = {
+        "file": file,
+        "size": size,
+        "source": frame.source,
+        "format": frame.format.name,
+        "width": frame.width,
+        "height": frame.height,
+        "stride": frame.stride,
+        "sequence": frame.sequence,
+        "lost": frame.lost,
+        "captured": datetime.fromtimestamp(frame.utc, UTC),
+        "moment": frame.moment.value,
+    }
+    text = (
+        f"{file}: {frame.format.name} {frame.width}x{frame.height}, number {frame.sequence}, "
+        f"{size:,} bytes"
+    )
+    return value, text
+
+
+def _check_free(files: Sequence[str], force: bool) -> None:
+    folder = Path(files[0]).parent
+    if not folder.is_dir():
+        raise ConfigurationError(f"{files[0]}: there is no folder {folder}")
+    there = next((file for file in files if Path(file).exists()), None)
+    if there is not None and not force:
+        raise ConfigurationError(f"{there}: the file is there already; --force takes its place")
+
+
+def _write(file: str, data: bytes) -> None:
+    try:
+        Path(file).write_bytes(data)
+    except OSError as exc:
+        raise ConfigurationError(f"{file}: cannot be written: {exc.strerror}") from exc
+
+
+# ---------------------------------------------------------------------- show
+
+
+@frames.command(
+    help=f"Serve a page of one source, or of up to {MOST_SHOWN} side by side, until Ctrl-C: the "
+    "newest frame of each, its age, rates, what was skipped and lost. The page's address goes to "
+    "stdout. A device streams while somebody looks; one that is not there is awaited, and the page "
+    'says so. Needs the extras "web" and "frames".'
+)
+@click.argument("urls", metavar="URL...", nargs=-1, required=True)
+@click.option(
+    "--quality",
+    type=click.IntRange(1, 100),
+    default=80,
+    show_default=True,
+    help="Of the JPEGs that the page gets; those of a camera that sends some stay as they are.",
+)
+@page_options("", always=True)
+@option("--seconds")
+@option("--timeout", help=TIMEOUT)
+@runs(*OUTPUT)
+async def show(urls: tuple[str, ...], quality: int, web: PageOptions, options: Options) -> None:
+    if len(urls) > MOST_SHOWN:
+        raise click.UsageError(f"expected {MOST_SHOWN} URLs at most, got {len(urls)}")
+    from smartcam.web import FramesSite
+
+    sources = [opened(url, options) for url in urls]
+    site = FramesSite(sources, quality=quality, **web.place)
+    tried = [asyncio.Event() for _ in sources]
+    jobs = [
+        _have_open(site, place, *each)
+        for place, each in enumerate(zip(sources, tried, strict=True))
+    ]
+    await first([_serve(site, tried, options), *jobs], options.seconds)
+
+
+async def _serve(site: FramesSite, tried: Sequence[asyncio.Event], options: Options) -> None:
+    """Serve the page, once each source was tried."""
+    for one in tried:
+        await one.wait()
+    async with site:
+        options.show({"page": site.url}, f"page: {site.url}")
+        await asyncio.Event().wait()
+
+
+async def _have_open(
+    site: FramesSite, place: int, source: FrameSource, tried: asyncio.Event
+) -> None:
+    """Open a source until it is there, and have it open until this is cancelled.
+
+    Raises FrameFormatError, ConfigurationError: it will never be what was asked for.
+    """
+    for delay in Backoff().delays():
+        try:
+            async with source:
+                site.failures.pop(place, None)
+                tried.set()
+                await asyncio.Event().wait()
+        except FrameFormatError:
+            raise
+        except FrameSourceError as exc:
+            if site.failures.get(place) != str(exc):
+                click.echo(f"note: {exc}; it is awaited", err=True)
+            site.failures[place] = str(exc)
+        tried.set()
+        await asyncio.sleep(delay)
+
+
+# ---------------------------------------------------------------------- measure
+
+
+@frames.command(
+    name="measure",
+    help="Read a source for some seconds and tell its rate and jitter, the age of a frame when it "
+    "is here, what was lost and skipped, and this process' part of a core. The latency is that of "
+    "pictures with a stamp, as synthetic:// draws it, seen by any camera or through any codec; "
+    "the clock must be this machine's.",
+)
+@click.argument("url")
+@option("--seconds", default=5.0, show_default=True, help="How long, from the first frame on.")
+@option("--timeout", help=TIMEOUT)
+@runs(*OUTPUT)
+async def measure_command(url: str, options: Options) -> None:
+    async with opened(url, options) as source:
+        value = await measure(source, options.seconds or 5.0)
+    options.show(jsonable(value), measured_text)

@@ -1,0 +1,406 @@
+"""A camera's frames at its agent: one source, for all programs that look.
+
+Who wants a stream asks for one frame after the other: the next request is here before the next
+frame is, so nothing is late, and a program that asks no more gets no more. Between two requests the
+agent keeps a reader for it, which skips and counts as any other. That one ends with its program, or
+when nothing was asked for a while; with the last one the device stops.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import math
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+from smartcam.exceptions import (
+    FrameFormatError,
+    FrameTimeoutError,
+    LocalProtocolError,
+    UnsupportedError,
+)
+from smartcam.fleet._frame_wire import MOST_FRAME, FrameForm, to_fields
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterator
+
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.fleet._frame_encoding import FrameEncoder
+    from smartcam.fleet._frame_sender import FrameSender
+    from smartcam.frames import Frame, FrameReader, FrameSource
+
+T = TypeVar("T")
+
+MOST_VIEWERS = 256
+"""Streams of one camera."""
+
+MOST_OF_PROGRAM = 16
+"""Streams of one camera that one program may have."""
+
+MOST_ASKED = 16
+"""Calls for frames of one camera that one program may have under way: each may keep a frame."""
+
+IDLE = 3.0
+"""Seconds without a request after which a stream has ended."""
+
+MOST_ENCODINGS = 16
+"""Ways of encoding whose last frame is kept, for who wants the same."""
+
+MOST_LENSES = 16
+
+HOLD = 1.0
+"""Seconds that a request waits for a frame at most; then it is answered that there is none."""
+
+
+class FramesOf(NamedTuple):
+    """Where a camera's frames come from.
+
+    Attributes:
+        make: returns the source; None: there is none.
+        url: of it, without a password; for people.
+    """
+
+    make: Callable[[], FrameSource] | None
+    url: str | None
+
+
+NO_FRAMES = FramesOf(None, None)
+
+
+class FrameOrder(NamedTuple):
+    """Who wants a frame, and how.
+
+    Attributes:
+        program: its name.
+        call: number of its call.
+        encoding: how it is to come.
+        timeout: seconds.
+    """
+
+    program: str
+    call: int
+    encoding: FrameForm
+    timeout: float
+
+
+@dataclass(eq=False)
+class _FrameStream:
+    """A stream of a program."""
+
+    number: int
+    reader: FrameReader
+    idle: asyncio.TimerHandle | None = None
+    busy: bool = False
+
+    def rest(self, close: Callable[[], None]) -> None:
+        """Nothing is asked for now: ``close`` is called if that stays so."""
+        self.busy = False
+        self.idle = asyncio.get_running_loop().call_later(IDLE, close)
+
+    def wake(self) -> None:
+        """Something is asked for."""
+        self.busy = True
+        if self.idle is not None:
+            self.idle.cancel()
+            self.idle = None
+
+    def close(self) -> None:
+        self.wake()
+        self.reader.close()
+
+
+class _Encoded(NamedTuple):
+    """The last frame that was encoded in one way."""
+
+    frame: Frame
+    task: asyncio.Task[Frame]
+
+
+@dataclass(eq=False)
+class SharedFrames:
+    """The frames of one camera, for programs.
+
+    Args:
+        name: of the camera.
+        make: returns its source; None: it has none.
+        sender: sends their bytes.
+        encoder: makes them small before.
+        url: where they come from, without a password; for people.
+    """
+
+    name: str
+    make: Callable[[], FrameSource] | None
+    sender: FrameSender
+    encoder: FrameEncoder
+    url: str | None = None
+    _source: FrameSource | None = None
+    _opening: asyncio.Task[FrameSource] | None = None
+    _viewers: dict[tuple[str, int], _FrameStream] = field(
+        default_factory=dict[tuple[str, int], _FrameStream]
+    )
+    _asking: dict[str, int] = field(default_factory=dict[str, int])
+    _encoded: dict[FrameForm, _Encoded] = field(default_factory=dict[FrameForm, _Encoded])
+    _lenses: dict[int, CameraModel] = field(default_factory=dict[int, "CameraModel"])
+    _numbers: itertools.count[int] = field(default_factory=lambda: itertools.count(1))
+    _tasks: set[asyncio.Task[Any]] = field(default_factory=set["asyncio.Task[Any]"])
+    _closed: bool = False
+
+    # ------------------------------------------------------------------ life
+
+    async def close(self) -> None:
+        """End all streams, and give the device back. Idempotent."""
+        self._closed = True
+        for viewer in self._viewers.values():
+            viewer.close()
+        self._viewers.clear()
+        tasks = [*self._tasks]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        self._encoded.clear()
+        source, self._source = self._source, None
+        if source is not None:
+            await source.close()
+
+    def forget(self, program: str) -> None:
+        """A program is gone, and so are its streams."""
+        for key in [key for key in self._viewers if key[0] == program]:
+            self._viewers.pop(key).close()
+
+    async def source(self) -> FrameSource:
+        """Return the source, opened where it is not.
+
+        Raises:
+            UnsupportedError: the camera has none.
+            FrameSourceError: it cannot be opened; the next one tries again.
+
+        Cancellation: it is opened all the same, for who comes next.
+        """
+        if self._source is not None:
+            return self._source
+        if self.make is None:
+            raise UnsupportedError(
+                f"{self.name} has no frames: its entry in the fleet file wants frames: URL, such "
+                "as v4l2:///dev/video0"
+            )
+        if self._closed:
+            raise LocalProtocolError(f"{self.name}: the agent ends")
+        if self._opening is None:
+            self._opening = self._begin(self._open(self.make()), "frames")
+        return await asyncio.shield(self._opening)
+
+    async def _open(self, source: FrameSource) -> FrameSource:
+        try:
+            await source.__aenter__()
+        finally:
+            self._opening = None
+        self._source = source
+        return source
+
+    # ------------------------------------------------------------------ calls
+
+    async def about(self, timeout: float) -> dict[str, Any]:
+        """Return what its frames are, as the device says."""
+        with self._within(timeout, "the device"):
+            async with asyncio.timeout(timeout):
+                made = (await self.source()).format
+        return {
+            "format": made.format.name,
+            "width": made.width,
+            "height": made.height,
+            "rates": list(made.rates),
+        }
+
+    async def one(
+        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
+    ) -> dict[str, Any]:
+        """Send one frame, as :meth:`get` has it."""
+        came = asyncio.get_running_loop().time()
+        frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
+        return {"came": came, "frame": self._send(frame, order, took)}
+
+    async def get(
+        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
+    ) -> tuple[Frame, float]:
+        """Return one frame, and the seconds that it took to encode it.
+
+        Args:
+            order: by whom, and how.
+            max_age: seconds since it was captured at most; None: any.
+            after: it was exposed after this time of the agent's clock.
+            fresh: it was exposed after this request came.
+        """
+        now = time.monotonic() + self.sender.ahead
+        with self._counted(order), self._within(order.timeout, "a frame"):
+            async with asyncio.timeout(order.timeout):
+                source = await self.source()
+                if fresh or after is not None:
+                    moment = now if after is None else after
+                    frame = await source.after(moment - self.sender.ahead, timeout=None)
+                else:
+                    age = math.inf if max_age is None else max_age
+                    frame = await source.newest(max_age=age, timeout=None)
+                return await self._encode(frame, order.encoding)
+
+    async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
+        """Send the newest frame that a stream has not had; say that there is none after a while."""
+        came = asyncio.get_running_loop().time()
+        key = order.program, stream
+        with self._counted(order):
+            viewer = self._viewers.get(key)
+            if viewer is None:
+                viewer = await self._view(key, order.timeout)
+            if viewer.busy:
+                raise LocalProtocolError(f"{self.name}: two requests for the frames of one stream")
+            viewer.wake()
+            try:
+                async with asyncio.timeout(min(order.timeout, HOLD)):
+                    frame = await anext(viewer.reader)
+                async with asyncio.timeout(order.timeout):
+                    sent, took = await self._encode(frame, order.encoding)
+            except FrameTimeoutError:
+                raise
+            except TimeoutError:
+                return {"came": came}
+            except StopAsyncIteration:
+                self._leave(key, viewer)
+                return {"came": came, "ended": True}
+            except Exception:
+                self._leave(key, viewer)
+                raise
+            finally:
+                if self._viewers.get(key) is viewer:
+                    viewer.rest(lambda: self._leave(key, viewer))
+        account = viewer.reader.statistics()
+        counts = {
+            "stream": viewer.number,
+            "sent": account.delivered,
+            "skipped": account.skipped,
+            "lost": account.lost,
+        }
+        return {"came": came, "frame": self._send(sent, order, took), **counts}
+
+    async def _view(self, key: tuple[str, int], timeout: float) -> _FrameStream:
+        """Begin a stream."""
+        with self._within(timeout, "the device"):
+            async with asyncio.timeout(timeout):
+                source = await self.source()
+        if key in self._viewers:
+            return self._viewers[key]
+        theirs = sum(program == key[0] for program, _ in self._viewers)
+        if len(self._viewers) >= MOST_VIEWERS or theirs >= MOST_OF_PROGRAM:
+            raise LocalProtocolError(
+                f"{self.name}: {len(self._viewers)} streams of frames, {theirs} of them this "
+                "program's; no more are possible"
+            )
+        viewer = self._viewers[key] = _FrameStream(next(self._numbers), source.reader(timeout=None))
+        return viewer
+
+    def leave(self, program: str, stream: int) -> None:
+        """End a stream; one that is not there is none."""
+        viewer = self._viewers.get((program, stream))
+        if viewer is not None:
+            self._leave((program, stream), viewer)
+
+    def _leave(self, key: tuple[str, int], viewer: _FrameStream) -> None:
+        if self._viewers.get(key) is viewer:
+            del self._viewers[key]
+        viewer.close()
+        if not self._viewers:
+            self._encoded.clear()
+
+    def lens(self, number: int) -> dict[str, Any]:
+        """Return a lens that frames have named by its number, and where they name another."""
+        found = self._lenses.get(number)
+        return {"lens": None if found is None else found.to_data()}
+
+    # ------------------------------------------------------------------ a frame
+
+    def _send(self, frame: Frame, order: FrameOrder, took: float) -> dict[str, Any]:
+        """Send a frame's bytes, and return what there is to say of it.
+
+        Raises:
+            FrameFormatError: there are more of them than a frame may have.
+        """
+        if len(frame.data) > MOST_FRAME:
+            raise FrameFormatError(
+                f"{self.name}: a frame of {len(frame.data)} bytes, expected {MOST_FRAME} at most",
+                source=self.name,
+            )
+        self.sender.send(order.program, order.call, frame.data)
+        return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
+
+    async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
+        """Return a frame encoded, once for all who want the same, and how long that took."""
+        if encoding.name == "raw":
+            return frame, 0.0
+        last = self._encoded.pop(encoding, None)
+        if last is None or last.frame is not frame:
+            last = _Encoded(
+                frame, self._begin(self.encoder.encoded(frame, encoding), encoding.name)
+            )
+        self._encoded[encoding] = last
+        if len(self._encoded) > MOST_ENCODINGS:
+            del self._encoded[next(iter(self._encoded))]
+        began = time.perf_counter()
+        made = await asyncio.shield(last.task)
+        return made, 0.0 if made is frame else time.perf_counter() - began
+
+    def _begin(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
+        """Have something done for whoever waits for it; it ends with the agent."""
+        task = asyncio.get_running_loop().create_task(
+            work, name=f"smartcam.fleet.{self.name}.{what}"
+        )
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        return task
+
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled():
+            task.exception()  # it was told to who waited, if anybody did
+
+    def _lens_number(self, lens: CameraModel | None) -> int:
+        if lens is None:
+            return 0
+        for number, known in self._lenses.items():
+            if known is lens:
+                return number
+        number = next(self._numbers)
+        self._lenses[number] = lens
+        if len(self._lenses) > MOST_LENSES:
+            del self._lenses[next(iter(self._lenses))]
+        return number
+
+    @contextlib.contextmanager
+    def _counted(self, order: FrameOrder) -> Iterator[None]:
+        """Count the calls of a program that are under way."""
+        under_way = self._asking.get(order.program, 0)
+        if under_way >= MOST_ASKED:
+            raise LocalProtocolError(
+                f"{self.name}: {under_way} calls of this program for frames are under way"
+            )
+        self._asking[order.program] = under_way + 1
+        try:
+            yield
+        finally:
+            left = self._asking[order.program] - 1
+            if left:
+                self._asking[order.program] = left
+            else:
+                del self._asking[order.program]
+
+    @contextlib.contextmanager
+    def _within(self, seconds: float, what: str) -> Iterator[None]:
+        """Have a timeout say what it waited for."""
+        try:
+            yield
+        except TimeoutError as exc:
+            if isinstance(exc, FrameTimeoutError):
+                raise
+            raise FrameTimeoutError(
+                f"{self.name}: waited {seconds:.3g} s for {what}, in vain", source=self.name
+            ) from None

@@ -1,0 +1,181 @@
+"""Pictures of a smart camera that can be asked for the last one."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
+
+from smartcam.client import SmartCamera
+from smartcam.exceptions import FrameFormatError, FrameSourceError, SmartCamError
+from smartcam.frames._bitmap import read_bitmap
+from smartcam.frames._driver import FrameDriver, StreamFormat
+from smartcam.frames._frame import Frame, Moment
+from smartcam.frames._pixels import find_format
+from smartcam.settings import CameraSettings
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from smartcam.frames._address import FrameAddress
+    from smartcam.frames._driver import FrameSink
+    from smartcam.frames._pixels import PixelFormat
+
+
+OURS = ("fps", "name", "timeout")
+
+
+class InSightDriver(FrameDriver):
+    """The last picture of a smart camera, again and again: ``insight://admin@HOST?fps=2``.
+
+    What else stands in the query is the camera's, as in :func:`smartcam.connect`. The camera has a
+    session only while somebody reads.
+
+    ============ ============================================================================
+    ``fps``      how often it is asked, times a second; usual 2
+    ``timeout``  seconds for connecting, and for a picture; usual 10
+    ``name``     of the camera
+    ============ ============================================================================
+
+    The camera does not say when a picture was taken, nor whether it is a new one. One with the
+    same bytes as the last is the same, and is not given again: where nothing triggers it, open it
+    with ``stall=None``. A frame is stamped with its arrival, and its ``duration`` goes back to when
+    the last one was asked for, since then it was not there yet; of the first one it is infinite.
+    """
+
+    def __init__(self, address: FrameAddress) -> None:
+        super().__init__(address)
+        parts = urlsplit(address.url)
+        said = parse_qsl(parts.query, keep_blank_values=True)
+        own = urlencode([one for one in said if one[0] in OURS])
+        query = urlencode([one for one in said if one[0] not in OURS])
+        mine = address.parameters(OURS, own)
+        self._rate = address.number("fps", mine.get("fps", "2"), 0.001, 100)
+        self._timeout = address.number("timeout", mine.get("timeout", "10"), 0.05, 600)
+        self._settings = CameraSettings.make(
+            urlunsplit(parts._replace(query=query)),
+            None,
+            {"connect_timeout": self._timeout, "reconnect": None},
+        )
+        self._name = mine.get("name") or self._settings.name
+        self._camera: SmartCamera[Any] | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._number = 0
+
+    @property
+    def name(self) -> str:
+        """The host and port, or as the URL says."""
+        return self._name
+
+    async def open(self) -> StreamFormat:
+        """Read a picture, and leave the camera again.
+
+        Raises:
+            FrameFormatError: it sends no bitmap.
+            FrameSourceError: it is not there, refuses the session, or has no picture to be read.
+        """
+        try:
+            await self._connect()
+            pixels = self._pixels(await self._read())
+        finally:
+            await self.stop()
+        height, width = pixels.shape[:2]
+        return StreamFormat(_format(pixels), width, height, (self._rate,))
+
+    async def start(self, sink: FrameSink) -> None:
+        """Connect, and ask for pictures.
+
+        Raises:
+            FrameSourceError: it is not there, or refuses.
+        """
+        try:
+            await self._connect()
+        except BaseException:
+            await self.stop()
+            raise
+        self._task = asyncio.create_task(self._poll(sink), name=f"frames of {self.name}")
+
+    async def stop(self) -> None:
+        """Ask no longer, and end the session."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+        camera, self._camera = self._camera, None
+        if camera is not None:
+            await camera.close()
+
+    async def close(self) -> None:
+        """Have nothing left. Idempotent."""
+        await self.stop()
+
+    async def _connect(self) -> None:
+        self._camera = SmartCamera(self._settings)
+        try:
+            await self._camera.open()
+        except SmartCamError as exc:
+            raise self._failed(exc) from exc
+        if not self._camera.capabilities.read_image:
+            raise FrameSourceError(
+                f"{self.name}: this camera cannot be asked for a picture", source=self.name
+            )
+
+    async def _read(self) -> bytes:
+        if self._camera is None:
+            raise FrameSourceError(f"{self.name}: stopped", source=self.name)
+        try:
+            return await self._camera.read_image(timeout=self._timeout)
+        except SmartCamError as exc:
+            raise self._failed(exc) from exc
+
+    def _failed(self, exc: SmartCamError) -> FrameSourceError:
+        text = str(exc).removeprefix(f"{self.name}: ")
+        return FrameSourceError(f"{self.name}: {text}", source=self.name)
+
+    def _pixels(self, data: bytes) -> NDArray[np.uint8]:
+        try:
+            return read_bitmap(data)
+        except FrameFormatError as exc:
+            raise FrameFormatError(f"{self.name}: {exc}", source=self.name) from exc
+
+    async def _poll(self, sink: FrameSink) -> None:
+        loop = asyncio.get_running_loop()
+        due, asked_before, last = loop.time(), -math.inf, b""
+        try:
+            while True:
+                asked = time.monotonic()
+                data = await self._read()
+                if data != last:
+                    pixels = await asyncio.to_thread(self._pixels, data)
+                    sink.frame(self._frame(pixels, asked_before))
+                    last = data
+                asked_before = asked
+                due = max(due + 1 / self._rate, loop.time())
+                await asyncio.sleep(due - loop.time())
+        except FrameSourceError as error:
+            sink.ended(error)
+
+    def _frame(self, pixels: NDArray[np.uint8], asked_before: float) -> Frame:
+        now = time.monotonic()
+        self._number += 1
+        height, width = pixels.shape[:2]
+        return Frame(
+            data=pixels.data.toreadonly().cast("B"),
+            format=_format(pixels),
+            width=width,
+            height=height,
+            stride=pixels.nbytes // height,
+            captured=now,
+            utc=time.time(),
+            moment=Moment.ARRIVAL,
+            duration=now - asked_before,
+            sequence=self._number,
+            source=self.name,
+        )
+
+
+def _format(pixels: NDArray[np.uint8]) -> PixelFormat:
+    return find_format("Mono8" if pixels.ndim == 2 else "RGB8")

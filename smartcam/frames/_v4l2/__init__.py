@@ -1,0 +1,1 @@
+"""Video4Linux cameras on the standard library: ioctl, mmap, and the event loop's reader."""

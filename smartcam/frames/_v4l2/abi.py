@@ -1,0 +1,164 @@
+"""The structures and numbers of ``linux/videodev2.h``.
+
+A structure is a :class:`struct.Struct` in the machine's own layout; ``0P`` pads to what a pointer
+is aligned to, as the unions of the header are. An ioctl's number has its structure's size in it, so
+a kernel with another layout refuses it and misreads nothing.
+
+Source: linux/videodev2.h, asm-generic/ioctl.h.
+"""
+
+from __future__ import annotations
+
+from struct import Struct
+from typing import Final, NamedTuple
+
+WRITE: Final = 1
+READ: Final = 2
+
+
+class Ioctl(NamedTuple):
+    """An ioctl.
+
+    Attributes:
+        name: of the header, without its ``VIDIOC_``.
+        number: of the ioctl.
+        layout: of its argument.
+    """
+
+    name: str
+    number: int
+    layout: Struct
+
+
+def _request(name: str, number: int, direction: int, layout: Struct) -> Ioctl:
+    return Ioctl(name, direction << 30 | layout.size << 16 | ord("V") << 8 | number, layout)
+
+
+POINTER: Final = Struct("P").size
+
+_CAPABILITY = Struct("16s32s32sIII12x")
+_FORMAT_DESCRIPTION = Struct("III32sII12x")
+_FORMAT = Struct("I0P12I152x0P")
+_REQUEST_BUFFERS = Struct("IIIIB3x")
+_BUFFER = Struct("IIIII0lll16xII0LI0LI8x0l")
+_INTEGER = Struct("i")
+_PARAMETERS = Struct("I10I160x")
+_CONTROL = Struct("Ii")
+_QUERY_CONTROL = Struct("II32sqqQqIIII4I128x")
+_QUERY_MENU = Struct("=II32s4x")
+_FRAME_SIZE = Struct("III6I8x")
+_FRAME_INTERVAL = Struct("IIIII6I8x")
+
+QUERYCAP: Final = _request("QUERYCAP", 0, READ, _CAPABILITY)
+ENUM_FMT: Final = _request("ENUM_FMT", 2, READ | WRITE, _FORMAT_DESCRIPTION)
+G_FMT: Final = _request("G_FMT", 4, READ | WRITE, _FORMAT)
+S_FMT: Final = _request("S_FMT", 5, READ | WRITE, _FORMAT)
+REQBUFS: Final = _request("REQBUFS", 8, READ | WRITE, _REQUEST_BUFFERS)
+QUERYBUF: Final = _request("QUERYBUF", 9, READ | WRITE, _BUFFER)
+QBUF: Final = _request("QBUF", 15, READ | WRITE, _BUFFER)
+DQBUF: Final = _request("DQBUF", 17, READ | WRITE, _BUFFER)
+STREAMON: Final = _request("STREAMON", 18, WRITE, _INTEGER)
+STREAMOFF: Final = _request("STREAMOFF", 19, WRITE, _INTEGER)
+G_PARM: Final = _request("G_PARM", 21, READ | WRITE, _PARAMETERS)
+S_PARM: Final = _request("S_PARM", 22, READ | WRITE, _PARAMETERS)
+G_CTRL: Final = _request("G_CTRL", 27, READ | WRITE, _CONTROL)
+S_CTRL: Final = _request("S_CTRL", 28, READ | WRITE, _CONTROL)
+QUERYMENU: Final = _request("QUERYMENU", 37, READ | WRITE, _QUERY_MENU)
+ENUM_FRAMESIZES: Final = _request("ENUM_FRAMESIZES", 74, READ | WRITE, _FRAME_SIZE)
+ENUM_FRAMEINTERVALS: Final = _request("ENUM_FRAMEINTERVALS", 75, READ | WRITE, _FRAME_INTERVAL)
+QUERY_EXT_CTRL: Final = _request("QUERY_EXT_CTRL", 103, READ | WRITE, _QUERY_CONTROL)
+
+CAPTURE: Final = 1
+"""V4L2_BUF_TYPE_VIDEO_CAPTURE."""
+
+MEMORY_MMAP: Final = 1
+
+CAP_VIDEO_CAPTURE: Final = 0x00000001
+CAP_VIDEO_CAPTURE_MPLANE: Final = 0x00001000
+CAP_VIDEO_M2M_MPLANE: Final = 0x00004000
+CAP_VIDEO_M2M: Final = 0x00008000
+CAP_META_CAPTURE: Final = 0x00800000
+CAP_STREAMING: Final = 0x04000000
+CAP_DEVICE_CAPS: Final = 0x80000000
+CAP_TIMEPERFRAME: Final = 0x1000
+
+FIELD_NONE: Final = 1
+WHOLE_FIELDS: Final = frozenset((0, FIELD_NONE, 4, 8, 9))
+"""Kinds of ``enum v4l2_field`` whose buffers have all rows in order: any, none, interlaced."""
+
+DISCRETE: Final = 1
+"""V4L2_FRMSIZE_TYPE_DISCRETE and V4L2_FRMIVAL_TYPE_DISCRETE."""
+
+BUF_ERROR: Final = 0x00000040
+TIMESTAMP_MASK: Final = 0x0000E000
+TIMESTAMP_MONOTONIC: Final = 0x00002000
+TIMESTAMP_COPY: Final = 0x00004000
+TSTAMP_SRC_MASK: Final = 0x00070000
+TSTAMP_SRC_EOF: Final = 0x00000000
+TSTAMP_SRC_SOE: Final = 0x00010000
+
+CTRL_INTEGER, CTRL_BOOLEAN, CTRL_MENU, CTRL_BUTTON = 1, 2, 3, 4
+CTRL_BITMASK, CTRL_INTEGER_MENU = 8, 9
+CTRL_DISABLED: Final = 0x0001
+CTRL_READ_ONLY: Final = 0x0004
+CTRL_INACTIVE: Final = 0x0010
+CTRL_WRITE_ONLY: Final = 0x0040
+CTRL_VOLATILE: Final = 0x0080
+CTRL_EXECUTE_ON_WRITE: Final = 0x0200
+CTRL_NEXT: Final = 0x80000000
+
+
+class Capability(NamedTuple):
+    """``struct v4l2_capability``."""
+
+    driver: bytes
+    card: bytes
+    bus_info: bytes
+    version: int
+    capabilities: int
+    device_caps: int
+
+
+class BufferLayout(NamedTuple):
+    """``struct v4l2_format`` of one plane, as far as it is of interest."""
+
+    width: int
+    height: int
+    fourcc: int
+    field: int
+    stride: int
+    size: int
+
+
+FULL_BUFFER: Final = Struct("I4xII4x0lll16xI0l")
+"""Of a buffer that was taken: its place, bytes, flags, seconds, microseconds, and number."""
+
+
+def new_buffer(index: int) -> bytearray:
+    """Return the argument that asks for a buffer, or for any."""
+    argument = bytearray(_BUFFER.size)
+    _BUFFER.pack_into(argument, 0, index, CAPTURE, 0, 0, 0, 0, 0, 0, MEMORY_MMAP, 0, 0)
+    return argument
+
+
+def offset_and_length(argument: bytearray) -> tuple[int, int]:
+    """Return where a buffer is mapped, and its bytes."""
+    offset, length = _BUFFER.unpack(argument)[9:11]
+    return offset, length
+
+
+def text(raw: bytes) -> str:
+    """Return a text of the kernel's; it ends at the first zero."""
+    return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
+
+
+def fourcc(name: str) -> int:
+    """Return four characters as V4L2 counts them; fewer are filled with spaces."""
+    return int.from_bytes(name.ljust(4).encode("latin-1"), "little")
+
+
+def fourcc_text(code: int) -> str:
+    """Return a format's four characters without spaces at the end; ``-BE`` is big endian."""
+    name = (code & 0x7FFFFFFF).to_bytes(4, "little").decode("latin-1").rstrip()
+    shown = "".join(one if one.isprintable() else "?" for one in name)
+    return shown + ("-BE" if code >> 31 else "")

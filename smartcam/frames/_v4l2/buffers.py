@@ -1,0 +1,110 @@
+"""Buffers that a driver writes pictures into: asked for, mapped, queued, and given back."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames._v4l2 import abi, system
+
+if TYPE_CHECKING:
+    import mmap
+
+    from smartcam.frames._v4l2.device import CaptureDevice
+
+LEAST: Final = 2
+"""Buffers: one that is written while another one is read."""
+
+
+_unpack: Final = abi.FULL_BUFFER.unpack_from
+
+
+class Full(NamedTuple):
+    """What was in a buffer.
+
+    Attributes:
+        data: a copy, the only one that is made; of a buffer with an error it is empty.
+        used: bytes that the driver says it wrote.
+        flags: of V4L2.
+        seconds: of its time stamp.
+        sequence: the driver's number of the frame.
+    """
+
+    data: bytes
+    used: int
+    flags: int
+    seconds: float
+    sequence: int
+
+
+class Buffers:
+    """The buffers of a device, which streams from now on.
+
+    Args:
+        device: set to what it is to stream.
+        count: how many are asked for; the driver may give more or fewer.
+
+    Raises:
+        FrameSourceError: it is in use, or has no memory; nothing streams.
+    """
+
+    def __init__(self, device: CaptureDevice, count: int) -> None:
+        self._device = device
+        self._pages: list[mmap.mmap] = []
+        self._argument = abi.new_buffer(0)  # of one call after the other
+        try:
+            given = device.ask(
+                abi.REQBUFS, count, abi.CAPTURE, abi.MEMORY_MMAP, tried="asking for buffers"
+            )[0]
+            if given < LEAST:
+                raise FrameSourceError(
+                    f"{device.path}: expected {LEAST} buffers or more, got {given}",
+                    source=device.path,
+                )
+            for index in range(given):
+                self._prepare(index)
+            device.ask(abi.STREAMON, abi.CAPTURE, tried="starting the stream")
+        except BaseException:
+            self.release()
+            raise
+
+    def __len__(self) -> int:
+        return len(self._pages)
+
+    def take(self) -> Full:
+        """Take the oldest picture that is there out of its buffer; the driver gets the buffer back.
+
+        Raises:
+            BlockingIOError: none is there.
+            OSError: the device is gone, or its driver gave up.
+        """
+        argument, number, ioctl = self._argument, self._device.number, system.ioctl
+        ioctl(number, abi.DQBUF, argument)
+        place, used, flags, seconds, microseconds, sequence = _unpack(argument)
+        data = b"" if flags & abi.BUF_ERROR else self._pages[place][:used]
+        ioctl(number, abi.QBUF, argument)
+        return Full(data, used, flags, seconds + microseconds / 1e6, sequence)
+
+    def release(self) -> None:
+        """Stop the stream and give the buffers back: others may use the device."""
+        with suppress(FrameSourceError):  # the device may be gone
+            self._device.ask(abi.STREAMOFF, abi.CAPTURE)
+        while self._pages:
+            self._pages.pop().close()
+        with suppress(FrameSourceError):
+            self._device.ask(abi.REQBUFS, 0, abi.CAPTURE, abi.MEMORY_MMAP)
+
+    def _prepare(self, index: int) -> None:
+        """Map and queue a buffer."""
+        device = self._device
+        argument = abi.new_buffer(index)
+        try:
+            system.ioctl(device.number, abi.QUERYBUF, argument)
+            offset, length = abi.offset_and_length(argument)
+            self._pages.append(system.pages(device.number, length, offset))
+            system.ioctl(device.number, abi.QBUF, argument)
+        except (OSError, ValueError) as exc:
+            raise FrameSourceError(
+                f"{device.path}: buffer {index}: {exc}", source=device.path
+            ) from exc

@@ -1,0 +1,226 @@
+"""What can be set at a device: exposure, gain, white balance and so on, with their ranges."""
+
+from __future__ import annotations
+
+import errno
+import re
+import sys
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames._v4l2 import abi
+from smartcam.frames._v4l2.device import failure
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.frames._v4l2.device import CaptureDevice
+
+KINDS: Final = {
+    abi.CTRL_INTEGER: "integer",
+    abi.CTRL_BOOLEAN: "boolean",
+    abi.CTRL_MENU: "menu",
+    abi.CTRL_BUTTON: "button",
+    abi.CTRL_BITMASK: "bitmask",
+    abi.CTRL_INTEGER_MENU: "menu",
+}
+"""Types that are known here; 64-bit numbers, texts and structures are not."""
+
+SWITCHES: Final = {"on": 1, "true": 1, "yes": 1, "off": 0, "false": 0, "no": 0}
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceControl:
+    """A control of a device.
+
+    Attributes:
+        name: its label in small letters with underscores: ``white_balance_automatic``.
+        number: V4L2's id.
+        kind: integer, boolean, menu, button or bitmask.
+        least: smallest value.
+        most: largest value.
+        step: between two values.
+        default: as the driver sets it.
+        value: as it is; None: it cannot be read.
+        menu: of a menu: value to label.
+        flags: of V4L2.
+    """
+
+    name: str
+    number: int
+    kind: str
+    least: int
+    most: int
+    step: int
+    default: int
+    value: int | None
+    menu: Mapping[int, str] = field(default_factory=dict[int, str])
+    flags: int = 0
+
+    @property
+    def range(self) -> str:
+        """What it takes, in words."""
+        if self.menu:
+            return ", ".join(f"{value} ({label})" for value, label in self.menu.items())
+        if self.kind == "button":
+            return "anything: it is a button"
+        if self.kind == "boolean":
+            return "0 (off), 1 (on)"
+        if self.kind == "bitmask":
+            return f"bits of {self.most & 0xFFFFFFFF:#x}"
+        step = f" in steps of {self.step}" if self.step > 1 else ""
+        return f"{self.least} to {self.most}{step}"
+
+    def __str__(self) -> str:
+        """Return it as lists and error texts have it."""
+        now = "" if self.value is None else f", now {self.value}"
+        return f"{self.name}: {self.range}; default {self.default}{now}"
+
+    def number_of(self, value: int | str) -> int | None:
+        """Return what the device calls a value; None: it takes no such one."""
+        found = self._read(value)
+        if found is None or self.kind == "button":
+            return found
+        if self.menu:
+            return found if found in self.menu else None
+        if self.kind == "bitmask":
+            return found if 0 <= found <= self.most & 0xFFFFFFFF else None
+        fits = self.least <= found <= self.most and (found - self.least) % max(1, self.step) == 0
+        return found if fits else None
+
+    def _read(self, value: int | str) -> int | None:
+        if not isinstance(value, str):
+            return int(value)
+        said = value.strip()
+        if self.kind == "boolean" and said.lower() in SWITCHES:
+            return SWITCHES[said.lower()]
+        for one, label in self.menu.items():
+            if simple(label) == simple(said) and not said.isdigit():
+                return one
+        try:
+            return int(said, 0)
+        except ValueError:
+            return None
+
+
+def simple(label: str) -> str:
+    """Return a label in small letters, with an underscore for all that is no letter or digit."""
+    return re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
+
+
+def list_controls(device: CaptureDevice) -> dict[str, DeviceControl]:
+    """Return the controls by their names, in the driver's order."""
+    return {name: _control(device, answer) for name, answer in _described(device).items()}
+
+
+def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
+    """Set a control.
+
+    Returns:
+        What the device has it set to.
+
+    Raises:
+        FrameSourceError: there is none of that name, it cannot be set, or takes no such value; it
+            lists what there is.
+    """
+    answer = _described(device).get(simple(name))
+    if answer is None:
+        raise _unknown(device, name)
+    control = _control(device, answer)
+    number = control.number_of(value)
+    if number is None or control.flags & abi.CTRL_READ_ONLY:
+        expected = control.range if number is None else "nothing, since it is read-only"
+        raise _refusal(device, control, f"expected {expected}, got {value!r}")
+    try:
+        device.try_to(abi.S_CTRL, control.number, number & 0xFFFFFFFF)
+    except OSError as exc:
+        raise failure(device.path, f"setting {control.name} to {value!r}", exc) from exc
+    got = _value(device, control.number, control.flags)
+    if got is None or control.kind == "button":
+        return number
+    if got != number and not control.flags & (abi.CTRL_VOLATILE | abi.CTRL_EXECUTE_ON_WRITE):
+        raise _refusal(device, control, f"set to {number}, the device has it at {got}")
+    return got
+
+
+def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
+    """Return the driver's descriptions by name; no value is read, which may take a camera long."""
+    found: dict[str, tuple[Any, ...]] = {}
+    number = 0
+    while True:
+        try:
+            answer = device.try_to(abi.QUERY_EXT_CTRL, number | abi.CTRL_NEXT)
+        except OSError as exc:
+            if exc.errno in (errno.EINVAL, errno.ENOTTY):  # that was the last one
+                return found
+            raise failure(device.path, "listing its controls", exc) from exc
+        if answer[0] <= number:  # a driver that goes in circles
+            return found
+        number = answer[0]
+        if answer[1] in KINDS and not answer[7] & abi.CTRL_DISABLED:
+            found.setdefault(simple(abi.text(answer[2])), answer)
+
+
+def _unknown(device: CaptureDevice, name: str) -> FrameSourceError:
+    controls = list_controls(device)
+    return FrameSourceError(
+        f"{device.path}: no control {name!r}; it has {', '.join(controls) or 'none'}"
+        f"{did_you_mean(simple(name), list(controls))}",
+        source=device.path,
+        available=tuple(map(str, controls.values())),
+    )
+
+
+def _refusal(device: CaptureDevice, control: DeviceControl, text: str) -> FrameSourceError:
+    return FrameSourceError(
+        f"{device.path}: control {control.name}: {text}",
+        source=device.path,
+        available=(str(control),),
+    )
+
+
+def _control(device: CaptureDevice, answer: tuple[Any, ...]) -> DeviceControl:
+    number, kind, label, least, most, step, default, flags = answer[:8]
+    menu: dict[int, str] = {}
+    if KINDS[kind] == "menu":
+        menu = _menu(device, number, kind, range(least, min(most, least + 255) + 1))
+    return DeviceControl(
+        simple(abi.text(label)),
+        number,
+        KINDS[kind],
+        least,
+        most,
+        step,
+        default,
+        _value(device, number, flags),
+        menu,
+        flags,
+    )
+
+
+def _menu(device: CaptureDevice, number: int, kind: int, places: range) -> dict[int, str]:
+    items: dict[int, str] = {}
+    for place in places:
+        try:
+            _, _, raw = device.try_to(abi.QUERYMENU, number, place)
+        except OSError as exc:
+            if exc.errno == errno.EINVAL:  # a menu may have gaps
+                continue
+            raise failure(device.path, "listing a menu", exc) from exc
+        value = int.from_bytes(raw[:8], sys.byteorder, signed=True)
+        items[place] = abi.text(raw) if kind == abi.CTRL_MENU else str(value)
+    return items
+
+
+def _value(device: CaptureDevice, number: int, flags: int) -> int | None:
+    if flags & abi.CTRL_WRITE_ONLY:
+        return None
+    try:
+        value: int = device.try_to(abi.G_CTRL, number)[1]
+    except OSError as exc:
+        if exc.errno == errno.ENODEV:
+            raise failure(device.path, "reading a control", exc) from exc
+        return None
+    return value

@@ -1,0 +1,311 @@
+"""A device that is open: what it is, what it can stream, and its refusals as errors of ours."""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.frames._pixels import PIXEL_FORMATS
+from smartcam.frames._v4l2 import abi, system
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Self
+
+    from smartcam.frames._pixels import PixelFormat
+    from smartcam.frames._v4l2.abi import BufferLayout, Ioctl
+
+
+FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fourcc}
+"""What of V4L2's formats is known here."""
+
+ENOUGH: Final = 512
+"""Answers to one enumeration at most; a driver that goes on is broken."""
+
+NEAR: Final = 0.01
+"""Part of a rate that it may be off: 29.97/s is 30/s to a camera."""
+
+REASONS: Final = {
+    errno.ENOENT: "there is no such device",
+    errno.ENXIO: "there is no such device",
+    errno.ENODEV: "it is gone: unplugged, or its driver was unloaded",
+    errno.EACCES: "not allowed; a member of its group, mostly 'video', may",
+    errno.EPERM: "not allowed; a member of its group, mostly 'video', may",
+    errno.EBUSY: "it is in use by another program",
+    errno.ENOTTY: "it is not a V4L2 device, or its driver cannot do that",
+    errno.ENOSPC: "the bus has no room for so many pictures: take a smaller size or a lower rate",
+    errno.EIO: "the device or its connection failed",
+}
+
+
+def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
+    """Return what a refusal of the system means; it lists the devices that are here."""
+    number = error.errno or 0
+    here = tuple(f"{one} ({name})" for one, name in system.nodes().items())
+    reason = REASONS.get(number, os.strerror(number))
+    shown = f"; here are {', '.join(here)}" if here else "; no video device is here"
+    return FrameSourceError(
+        f"{path}: {tried}: {errno.errorcode.get(number, number)}, {reason}{shown}",
+        source=path,
+        available=here,
+    )
+
+
+class WantedSetting(NamedTuple):
+    """What is asked of a device; None: as it is."""
+
+    format: PixelFormat | None
+    size: tuple[int, int] | None
+    rate: float | None
+
+
+class Setting(NamedTuple):
+    """How a device is set.
+
+    Attributes:
+        format: of the pixels.
+        layout: how they lie in a buffer.
+        rate: frames a second; None: it does not say.
+    """
+
+    format: PixelFormat
+    layout: BufferLayout
+    rate: float | None
+
+
+class CaptureDevice:
+    """An open capture device. All of it may wait for the device, and none of it is asynchronous."""
+
+    def __init__(self, path: str, number: int) -> None:
+        self.path = path
+        self.number = number  # the file descriptor
+        self.capability = abi.Capability(*self.ask(abi.QUERYCAP))
+
+    @classmethod
+    def open(cls, path: str) -> Self:
+        """Open a device that captures pictures.
+
+        Raises:
+            FrameSourceError: there is none, it is none, or it is not allowed.
+        """
+        try:
+            number = system.open(path)
+        except OSError as exc:
+            raise failure(path, "opening it", exc) from exc
+        try:
+            device = cls(path, number)
+            device._check()
+        except BaseException:
+            system.close(number)
+            raise
+        return device
+
+    def close(self) -> None:
+        """Give it back."""
+        system.close(self.number)
+
+    @property
+    def identity(self) -> tuple[str, str]:
+        """Name and place of the device; another one has another."""
+        return abi.text(self.capability.card), abi.text(self.capability.bus_info)
+
+    def ask(self, request: Ioctl, *fields: object, tried: str = "") -> tuple[Any, ...]:
+        """Return the driver's answer; fields that are not given are 0.
+
+        Raises:
+            FrameSourceError: it refuses.
+        """
+        try:
+            return self.try_to(request, *fields)
+        except OSError as exc:
+            raise failure(self.path, tried or request.name, exc) from exc
+
+    def try_to(self, request: Ioctl, *fields: object) -> tuple[Any, ...]:
+        """Return the driver's answer, or raise its OSError."""
+        layout = request.layout
+        argument = bytearray(layout.size)
+        # the fields that are asked with stand in front, each of 32 bits
+        struct.pack_into(f"{len(fields)}I", argument, 0, *fields)
+        system.ioctl(self.number, request, argument)
+        return layout.unpack(argument)
+
+    def enumerate(self, request: Ioctl, *fields: object) -> Iterator[tuple[Any, ...]]:
+        """Return what the driver counts up; nothing where it does not."""
+        for index in range(ENOUGH):
+            try:
+                yield self.try_to(request, index, *fields)
+            except OSError as exc:
+                if exc.errno in (errno.EINVAL, errno.ENOTTY):
+                    return
+                raise failure(self.path, request.name, exc) from exc
+
+    # what it can
+
+    def formats(self) -> list[int]:
+        """Return the fourcc of each format that it can stream."""
+        return [answer[4] for answer in self.enumerate(abi.ENUM_FMT, abi.CAPTURE)]
+
+    def sizes(self, code: int) -> list[tuple[int, int]]:
+        """Return the sizes of a format; of steps the smallest and the largest."""
+        found: list[tuple[int, int]] = []
+        for _, _, kind, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
+            if kind == abi.DISCRETE:
+                found.append((numbers[0], numbers[1]))
+            else:
+                return [(numbers[0], numbers[3]), (numbers[1], numbers[4])]
+        return found
+
+    def size_texts(self, code: int) -> list[str]:
+        """Return the sizes of a format in words."""
+        for _, _, kind, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
+            if kind != abi.DISCRETE:
+                least, most = f"{numbers[0]}x{numbers[3]}", f"{numbers[1]}x{numbers[4]}"
+                return [f"{least} to {most} in steps of {numbers[2]}x{numbers[5]}"]
+            break
+        return [f"{width}x{height}" for width, height in self.sizes(code)]
+
+    def rates(self, code: int, width: int, height: int) -> list[float]:
+        """Return the frames a second, fastest first; of steps the fastest and the slowest."""
+        found: list[float] = []
+        asked = self.enumerate(abi.ENUM_FRAMEINTERVALS, code, width, height)
+        for _, _, _, _, kind, *numbers in asked:
+            last = 2 if kind == abi.DISCRETE else 4
+            found += [
+                numbers[place + 1] / numbers[place]
+                for place in range(0, last, 2)
+                if numbers[place] and numbers[place + 1]
+            ]
+            if kind != abi.DISCRETE:
+                break
+        return sorted(found, reverse=True)
+
+    # what it is set to
+
+    def set(self, wanted: WantedSetting) -> Setting:
+        """Set the device so, and see that it did it.
+
+        Raises:
+            FrameFormatError: it took another format, size or rate; it lists what there is.
+            FrameSourceError: it is in use.
+        """
+        current = self._layout(self.ask(abi.G_FMT, abi.CAPTURE, tried="reading its format"))
+        code = self._code(wanted.format, current.fourcc)
+        width, height = wanted.size or (current.width, current.height)
+        layout = self._layout(
+            self.ask(
+                abi.S_FMT, abi.CAPTURE, *self._padding(), width, height, code, abi.FIELD_NONE,
+                tried="setting its format",
+            )
+        )  # fmt: skip
+        self._compare(code, wanted.size, layout)
+        return Setting(FORMATS[code], layout, self._rate(wanted.rate, layout))
+
+    def _check(self) -> None:
+        """See that it captures pictures in a way that is known here."""
+        one = self.capability
+        does = one.device_caps if one.capabilities & abi.CAP_DEVICE_CAPS else one.capabilities
+        if does & abi.CAP_VIDEO_CAPTURE and does & abi.CAP_STREAMING:
+            return
+        kind = next(
+            (name for bit, name in _OTHER_KINDS.items() if does & bit),
+            "no camera: it captures no pictures, or gives none by streaming",
+        )
+        here = tuple(f"{path} ({name})" for path, name in system.nodes().items())
+        raise FrameSourceError(
+            f"{self.path}: expected a camera, got {self.identity[0]!r}, which is {kind}; "
+            f"here are {', '.join(here)}",
+            source=self.path,
+            available=here,
+        )
+
+    @staticmethod
+    def _padding() -> tuple[int, ...]:
+        return (0,) * (abi.POINTER // 4 - 1)
+
+    @staticmethod
+    def _layout(answer: tuple[Any, ...]) -> BufferLayout:
+        return abi.BufferLayout(*answer[1:7])
+
+    def _code(self, wanted: PixelFormat | None, current: int) -> int:
+        """Return the fourcc that is to be streamed."""
+        if wanted is None:
+            known = [one for one in (current, *self.formats()) if one in FORMATS]
+        else:
+            known = [abi.fourcc(wanted.fourcc)] if wanted.fourcc else []
+        if not known:
+            raise self._no_format("a format that is known here" if wanted is None else wanted.name)
+        return known[0]
+
+    def _no_format(self, expected: str) -> FrameFormatError:
+        there = tuple(_named(one) for one in self.formats())
+        return FrameFormatError(
+            f"{self.path}: expected {expected}, it has {', '.join(there) or 'none'}",
+            source=self.path,
+            available=there,
+        )
+
+    def _compare(self, code: int, size: tuple[int, int] | None, got: BufferLayout) -> None:
+        """See that the device took what it was asked for."""
+        if got.fourcc != code:
+            raise self._no_format(_named(code))
+        if size is not None and size != (got.width, got.height):
+            there = tuple(self.size_texts(code))
+            raise FrameFormatError(
+                f"{self.path}: expected {_named(code)} {size[0]}x{size[1]}, the device took "
+                f"{got.width}x{got.height}; it has {', '.join(there) or 'what it does not say'}",
+                source=self.path,
+                available=there,
+            )
+        if got.field not in abi.WHOLE_FIELDS:
+            raise FrameFormatError(
+                f"{self.path}: expected whole pictures, it has fields (kind {got.field}), half "
+                "the rows each",
+                source=self.path,
+            )
+
+    def _rate(self, wanted: float | None, layout: BufferLayout) -> float | None:
+        """Set the rate, where one is wanted; return what it is."""
+        try:
+            _, can, _, over, under, *_ = self.try_to(abi.G_PARM, abi.CAPTURE)
+            if wanted is not None and can & abi.CAP_TIMEPERFRAME:
+                period = 1 / Fraction(wanted).limit_denominator(1001)
+                _, can, _, over, under, *_ = self.try_to(
+                    abi.S_PARM, abi.CAPTURE, 0, 0, period.numerator, period.denominator
+                )
+        except OSError as exc:
+            if exc.errno not in (errno.ENOTTY, errno.EINVAL):
+                raise failure(self.path, "setting its rate", exc) from exc
+            can = over = under = 0
+        got = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
+        if wanted is not None and (got is None or abs(got - wanted) > wanted * NEAR):
+            there = tuple(
+                f"{one:g}/s" for one in self.rates(layout.fourcc, layout.width, layout.height)
+            )
+            raise FrameFormatError(
+                f"{self.path}: expected {wanted:g} frames/s of {_named(layout.fourcc)} "
+                f"{layout.width}x{layout.height}, the device took "
+                f"{'none that it tells' if got is None else f'{got:g}'}; it has "
+                f"{', '.join(there) or 'what it does not say'}",
+                source=self.path,
+                available=there,
+            )
+        return got
+
+
+_OTHER_KINDS: Final = {
+    abi.CAP_VIDEO_M2M: "a codec",
+    abi.CAP_VIDEO_M2M_MPLANE: "a codec",
+    abi.CAP_VIDEO_CAPTURE_MPLANE: "a camera with pictures of several planes in as many buffers, "
+    "which is not supported",
+    abi.CAP_META_CAPTURE: "the metadata of a camera; its pictures are at another device",
+}
+
+
+def _named(code: int) -> str:
+    known = FORMATS.get(code)
+    name = abi.fourcc_text(code)
+    return name if known is None or known.name == name else f"{known.name} ({name})"

@@ -1,0 +1,50 @@
+"""The cameras that are here."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames._driver import FoundSource, StreamFormat
+from smartcam.frames._v4l2 import abi, system
+from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def find() -> list[FoundSource]:
+    """Return a source for each video device, with what keeps one from being opened.
+
+    Metadata, codecs and the like are left out: their pictures are elsewhere, or there are none.
+    """
+    found = [_look(path, name) for path, name in system.nodes().items()]
+    return [one for one in found if one is not None]
+
+
+def _look(path: str, name: str) -> FoundSource | None:
+    url = f"v4l2://{path}"
+    try:
+        device = CaptureDevice.open(path)
+    except FrameSourceError as exc:
+        cause = exc.__cause__
+        if cause is None:  # it opened, and is no camera
+            return None
+        return FoundSource(url, name, remark=str(exc))
+    with closing(device):
+        try:
+            formats = device.formats()
+            known = tuple(one for code in formats for one in _formats(device, code))
+        except FrameSourceError as exc:
+            return FoundSource(url, name, remark=str(exc))
+    others = [abi.fourcc_text(code) for code in formats if code not in FORMATS]
+    remark = f"also has {', '.join(others)}, not known here" if others else ""
+    return FoundSource(url, device.identity[0], known, remark)
+
+
+def _formats(device: CaptureDevice, code: int) -> Iterator[StreamFormat]:
+    known = FORMATS.get(code)
+    if known is not None:
+        for width, height in device.sizes(code):
+            yield StreamFormat(known, width, height, tuple(device.rates(code, width, height)))

@@ -1,0 +1,234 @@
+"""Cameras of Video4Linux."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from typing import TYPE_CHECKING, Final, TypeVar
+from urllib.parse import parse_qsl
+
+from smartcam.exceptions import FrameSourceError, LocalProtocolError
+from smartcam.frames._driver import FrameDriver, StreamFormat
+from smartcam.frames._pixels import find_format
+from smartcam.frames._v4l2.controls import list_controls, set_control
+from smartcam.frames._v4l2.device import CaptureDevice, WantedSetting
+from smartcam.frames._v4l2.discovery import find
+from smartcam.frames._v4l2.stream import CaptureStream
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.frames._address import FrameAddress
+    from smartcam.frames._driver import FoundSource, FrameSink
+    from smartcam.frames._v4l2.controls import DeviceControl
+    from smartcam.frames._v4l2.device import Setting
+
+Value = TypeVar("Value")
+
+ANSWER: Final = 10.0
+"""Seconds for a device to be opened, set and started; the slowest cameras take one or two."""
+
+CONTROL: Final = "control."
+"""What parameters that set a control begin with."""
+
+
+class V4L2Driver(FrameDriver):
+    """A camera of the Linux kernel: ``v4l2:///dev/video0?format=YUYV&size=640x480&fps=30``.
+
+    What the URL does not say stays as the device has it. What it says and the device does not
+    take is a :exc:`~smartcam.FrameFormatError` that lists what it has.
+
+    - the path: of the device; ``/dev/v4l/by-id/...`` is the same camera at any port.
+    - ``format``: of the pixels, by its name in PFNC or V4L2.
+    - ``size``: ``WIDTHxHEIGHT``, pixels.
+    - ``fps``: frames a second.
+    - ``buffers``: 2 to 32 that the driver writes into; 4.
+    - ``control.NAME``: sets a control, in the order of the URL, as often as the device is started:
+      ``control.brightness=10``, ``control.power_line_frequency=50_hz``. The name is its label in
+      small letters with underscores, the value a number, a menu's label, or ``on`` and ``off``.
+
+    ``source.driver`` has :meth:`controls` and :meth:`set_control` for the time in between.
+
+    While nothing is read from it, the device is closed: another program can use it. Each frame's
+    bytes are copied out of the driver's buffer once. One that is replaced before a reader took it
+    has been copied, too: to know that before, buffers would have to be kept from the driver, which
+    then had fewer to write into.
+
+    All that may wait for the device runs in a thread of its own; the event loop only takes full
+    buffers out.
+    """
+
+    def __init__(self, address: FrameAddress) -> None:
+        super().__init__(address)
+        controls = [
+            name
+            for name, _ in parse_qsl(address.query, keep_blank_values=True)
+            if name.startswith(CONTROL) and name != CONTROL
+        ]
+        known = ["format", "size", "fps", "buffers"]
+        said = address.parameters([*known, *(controls or [f"{CONTROL}NAME"])])
+        self._path = address.path
+        if address.host or self._path in ("", "/"):
+            raise address.wrong("path", "a device, as in v4l2:///dev/video0", address.shown)
+        self._wanted = WantedSetting(
+            find_format(said["format"]) if "format" in said else None,
+            address.size(said["size"]) if "size" in said else None,
+            address.number("fps", said["fps"], 0.001, 100_000) if "fps" in said else None,
+        )
+        buffers = address.number("buffers", said.get("buffers", "4"), 2, 32)
+        if buffers != int(buffers):
+            raise address.wrong("buffers", "a whole number", said["buffers"])
+        self._buffers = int(buffers)
+        self._controls = {
+            name.removeprefix(CONTROL): said[name] for name in controls if name in said
+        }
+        self._identity: tuple[str, str] | None = None
+        self._stream: CaptureStream | None = None  # the thread's, but for taking frames out
+        self._watched: int | None = None
+        self._thread: ThreadPoolExecutor | None = None
+
+    @classmethod
+    async def discover(cls) -> list[FoundSource]:
+        """Return the cameras that are here, with their formats."""
+        thread = ThreadPoolExecutor(1, "v4l2")
+        try:
+            return await asyncio.get_running_loop().run_in_executor(thread, find)
+        finally:
+            thread.shutdown(wait=False)
+
+    async def open(self) -> StreamFormat:
+        """See that the device is there and does what the URL says."""
+        self._thread = ThreadPoolExecutor(1, f"v4l2 {self._path}")
+        return await self._do(self._try, "be opened")
+
+    async def start(self, sink: FrameSink) -> None:
+        """Open the device and have it stream."""
+        stream = await self._do(self._begin, "start")
+        self._watched = stream.device.number
+        asyncio.get_running_loop().add_reader(self._watched, self._ready, stream, sink)
+
+    async def stop(self) -> None:
+        """Stop the stream; the device is closed."""
+        self._unwatch()
+        if self._thread is not None:
+            await self._do(self._end, "stop")
+
+    async def close(self) -> None:
+        """Have neither device nor thread left."""
+        try:
+            await self.stop()
+        finally:
+            thread, self._thread = self._thread, None
+            if thread is not None:
+                thread.shutdown(wait=False)
+
+    async def controls(self) -> dict[str, DeviceControl]:
+        """Return what can be set at the device, by name.
+
+        Raises:
+            FrameSourceError: it is not there.
+        """
+        return await self._do(lambda: self._with_device(list_controls), "list its controls")
+
+    async def set_control(self, name: str, value: int | str) -> int:
+        """Set a control now; the URL's are set again when the device starts anew.
+
+        Returns:
+            What the device has it set to.
+
+        Raises:
+            FrameSourceError: there is none of that name, or it takes no such value; it lists what
+                there is, with the range.
+        """
+        return await self._do(
+            lambda: self._with_device(lambda device: set_control(device, name, value)),
+            f"set {name}",
+        )
+
+    # in the event loop
+
+    def _ready(self, stream: CaptureStream, sink: FrameSink) -> None:
+        try:
+            stream.drain(sink)
+        except FrameSourceError as exc:
+            self._unwatch()
+            sink.ended(exc)
+
+    def _unwatch(self) -> None:
+        watched, self._watched = self._watched, None
+        if watched is not None:
+            asyncio.get_running_loop().remove_reader(watched)
+
+    async def _do(self, job: Callable[[], Value], what: str) -> Value:
+        """Have the thread do something, after all that it was given before.
+
+        Cancellation: it is done all the same, and what it leaves the next :meth:`stop` ends.
+        """
+        if self._thread is None:
+            raise LocalProtocolError(f"{self.name} is not open: async with it")
+        done = asyncio.get_running_loop().run_in_executor(self._thread, job)
+        done.add_done_callback(_heard)
+        finished, _ = await asyncio.wait([done], timeout=ANSWER)
+        if not finished:
+            raise FrameSourceError(
+                f"{self.name}: it was to {what}, and did not answer within {ANSWER:g} s",
+                source=self.name,
+            )
+        return done.result()
+
+    # in the thread
+
+    def _try(self) -> StreamFormat:
+        with closing(CaptureDevice.open(self._path)) as device:
+            setting = self._set(device)
+            self._identity = device.identity
+        rates = () if setting.rate is None else (setting.rate,)
+        size = (setting.layout.width, setting.layout.height)
+        self._wanted = WantedSetting(setting.format, size, self._wanted.rate)  # so it stays
+        return StreamFormat(setting.format, *size, rates)
+
+    def _begin(self) -> CaptureStream:
+        device = CaptureDevice.open(self._path)
+        try:
+            if device.identity != self._identity:
+                raise self._another(device)
+            setting = self._set(device)
+            self._stream = CaptureStream(device, setting, self._buffers, self.name)
+        except BaseException:
+            device.close()
+            raise
+        return self._stream
+
+    def _end(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+
+    def _set(self, device: CaptureDevice) -> Setting:
+        for name, value in self._controls.items():
+            set_control(device, name, value)
+        return device.set(self._wanted)
+
+    def _with_device(self, job: Callable[[CaptureDevice], Value]) -> Value:
+        if self._stream is not None:
+            return job(self._stream.device)
+        with closing(CaptureDevice.open(self._path)) as device:
+            return job(device)
+
+    def _another(self, device: CaptureDevice) -> FrameSourceError:
+        expected, got = (
+            "nothing" if one is None else " at ".join(one)
+            for one in (self._identity, device.identity)
+        )
+        return FrameSourceError(
+            f"{self.name}: expected {expected}, which was there when it was opened, got {got}",
+            source=self.name,
+            available=(got,),
+        )
+
+
+def _heard(done: asyncio.Future[Value]) -> None:
+    """Take the error of a job that nobody waits for any longer."""
+    if not done.cancelled():
+        done.exception()

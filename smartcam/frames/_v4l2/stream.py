@@ -1,0 +1,141 @@
+"""A device that streams: full buffers become frames, and what is wrong with them is counted."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.frames._frame import Frame
+from smartcam.frames._v4l2 import abi, system
+from smartcam.frames._v4l2.buffers import Buffers
+from smartcam.frames._v4l2.device import failure
+from smartcam.frames._v4l2.stamps import BufferStamps
+
+if TYPE_CHECKING:
+    from smartcam.frames._driver import FrameSink
+    from smartcam.frames._v4l2.buffers import Full
+    from smartcam.frames._v4l2.device import CaptureDevice, Setting
+
+BAD_IN_A_ROW: Final = 30
+"""Buffers without a picture after which the stream ends: there is no use in waiting."""
+
+EMPTY_IN_A_ROW: Final = 1000
+"""Times that the system says a buffer is full, and none is; then it would say so for ever."""
+
+HALF: Final = 1 << 31
+"""Of the numbers of frames, which are of 32 bits: more than that onwards is backwards."""
+
+
+class CaptureStream:
+    """The frames of a device that was set.
+
+    Args:
+        device: set, and this stream's from now on.
+        setting: of the device.
+        buffers: how many to ask for.
+        name: of the camera.
+
+    Raises:
+        FrameSourceError: it does not stream; the device is still the caller's.
+    """
+
+    def __init__(self, device: CaptureDevice, setting: Setting, buffers: int, name: str) -> None:
+        self.device = device
+        self._name = name
+        layout = setting.layout
+        period = None if setting.rate is None else 1 / setting.rate
+        self._format, self._width, self._height = setting.format, layout.width, layout.height
+        self._stride = 0 if setting.format.compressed else layout.stride
+        self._least = (
+            1
+            if setting.format.compressed
+            else setting.format.size(layout.width, layout.height, layout.stride)
+        )
+        self._stamps = BufferStamps(name, period, system.now())
+        self._buffers = Buffers(device, buffers)
+        self._sequence: int | None = None  # the driver's number of the last frame
+        self._number = 0
+        self._bad = self._empty = 0
+
+    def close(self) -> None:
+        """Stop it, and give buffers and device back."""
+        self._buffers.release()
+        self.device.close()
+
+    def drain(self, sink: FrameSink) -> None:
+        """Give all frames to the sink that are there.
+
+        Raises:
+            FrameSourceError: nothing more will come.
+        """
+        for _ in range(len(self._buffers)):
+            try:
+                full = self._buffers.take()
+            except BlockingIOError:
+                self._stamps.queue_is_empty(system.now())
+                self._none_was_there()
+                return
+            except OSError as exc:
+                raise failure(self._name, "taking a picture", exc) from exc
+            self._empty = 0
+            frame = self._frame(full, sink)
+            if frame is not None:
+                sink.frame(frame)
+                if self._stamps.is_newest:
+                    return
+
+    def _frame(self, full: Full, sink: FrameSink) -> Frame | None:
+        """Return what was in a buffer as a frame; what is none counts as lost."""
+        steps = self._steps(full.sequence)
+        if len(full.data) < self._least:
+            sink.lost(steps)
+            self._bad += 1
+            if self._bad >= BAD_IN_A_ROW:
+                raise self._no_pictures(full)
+            return None
+        self._bad = 0
+        now, utc = system.now(), time.time()
+        stamp = self._stamps.read(full.seconds, full.flags, self._number, now)
+        return Frame(
+            data=full.data,
+            format=self._format,
+            width=self._width,
+            height=self._height,
+            stride=self._stride,
+            captured=stamp.captured,
+            utc=utc - (now - stamp.captured),
+            moment=stamp.moment,
+            duration=stamp.duration,
+            device_time=stamp.device_time,
+            sequence=self._number,
+            lost=steps - 1,
+            source=self._name,
+        )
+
+    def _none_was_there(self) -> None:
+        self._empty += 1
+        if self._empty > EMPTY_IN_A_ROW:
+            raise FrameSourceError(
+                f"{self._name}: its driver says that a picture is there, and gives none",
+                source=self._name,
+            )
+
+    def _steps(self, sequence: int) -> int:
+        """Return how many frames on it is; a driver that does not count has none lost."""
+        last, self._sequence = self._sequence, sequence
+        if last is None:
+            self._number = sequence
+            return 1
+        steps = (sequence - last) % (2 * HALF)
+        steps = steps if 0 < steps < HALF else 1
+        self._number += steps
+        return steps
+
+    def _no_pictures(self, full: Full) -> FrameFormatError:
+        came = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
+        return FrameFormatError(
+            f"{self._name}: expected {self._format.name} {self._width}x{self._height}, "
+            f"{self._least} bytes or more, got {came} {self._bad} times in a row",
+            source=self._name,
+        )

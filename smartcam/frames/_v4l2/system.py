@@ -1,0 +1,59 @@
+"""What is asked of the system, in one place: tests answer in its stead."""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from smartcam.frames._v4l2.abi import Ioctl
+
+
+SYSFS: Final = Path("/sys/class/video4linux")
+
+
+def open(path: str) -> int:
+    """Open a device; no call on it will wait."""
+    return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+
+
+def close(device: int) -> None:
+    """Close a device."""
+    os.close(device)
+
+
+def ioctl(device: int, request: Ioctl, argument: bytearray) -> None:
+    """Ask the driver; its answer stands in ``argument``."""
+    while True:
+        try:
+            fcntl.ioctl(device, request.number, argument)
+        except InterruptedError:  # by a signal, before anything was done
+            continue
+        return
+
+
+def pages(device: int, length: int, offset: int) -> mmap.mmap:
+    """Map a buffer of the driver; a slice of it is a copy."""
+    return mmap.mmap(device, length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset)
+
+
+def nodes() -> dict[str, str]:
+    """Return the video devices that are here, path to name; none is opened."""
+    found = sorted(SYSFS.glob("video*"), key=lambda one: (len(one.name), one.name))
+    return {f"/dev/{one.name}": _name(one) for one in found}
+
+
+def now() -> float:
+    """Return the time of the clock that drivers stamp with, seconds."""
+    return time.clock_gettime(time.CLOCK_MONOTONIC)
+
+
+def _name(folder: Path) -> str:
+    try:
+        return (folder / "name").read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:  # it is just going
+        return ""

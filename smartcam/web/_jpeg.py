@@ -1,0 +1,108 @@
+"""A frame as people look at it: its colours, at 8 bits, as a JPEG."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames._layouts import Planes, YuvPairs
+from smartcam.frames._optional_imports import load
+from smartcam.frames._pictures import decoded, to_jpeg, with_pixels
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.frames import Frame
+
+START: Final = b"\xff\xd8"
+TABLES: Final = b"\xff\xc4"
+"""Marker of a JPEG's Huffman tables; many a webcam leaves them out, and few programs read that."""
+
+HEAD: Final = 4096
+"""Bytes in which the tables are looked for: they stand in front of the picture."""
+
+READY: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
+"""Formats that become a JPEG without being made another one first; those of Y, U and V do, too."""
+
+
+def jpeg(frame: Frame, quality: int) -> bytes:
+    """Return a frame as a JPEG; one that is a whole JPEG already as it came, its quality too.
+
+    More than 8 bits are scaled, so that the brightest pixel becomes white: to be looked at.
+
+    Args:
+        frame: it; it takes milliseconds, and belongs into a thread.
+        quality: 1 to 100.
+
+    Raises:
+        FrameFormatError: its bytes are wrong, or a JPEG cannot be so large.
+        MissingExtraError: what reads or makes it is not installed.
+    """
+    if is_whole_jpeg(frame):
+        return bytes(frame.data)
+    if not _is_ready(frame):
+        return encoded(frame, stretched(picture(frame)), quality)
+    return _jpeg(frame, quality)
+
+
+def encoded(frame: Frame, pixels: NDArray[np.uint8], quality: int) -> bytes:
+    """Return pixels of a frame, (H, W) or (H, W, 3) with red first, as a JPEG.
+
+    Raises:
+        FrameFormatError: a JPEG cannot be so large.
+        MissingExtraError: the extra ``frames`` is not installed.
+    """
+    return _jpeg(with_pixels(frame, pixels, "Mono8" if pixels.ndim == 2 else "RGB8"), quality)
+
+
+def require_encoder() -> None:
+    """See that JPEGs can be made.
+
+    Raises:
+        MissingExtraError: the extra ``frames`` is not installed.
+    """
+    load("simplejpeg")
+
+
+def is_whole_jpeg(frame: Frame) -> bool:
+    """Tell whether a frame came as a JPEG that any program can read."""
+    head = bytes(frame.data[:HEAD])
+    return frame.format.name == "MJPEG" and head.startswith(START) and TABLES in head
+
+
+def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
+    """Return what is to be seen: (H, W, 3), red first; (H, W) where there is no colour.
+
+    Raises:
+        FrameFormatError: its bytes are wrong, or it has no brightness, which ``grey`` asks for.
+        MissingExtraError: a compressed format or a Bayer pattern, and its codec is not installed.
+    """
+    if frame.format.name in {"PNG", "JPEGXL"}:
+        frame = decoded(frame, "")
+    if frame.format.name.startswith("Coord3D") and not grey:
+        return frame.array()
+    return frame.grey() if grey or frame.format.name.startswith("Mono") else frame.rgb()
+
+
+def stretched(levels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return levels of 8 bits; of more the brightest becomes 255."""
+    if levels.dtype == np.uint8:
+        return levels
+    top = max(1, int(levels.max()))
+    return (levels.astype(np.uint32) * 255 // top).astype(np.uint8)
+
+
+def _is_ready(frame: Frame) -> bool:
+    return frame.format.name in READY or isinstance(frame.format.layout, YuvPairs | Planes)
+
+
+def _jpeg(frame: Frame, quality: int) -> bytes:
+    try:
+        return bytes(to_jpeg(frame, quality).data)
+    except ValueError as exc:
+        raise FrameFormatError(
+            f"{frame.source}: no JPEG of {frame.width}x{frame.height} pixels: {exc}",
+            source=frame.source,
+        ) from exc

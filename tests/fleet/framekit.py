@@ -1,0 +1,75 @@
+"""What tests of a fleet's frames share: a device that does what a test says, at an agent."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Any
+
+from smartcam.fleet import FleetCamera
+from smartcam.fleet._frames import SharedFrames
+from smartcam.frames import FrameSource
+from tests.fleet.fleetkit import NAME, Plant, until
+from tests.frames.drivers import ScriptedDriver, frame
+from tests.timed_loop import TimedLoop
+
+
+class FramePlant(Plant):
+    """A plant whose camera has frames, those that a test gives; on the bus that the mark says.
+
+    Args:
+        source: options of the frames' source.
+        **options: as a plant has them.
+
+    Attributes:
+        driver: the device.
+    """
+
+    def __init__(self, source: dict[str, Any] | None = None, **options: Any) -> None:
+        self.driver = ScriptedDriver()
+        self._source = source or {}
+        options.setdefault("zenoh", not isinstance(asyncio.get_running_loop(), TimedLoop))
+        super().__init__(frames=self._make, **options)
+
+    def _make(self) -> FrameSource:
+        return FrameSource(self.driver, **self._source)
+
+    @property
+    def shared(self) -> SharedFrames:
+        """The frames at the agent."""
+        return self.agent.hosts[NAME].frames
+
+    @contextlib.asynccontextmanager
+    async def streaming(self, every: float = 0.02, **other: Any) -> AsyncIterator[None]:
+        """Have the device give numbered frames whenever it streams."""
+        giving = asyncio.create_task(self._give(every, other))
+        try:
+            yield
+        finally:
+            giving.cancel()
+            await asyncio.wait([giving])
+
+    async def _give(self, every: float, other: dict[str, Any]) -> None:
+        number = 0
+        while True:
+            await asyncio.sleep(every)
+            if self.driver.sink is not None:
+                number += 1
+                self.driver.give(frame(number, **other))
+
+    async def waits(self) -> None:
+        """Wait until a program waits for the next frame."""
+        await until(
+            lambda: (
+                self.driver.sink is not None
+                and any(one.busy for one in self.shared._viewers.values())
+            )
+        )
+
+
+@contextlib.asynccontextmanager
+async def looking(**options: Any) -> AsyncIterator[tuple[FramePlant, FleetCamera[Any]]]:
+    """Give a plant whose camera has frames, and a program's camera."""
+    async with FramePlant(**options) as plant, plant.camera() as camera:
+        yield plant, camera

@@ -1,0 +1,242 @@
+"""The page of pictures in a real browser."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import pytest_asyncio
+
+import smartcam.frames
+from smartcam.frames._synthetic import read_stamp, stripes, write_stamp
+from smartcam.web import FramesSite
+from tests.frames.drivers import GoneError, frame, scripted
+from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
+from tests.web.sitekit import TOKEN, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    from playwright.async_api import Page
+
+    from smartcam.frames import Frame, FrameSource
+    from tests.frames.drivers import ScriptedDriver
+
+pytestmark = BROWSER_MARKS
+
+LIVE = "#live[data-state=live]"
+HIDE = """
+hidden => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
+  document.dispatchEvent(new Event("visibilitychange"));
+}
+"""
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def page() -> AsyncIterator[Page]:
+    """The one page of all tests; each opens a site of its own in it."""
+    async with new_page(1280, 800) as page:
+        yield page
+
+
+async def see(page: Page, selector: str, text: str = "") -> None:
+    """Wait until something is to be seen, with a text."""
+    await page.locator(selector).filter(has_text=text).first.wait_for()
+
+
+@contextlib.asynccontextmanager
+async def opened(
+    page: Page, sources: Sequence[FrameSource], *, token: str | None = None
+) -> AsyncIterator[FramesSite]:
+    """Show sources; what the browser finds wrong with the page fails the test."""
+    with nothing_wrong(page):
+        async with FramesSite(sources, token=token) as site:
+            await page.goto(site.url)
+            await see(page, LIVE)
+            yield site
+            await page.goto("about:blank")
+
+
+@contextlib.asynccontextmanager
+async def scripted_on(page: Page) -> AsyncIterator[tuple[ScriptedDriver, FrameSource]]:
+    """Show a source whose device does what the test says."""
+    driver, source = scripted(stall=None)
+    async with source, opened(page, [source]):
+        await driver.streams()
+        yield driver, source
+
+
+def stamped(number: int, **other: Any) -> Frame:
+    picture = stripes(320, 240)
+    write_stamp(picture, number, 1)
+    about = {"data": picture.tobytes(), "width": 320, "height": 240, "stride": 320}
+    return frame(number, **(about | other))
+
+
+async def shown(page: Page, place: int = 0) -> int | None:
+    """Return the number that is drawn into the picture on the page."""
+    pixels = await page.eval_on_selector(
+        f"[data-place='{place}'] canvas",
+        "c => [c.width, c.height, Array.from(c.getContext('2d')"
+        ".getImageData(0, 0, c.width, 16).data)]",
+    )
+    width, height, data = pixels
+    assert (width, height) == (320, 240)
+    found = read_stamp(np.array(data, np.uint8).reshape(16, width, 4)[..., 0])
+    return None if found is None else found[0]
+
+
+async def test_newest_frame_is_shown_with_its_account(page: Page) -> None:
+    async with scripted_on(page) as (driver, _):
+        driver.give(stamped(41))
+        await see(page, "[data-count=number]", "41")
+        assert await shown(page) == 41
+        driver.give(stamped(42, lost=2))
+        await see(page, "[data-count=number]", "42")
+        assert await shown(page) == 42
+        assert await page.inner_text("[data-count=format]") == "Mono8 320x240"
+        assert await page.inner_text("[data-count=lost]") == "2"
+        assert "ms" in await page.inner_text("[data-count=age]")
+        assert (
+            await page.get_attribute("[data-count=age]", "title") == "since the start of exposure"
+        )
+
+
+async def test_rates_and_skips_add_up(page: Page) -> None:
+    async with (
+        smartcam.frames.open("synthetic://?fps=50&size=320x240") as source,
+        opened(page, [source]) as site,
+    ):
+        await see(page, "[data-count=shown]", "/s")
+        await until(lambda: source.statistics().frames > 50, PATIENCE)
+        assert float((await page.inner_text("[data-count=shown]")).removesuffix("/s")) > 0
+        assert float((await page.inner_text("[data-count=camera]")).removesuffix("/s")) > 0
+        assert len(site.viewers) == 1
+
+
+async def test_frame_that_grows_old_is_said_to_be_so(page: Page) -> None:
+    async with scripted_on(page) as (driver, _):
+        driver.give(stamped(1))
+        await see(page, "[data-count=age].warn", "not fresh")
+        await see(page, ".source.old")
+        driver.give(stamped(2))
+        await page.locator(".source:not(.old)").wait_for()
+
+
+async def test_source_that_dies_is_said_and_comes_back(page: Page) -> None:
+    async with scripted_on(page) as (driver, _):
+        driver.give(stamped(1))
+        await see(page, "[data-count=number]", "1")
+        assert driver.sink is not None
+        driver.fails["start"] = GoneError("scripted: it was unplugged <b>")
+        driver.sink.ended(GoneError("scripted: it was unplugged <b>"))
+        await see(page, ".source[data-state=lost] .why", "it was unplugged <b>")
+        await see(page, ".source.old")
+        assert await page.inner_text("[data-count=camera]") == "-"
+        del driver.fails["start"]
+        await driver.streams()
+        driver.give(stamped(2))
+        await see(page, ".source[data-state=live]")
+        assert await page.inner_text(".why") == ""
+
+
+async def test_frame_that_cannot_be_read_is_counted(page: Page) -> None:
+    async with scripted_on(page) as (driver, _):
+        driver.give(stamped(1, data=b"torn"))
+        await see(page, ".why", "A frame cannot be shown")
+        await see(page, "[data-count=lost]", "1 not readable")
+        driver.give(stamped(2))
+        await see(page, "[data-count=number]", "2")
+        assert await page.inner_text(".why") == ""
+
+
+async def test_source_that_is_awaited_says_why(page: Page) -> None:
+    _, source = scripted(stall=None)
+    async with opened(page, [source]) as site:
+        site.failures[0] = "scripted: no such device"
+        await see(page, ".source[data-state=awaited] .why", "scripted: no such device")
+
+
+async def test_hidden_page_lets_the_device_rest(page: Page) -> None:
+    async with scripted_on(page) as (driver, source):
+        driver.give(stamped(1))
+        await see(page, "[data-count=number]", "1")
+        await page.evaluate(HIDE, True)
+        await until(lambda: source.statistics().readers == 0, PATIENCE)
+        await driver.rests()
+        await see(page, ".state", "paused")
+        await page.evaluate(HIDE, False)
+        await driver.streams()
+        driver.give(stamped(2))
+        await see(page, "[data-count=number]", "2")
+
+
+async def test_server_that_goes_is_said_and_comes_back(page: Page) -> None:
+    driver, source = scripted(stall=None)
+    async with source:
+        async with FramesSite([source]) as site:
+            await page.goto(site.url)
+            await see(page, LIVE)
+            port = site.port
+        await see(page, "#alarm", "server does not answer")
+        await see(page, "#live[data-state=lost]", "no server")
+        async with FramesSite([source], port=port):
+            await see(page, LIVE)
+            await driver.streams()
+            driver.give(stamped(5))
+            await see(page, "[data-count=number]", "5")
+            await page.goto("about:blank")
+
+
+async def test_token_is_asked_for_and_opens_the_sockets(page: Page) -> None:
+    driver, source = scripted(stall=None)
+    async with source, FramesSite([source], token=TOKEN) as site:
+        await page.goto(site.api)
+        await see(page, "#gate")
+        await page.fill("#token", "not-the-token_of-24-chars")
+        await page.click("#gate button")
+        await see(page, "#gate-error", "Refused")
+        await page.fill("#token", TOKEN)
+        await page.click("#gate button")
+        await see(page, LIVE)
+        await driver.streams()
+        driver.give(stamped(3))
+        await see(page, "[data-count=number]", "3")
+        await page.goto("about:blank")
+        async with opened(page, [source], token=TOKEN):
+            await driver.streams()
+            assert TOKEN not in page.url
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])
+@pytest.mark.parametrize("count", [1, 4])
+async def test_nothing_is_cut(page: Page, width: int, height: int, count: int) -> None:
+    await page.set_viewport_size({"width": width, "height": height})
+    names = ["left", "a-name-without-any-place-to-break-it-" * 2, "wide", "deep"]
+    sizes = ["640x480", "320x240", "1280x320", "320x960"]
+    async with contextlib.AsyncExitStack() as stack:
+        sources = [
+            await stack.enter_async_context(
+                smartcam.frames.open(f"synthetic://?fps=10&name={name}&size={size}")
+            )
+            for name, size in zip(names[:count], sizes, strict=False)
+        ]
+        await stack.enter_async_context(opened(page, sources))
+        for place in range(count):
+            await see(page, f"[data-place='{place}'] canvas")
+        assert await page.evaluate("document.documentElement.scrollWidth") == width
+        wide = await page.evaluate(
+            "[...document.querySelectorAll('.panel, .view, canvas, dl, h2')]"
+            ".filter((e) => e.getBoundingClientRect().right > innerWidth"
+            " || e.scrollWidth > e.clientWidth + 1).map((e) => e.outerHTML.slice(0, 80))"
+        )
+        assert wide == []
+        shapes = await page.evaluate(
+            "[...document.querySelectorAll('canvas')]"
+            ".map((c) => [c.width / c.height, c.clientWidth / c.clientHeight])"
+        )
+        for natural, drawn in shapes:
+            assert drawn == pytest.approx(natural, rel=0.02)
