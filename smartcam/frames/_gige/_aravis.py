@@ -15,12 +15,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from smartcam.exceptions import FrameFormatError, FrameSourceError, MessageError
+from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._driver import FrameDriver
 from smartcam.frames._frame import Frame, Moment
-from smartcam.frames._gige._description import parse
-from smartcam.frames._gige._features import Features
+from smartcam.frames._gige._control import ControlChannel
+from smartcam.frames._gige._features import GenicamFeatures
 from smartcam.frames._gige._places import place
+from smartcam.frames._gige._session import read_description
 from smartcam.frames._gige._setup import lock, set_up
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink, StreamFormat
-    from smartcam.frames._gige._setup import Shape, Wanted
+    from smartcam.frames._gige._setup import StreamShape, WantedStream
 
 Result = TypeVar("Result")
 
@@ -66,16 +67,17 @@ class AravisDriver(FrameDriver):
         wanted: the same, read.
     """
 
-    def __init__(self, address: FrameAddress, wanted: Wanted) -> None:
+    def __init__(self, address: FrameAddress, wanted: WantedStream) -> None:
         super().__init__(address)
         self._wanted = wanted
         self.label = address.shown
         self._aravis: Any = None
         self._camera: Any = None
         self._stream: Any = None
+        self._control: ControlChannel | None = None
         self._pool: ThreadPoolExecutor | None = None
-        self._features: Features | None = None
-        self._shape: Shape | None = None
+        self._features: GenicamFeatures | None = None
+        self._shape: StreamShape | None = None
         self._sink: FrameSink | None = None
         self._pump: asyncio.Future[None] | None = None
         self._end = threading.Event()
@@ -89,7 +91,7 @@ class AravisDriver(FrameDriver):
         return self.label
 
     @property
-    def features(self) -> Features:
+    def features(self) -> GenicamFeatures:
         """What can be asked and set."""
         if self._features is None:
             raise FrameSourceError(f"{self.label}: it is not open", source=self.label)
@@ -98,12 +100,13 @@ class AravisDriver(FrameDriver):
     async def open(self) -> StreamFormat:
         """Take control of the camera and set it."""
         self._aravis = load()
-        host, _ = await place(self.address, self._wanted)
+        host, port = await place(self.address, self._wanted)
         self._pool = ThreadPoolExecutor(2, thread_name_prefix=f"aravis for {self.address.shown}")
         try:
             self._camera = await self._call("open it", self._aravis.Camera.new, host)
             self._gone = False
-            await self._begin()
+            self._control = await ControlChannel.connect(host, port, self.label)
+            await self._begin(self._control)
             self._shape = await set_up(self, self._wanted)
         except BaseException:
             await self.close()
@@ -156,6 +159,9 @@ class AravisDriver(FrameDriver):
             await self.stop()
         finally:
             pool, self._pool = self._pool, None
+            control, self._control = self._control, None
+            if control is not None:
+                control.close()
             held = [self._camera, self._features]
             self._camera = self._features = None
             self.label = self.address.shown
@@ -166,7 +172,7 @@ class AravisDriver(FrameDriver):
 
     # in the event loop
 
-    async def _begin(self) -> None:
+    async def _begin(self, control: ControlChannel) -> None:
         camera = self._camera
         device = camera.get_device()
         model = await self._call("its model", camera.get_model_name)
@@ -178,12 +184,9 @@ class AravisDriver(FrameDriver):
                 "back first",
                 source=self.label,
             )
-        text = await self._call("its description", device.get_genicam_xml)
-        try:
-            nodes = await self._call("its description", parse, text[0].encode())
-        except MessageError as exc:
-            raise FrameSourceError(f"{self.label}: {exc}", source=self.label) from exc
-        self._features = Features(nodes, _Port(self._call, device), self.label)
+        nodes = await read_description(control, self.label)
+        memory = _AravisMemory(self._call, device, control)
+        self._features = GenicamFeatures(nodes, memory, self.label)
         loop = asyncio.get_running_loop()
         device.connect("control-lost", functools.partial(self._control_lost, loop))
 
@@ -207,17 +210,17 @@ class AravisDriver(FrameDriver):
         self._sink = None
         self._end.set()
         pump, self._pump = self._pump, None
-        stream, self._stream = self._stream, None
+        held, self._stream = [self._stream], None
         if pump is not None:
             await asyncio.wait([pump])
-        if stream is not None:
-            await self._call("end its stream", stream.stop_thread, True)
+        if self._pool is not None:  # it ends when nobody holds it, which waits for its thread
+            await asyncio.get_running_loop().run_in_executor(self._pool, held.clear)
 
     def _resend(self) -> Any:
         kinds = self._aravis.GvStreamPacketResend
         return kinds.ALWAYS if self._wanted.resend else kinds.NEVER
 
-    def _take(self, taken: _Taken, stream: Any, buffer: Any) -> None:
+    def _take(self, taken: _AravisFrame, stream: Any, buffer: Any) -> None:
         """Take what the thread has; only then aravis gets its buffer back."""
         sink, shape = self._sink, self._shape
         if sink is None or shape is None or stream is not self._stream:
@@ -235,10 +238,10 @@ class AravisDriver(FrameDriver):
             sink.frame(self._frame(taken, shape, max(gap - 1, 0)))
         stream.push_buffer(buffer)
 
-    def _expected(self, shape: Shape) -> tuple[int, int, int]:
+    def _expected(self, shape: StreamShape) -> tuple[int, int, int]:
         return shape.number, shape.format.width, shape.format.height
 
-    def _changed(self, taken: _Taken, shape: Shape) -> FrameFormatError:
+    def _changed(self, taken: _AravisFrame, shape: StreamShape) -> FrameFormatError:
         return FrameFormatError(
             f"{self.label}: it streams {shape.format} ({shape.number:#010x}), then came "
             f"{taken.width}x{taken.height} of {taken.code:#010x}",
@@ -246,7 +249,7 @@ class AravisDriver(FrameDriver):
             available=(str(shape.format),),
         )
 
-    def _frame(self, taken: _Taken, shape: Shape, lost: int) -> Frame:
+    def _frame(self, taken: _AravisFrame, shape: StreamShape, lost: int) -> Frame:
         width, height = shape.format.width, shape.format.height
         return Frame(
             data=taken.data or b"",
@@ -271,7 +274,9 @@ class AravisDriver(FrameDriver):
         while not self._end.is_set():
             buffer = stream.timeout_pop_buffer(POLL)
             if buffer is not None and not loop.is_closed():
-                loop.call_soon_threadsafe(self._take, _Taken(buffer, self._aravis), stream, buffer)
+                loop.call_soon_threadsafe(
+                    self._take, _AravisFrame(buffer, self._aravis), stream, buffer
+                )
 
     def _control_lost(self, loop: asyncio.AbstractEventLoop, _: object) -> None:
         if not loop.is_closed():
@@ -288,7 +293,7 @@ class AravisDriver(FrameDriver):
             )
 
 
-class _Taken:
+class _AravisFrame:
     """What aravis has of a frame; ``data`` is None where packets of it are missing."""
 
     def __init__(self, buffer: Any, aravis: Any) -> None:
@@ -304,20 +309,18 @@ class _Taken:
             self.arrived = time.monotonic() - max(0.0, ago)
 
 
-class _Port:
-    """The camera's memory, a word at a time: the binding has no more."""
+class _AravisMemory:
+    """The camera's memory: aravis writes, a word at a time, since control is its.
 
-    def __init__(self, call: Callable[..., Any], device: Any) -> None:
-        self._call, self._device = call, device
+    Anybody may read, so our own channel does: the binding reads no more than a word either, and
+    gives the description without its end (0.8.26).
+    """
+
+    def __init__(self, call: Callable[..., Any], device: Any, control: ControlChannel) -> None:
+        self._call, self._device, self._control = call, device, control
 
     async def read(self, address: int, length: int) -> bytes:
-        begin, end = address & ~3, (address + length + 3) & ~3
-        words = [
-            await self._call(f"{place:#06x}", self._device.read_register, place)
-            for place in range(begin, end, 4)
-        ]
-        data = b"".join(int(word).to_bytes(4, "big") for word in words)
-        return data[address - begin :][:length]
+        return await self._control.read(address, length)
 
     async def write(self, address: int, data: bytes) -> None:
         begin, end = address & ~3, (address + len(data) + 3) & ~3

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam.exceptions import MessageError
 from smartcam.frames._gige._block import PACKET, Block
-from smartcam.frames._gige._gvcp import Status
-from smartcam.frames._gige._gvsp import HEADER, Kind, decode_header
+from smartcam.frames._gige._gvcp import GvcpStatus
+from smartcam.frames._gige._gvsp import HEADER, PacketKind, decode_header
 
 if TYPE_CHECKING:
-    from smartcam.frames._gige._block import Picture
-    from smartcam.frames._gige._gvsp import Header
+    from smartcam.frames._gige._block import WholePicture
+    from smartcam.frames._gige._gvsp import PacketHeader
 
 MOST_OPEN: Final = 4
 """Blocks that wait for packets or for an earlier block: at 100 frames/s 40 ms."""
@@ -60,9 +60,9 @@ SHORT_IDS: Final = 65535
 
 _SHORT: Final = struct.Struct(">HHI")
 _GONE: Final = {
-    Status.PACKET_UNAVAILABLE,
-    Status.PACKET_REMOVED_FROM_MEMORY,
-    Status.PACKET_AND_PREV_REMOVED_FROM_MEMORY,
+    GvcpStatus.PACKET_UNAVAILABLE,
+    GvcpStatus.PACKET_REMOVED_FROM_MEMORY,
+    GvcpStatus.PACKET_AND_PREV_REMOVED_FROM_MEMORY,
 }
 
 
@@ -76,7 +76,7 @@ class Resend(NamedTuple):
 
 
 @dataclass(slots=True)
-class Counts:
+class PacketCounts:
     """What came and what became of it.
 
     Attributes:
@@ -110,7 +110,7 @@ class Assembler:
     """
 
     def __init__(self, payload_size: int, datagram: int, *, resend: bool = True) -> None:
-        self.counts = Counts()
+        self.counts = PacketCounts()
         self.fault: MessageError | None = None
         """Why its blocks cannot be read at all, such as a payload type that is no picture."""
         self._most, self._datagram, self._resend = payload_size, datagram, resend
@@ -121,7 +121,7 @@ class Assembler:
         self._begun = False
         self._ticks = 0
         self._accepted = -math.inf
-        self._pictures: list[Picture] = []
+        self._pictures: list[WholePicture] = []
         self._untold = 0
 
     def feed(self, data: memoryview, size: int, now: float, arrived: float) -> None:
@@ -154,7 +154,7 @@ class Assembler:
                 block.arrived = arrived
             self._put(block, header, data[header.size : size], now)
 
-    def pictures(self) -> list[Picture]:
+    def pictures(self) -> list[WholePicture]:
         """Return the pictures that are complete, in order, each once."""
         done, self._pictures = self._pictures, []
         return done
@@ -214,7 +214,9 @@ class Assembler:
 
     # packets
 
-    def _block_of(self, header: Header, data: memoryview, size: int, now: float) -> Block | None:
+    def _block_of(
+        self, header: PacketHeader, data: memoryview, size: int, now: float
+    ) -> Block | None:
         """Return the block that a packet belongs to; None: it belongs to none any longer."""
         extended = header.size != HEADER
         if not self._begun:
@@ -223,15 +225,17 @@ class Assembler:
                 self._newest = self._closed = header.block - 1
         number = self._number(header.block, extended)
         ahead = number - self._newest
-        if header.kind == Kind.LEADER and self._restarted(number, bytes(data[header.size : size])):
+        if header.kind == PacketKind.LEADER and self._restarted(
+            number, bytes(data[header.size : size])
+        ):
             number = self._restart(header.block)
         elif ahead > MOST_OPEN + FASTEST * min(now - self._accepted, 1e6):
-            if header.kind != Kind.LEADER:
+            if header.kind != PacketKind.LEADER:
                 self.counts.late += 1
                 return None
             number = self._restart(header.block)
         elif number <= self._closed:
-            if header.kind != Kind.LEADER or now - self._accepted < RESTART_SILENCE:
+            if header.kind != PacketKind.LEADER or now - self._accepted < RESTART_SILENCE:
                 self.counts.late += 1
                 return None
             number = self._restart(header.block)
@@ -304,7 +308,7 @@ class Assembler:
         self._blocks[number] = block
         return block
 
-    def _put(self, block: Block, header: Header, payload: memoryview, now: float) -> None:
+    def _put(self, block: Block, header: PacketHeader, payload: memoryview, now: float) -> None:
         """Put a packet where it belongs."""
         packet = header.packet
         if block.dead or block.complete:
@@ -330,16 +334,16 @@ class Assembler:
         if block.complete:
             self._settle()
 
-    def _fits(self, block: Block, header: Header, payload: memoryview) -> bool:
+    def _fits(self, block: Block, header: PacketHeader, payload: memoryview) -> bool:
         try:
-            if header.kind == Kind.PAYLOAD:
+            if header.kind == PacketKind.PAYLOAD:
                 return block.take_payload(header.packet, payload)
-            if header.kind == Kind.LEADER and header.packet == 0:
+            if header.kind == PacketKind.LEADER and header.packet == 0:
                 block.take_leader(bytes(payload))
                 if block.leader is not None:
                     self._ticks = max(self._ticks, block.leader.ticks)
                 return True
-            if header.kind == Kind.TRAILER:
+            if header.kind == PacketKind.TRAILER:
                 return block.take_trailer(header.packet, bytes(payload))
         except MessageError as exc:
             self.fault = self.fault or exc

@@ -24,7 +24,7 @@ PACKET: Final = 0xFFFFFF
 """The id in that word."""
 
 
-class Picture(NamedTuple):
+class WholePicture(NamedTuple):
     """A frame all of whose packets came.
 
     Attributes:
@@ -218,7 +218,7 @@ class Block:
         need = picture_bytes(self.leader, self.leader.height) + self.leader.padding_y
         return max(self.highest, min(self.packets, -(-need // self.full)))
 
-    def picture(self, lost: int) -> Picture | None:
+    def picture(self, lost: int) -> WholePicture | None:
         """Return the frame, once it is complete; None where its bytes are too few for it."""
         leader = self.leader
         if leader is None or self.trailer is None:
@@ -235,4 +235,4 @@ class Block:
         if len(self.buffer) != need:
             data = memoryview(self.buffer)[:need]
         arrived = self.arrived if self.arrived is not None else 0.0
-        return Picture(self.number, lost, leader, rows, stride, data, arrived)
+        return WholePicture(self.number, lost, leader, rows, stride, data, arrived)

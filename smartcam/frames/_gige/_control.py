@@ -17,9 +17,9 @@ from smartcam.frames._gige._gvcp import (
     EXCLUSIVE,
     MOST_MEMORY,
     Ack,
-    Command,
+    GvcpCommand,
+    GvcpStatus,
     Register,
-    Status,
     decode_ack,
     encode,
     encode_resend,
@@ -114,13 +114,15 @@ class ControlChannel(asyncio.DatagramProtocol):
         Raises:
             FrameSourceError: the camera refuses, or does not answer.
         """
-        payload = await self.request(Command.READREG, read_registers(address), 4, f"{address:#06x}")
+        payload = await self.request(
+            GvcpCommand.READREG, read_registers(address), 4, f"{address:#06x}"
+        )
         return int.from_bytes(payload[:4], "big")
 
     async def write_register(self, address: int, value: int) -> None:
         """Write a register; the errors are the same."""
         what = f"{address:#06x} = {value:#x}"
-        await self.request(Command.WRITEREG, write_registers((address, value)), 0, what)
+        await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, what)
 
     async def read(self, address: int, length: int) -> bytes:
         """Return bytes of the camera's memory; the errors are the same."""
@@ -132,7 +134,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         for place in range(begin, end, MOST_MEMORY):
             count = min(MOST_MEMORY, end - place)
             payload = await self.request(
-                Command.READMEM, read_memory(place, count), 4 + count, f"{place:#06x}, {count}"
+                GvcpCommand.READMEM, read_memory(place, count), 4 + count, f"{place:#06x}, {count}"
             )
             parts.append(payload[4 : 4 + count])
         return b"".join(parts)[address - begin :][:length]
@@ -150,7 +152,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         for place in range(begin, end, MOST_MEMORY):
             part = data[place - begin :][:MOST_MEMORY]
             await self.request(
-                Command.WRITEMEM, write_memory(place, part), 0, f"{place:#06x}, {len(part)}"
+                GvcpCommand.WRITEMEM, write_memory(place, part), 0, f"{place:#06x}, {len(part)}"
             )
 
     def resend(self, wanted: Resend) -> None:
@@ -161,7 +163,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             )
             self._transport.sendto(data)
 
-    async def request(self, command: Command, payload: bytes, least: int, what: str) -> bytes:
+    async def request(self, command: GvcpCommand, payload: bytes, least: int, what: str) -> bytes:
         """Send a request; return its answer's payload.
 
         Args:
@@ -193,7 +195,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             source=self.source,
         )
 
-    async def _tried(self, datagram: bytes, command: Command, what: str) -> Ack | None:
+    async def _tried(self, datagram: bytes, command: GvcpCommand, what: str) -> Ack | None:
         """Send a request; return its answer, None where none comes in time."""
         if self._transport is None or self._transport.is_closing():
             raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
@@ -210,16 +212,16 @@ class ControlChannel(asyncio.DatagramProtocol):
                             f"speaks GVCP: {ack}",
                             source=self.source,
                         ) from ack
-                    if ack.command != Command.PENDING_ACK:
+                    if ack.command != GvcpCommand.PENDING_ACK:
                         return ack
                     wait = int.from_bytes(ack.payload[2:4], "big") / 1e3 + ANSWER
                     limit.reschedule(min(loop.time() + wait, begun + LONGEST_PENDING))
         except TimeoutError:
             return None
 
-    def _checked(self, ack: Ack, command: Command, least: int, what: str) -> bytes:
-        if ack.status != Status.SUCCESS:
-            raise RefusedError(
+    def _checked(self, ack: Ack, command: GvcpCommand, least: int, what: str) -> bytes:
+        if ack.status != GvcpStatus.SUCCESS:
+            raise RequestRefusedError(
                 f"{self.source}: {command.name} {what}: the camera answers "
                 f"{status_text(ack.status)}",
                 source=self.source,
@@ -276,11 +278,11 @@ class ControlChannel(asyncio.DatagramProtocol):
             self._take(exc)
 
 
-class RefusedError(FrameSourceError):
+class RequestRefusedError(FrameSourceError):
     """The camera answered with an error.
 
     Attributes:
-        status: of :class:`~smartcam.frames._gige._gvcp.Status`.
+        status: of :class:`~smartcam.frames._gige._gvcp.GvcpStatus`.
     """
 
     def __init__(

@@ -128,7 +128,7 @@ def parse(text: bytes) -> dict[str, Element]:
     Raises:
         MessageError: it is no XML, has a document type, or is larger than any.
     """
-    reader = _Reader()
+    reader = _XmlReader()
     parser = expat.ParserCreate()
     parser.buffer_text = True
     parser.StartElementHandler = reader.start
@@ -146,7 +146,7 @@ def parse(text: bytes) -> dict[str, Element]:
     return _nodes(reader.root)
 
 
-class _Reader:
+class _XmlReader:
     def __init__(self) -> None:
         self.root = Element("", {})
         self._open: list[Element] = []

@@ -15,8 +15,8 @@ from smartcam.frames._gige._gvcp import (
     ACK_REQUIRED,
     BROADCAST_ACK,
     PORT,
-    Command,
     DeviceInfo,
+    GvcpCommand,
     decode_ack,
     encode,
 )
@@ -49,7 +49,7 @@ class Network(NamedTuple):
     network: ipaddress.IPv4Network | None = None
 
 
-class Camera(NamedTuple):
+class AnsweringCamera(NamedTuple):
     """A camera that answered.
 
     Attributes:
@@ -85,7 +85,9 @@ def networks() -> list[Network]:
     return found
 
 
-async def find(places: Iterable[Network], *, port: int = PORT, wait: float = WAIT) -> list[Camera]:
+async def find(
+    places: Iterable[Network], *, port: int = PORT, wait: float = WAIT
+) -> list[AnsweringCamera]:
     """Ask for cameras.
 
     Args:
@@ -111,7 +113,7 @@ async def find(places: Iterable[Network], *, port: int = PORT, wait: float = WAI
                 flags = ACK_REQUIRED | BROADCAST_ACK
                 for target in place.targets:
                     transport.sendto(
-                        encode(Command.DISCOVERY, _REQUEST_ID, flags=flags), (target, port)
+                        encode(GvcpCommand.DISCOVERY, _REQUEST_ID, flags=flags), (target, port)
                     )
         await asyncio.sleep(wait)
     finally:
@@ -125,12 +127,16 @@ async def find(places: Iterable[Network], *, port: int = PORT, wait: float = WAI
 class _Asking(asyncio.DatagramProtocol):
     def __init__(self, place: Network) -> None:
         self._place = place
-        self.found: list[Camera] = []
+        self.found: list[AnsweringCamera] = []
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         try:
             ack = decode_ack(data)
-            if ack.command != Command.DISCOVERY + 1 or ack.request_id != _REQUEST_ID or ack.status:
+            if (
+                ack.command != GvcpCommand.DISCOVERY + 1
+                or ack.request_id != _REQUEST_ID
+                or ack.status
+            ):
                 return
             info = DeviceInfo.decode(ack.payload)
         except MessageError:
@@ -138,7 +144,7 @@ class _Asking(asyncio.DatagramProtocol):
         network = self._place.network
         reachable = network is None or ipaddress.IPv4Address(info.address) in network
         if len(self.found) < MOST_CAMERAS:
-            self.found.append(Camera(info, info.address, reachable))
+            self.found.append(AnsweringCamera(info, info.address, reachable))
 
     def error_received(self, exc: Exception) -> None:
         """Take that nobody listens at one of the targets."""

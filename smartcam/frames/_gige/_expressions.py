@@ -194,10 +194,10 @@ def _bounded(value: Number, whole: bool) -> Number:
 
 @functools.lru_cache(maxsize=1024)
 def _parsed(formula: str) -> Tree:
-    return _Parser(formula).parsed()
+    return _FormulaParser(formula).parsed()
 
 
-class _Parser:
+class _FormulaParser:
     def __init__(self, formula: str) -> None:
         if len(formula) > LONGEST:
             raise MessageError(

@@ -38,7 +38,7 @@ _WHOLE: Final = ("Integer", "IntSwissKnife", "IntConverter", "Enumeration", "Boo
 _TEXTS: Final = ("String", "StringReg")
 
 
-class Port(Protocol):
+class DeviceMemory(Protocol):
     """The camera's memory."""
 
     async def read(self, address: int, length: int) -> bytes:
@@ -50,7 +50,7 @@ class Port(Protocol):
         ...
 
 
-class Features:
+class GenicamFeatures:
     """What can be asked of a camera, and set.
 
     Nothing is kept between two calls but what the description itself holds.
@@ -61,7 +61,7 @@ class Features:
         source: its name, for errors.
     """
 
-    def __init__(self, nodes: Mapping[str, Element], port: Port, source: str) -> None:
+    def __init__(self, nodes: Mapping[str, Element], port: DeviceMemory, source: str) -> None:
         self._nodes, self._port, self._source = nodes, port, source
         self._held: dict[str, Value] = {}  # what nodes with a <Value> were set to
         self._read: dict[tuple[int, int], bytes] = {}

@@ -32,7 +32,7 @@ _ANSWER: Final = struct.Struct(">HHHH")
 _WORD: Final = struct.Struct(">I")
 
 
-class Command(IntEnum):
+class GvcpCommand(IntEnum):
     """What a packet is; answers are one above their requests."""
 
     DISCOVERY = 0x0002
@@ -44,7 +44,7 @@ class Command(IntEnum):
     PENDING_ACK = 0x0089
 
 
-class Status(IntEnum):
+class GvcpStatus(IntEnum):
     """What a camera says of a request, or of a packet of its stream."""
 
     SUCCESS = 0x0000
@@ -108,8 +108,8 @@ class Ack(NamedTuple):
     """An answer.
 
     Attributes:
-        status: of :class:`Status`, or a maker's own.
-        command: of :class:`Command`, plus one; or PENDING_ACK.
+        status: of :class:`GvcpStatus`, or a maker's own.
+        command: of :class:`GvcpCommand`, plus one; or PENDING_ACK.
         request_id: of the request that it answers.
         payload: what stands behind the header.
     """
@@ -180,7 +180,7 @@ def text(data: bytes) -> str:
 def status_text(status: int) -> str:
     """Return a status code for people."""
     try:
-        return f"{Status(status).name} ({status:#06x})"
+        return f"{GvcpStatus(status).name} ({status:#06x})"
     except ValueError:
         return f"status {status:#06x}"
 
@@ -243,4 +243,4 @@ def encode_resend(request_id: int, block: int, first: int, last: int, *, extende
         payload = struct.pack(">HHIIQ", 0, 0, first, last, block)
     else:
         payload = struct.pack(">HHII", 0, block, first, last)
-    return encode(Command.PACKETRESEND, request_id, payload, EXTENDED_ID if extended else 0)
+    return encode(GvcpCommand.PACKETRESEND, request_id, payload, EXTENDED_ID if extended else 0)

@@ -37,7 +37,7 @@ def bits_of(pixel_format: int) -> int:
     return pixel_format >> 16 & 0xFF
 
 
-class Kind(IntEnum):
+class PacketKind(IntEnum):
     """What a packet is."""
 
     LEADER = 1
@@ -61,13 +61,13 @@ class PayloadType(IntEnum):
     IMAGE_WITH_CHUNKS = 0x4001
 
 
-class Header(NamedTuple):
+class PacketHeader(NamedTuple):
     """A packet's header.
 
     Attributes:
         status: 0, or what is wrong.
         block: id of its block.
-        kind: of :class:`Kind`, or another.
+        kind: of :class:`PacketKind`, or another.
         packet: its id in the block.
         size: bytes of the header.
     """
@@ -101,18 +101,18 @@ class Leader(NamedTuple):
     padding_y: int
 
 
-def decode_header(data: bytes | bytearray | memoryview, size: int) -> Header | None:
+def decode_header(data: bytes | bytearray | memoryview, size: int) -> PacketHeader | None:
     """Read the header of a packet of ``size`` bytes; None where it is too short for one."""
     if size < HEADER:
         return None
     status, block, word = _SHORT.unpack_from(data)
     kind = word >> 24
     if not kind & EXTENDED:
-        return Header(status, block, kind, word & 0xFFFFFF, HEADER)
+        return PacketHeader(status, block, kind, word & 0xFFFFFF, HEADER)
     if size < EXTENDED_HEADER:
         return None
     status, _, word, block, packet = _LONG.unpack_from(data)
-    return Header(status, block, kind & 0x7F, packet, EXTENDED_HEADER)
+    return PacketHeader(status, block, kind & 0x7F, packet, EXTENDED_HEADER)
 
 
 def decode_leader(payload: bytes) -> Leader:

@@ -12,16 +12,16 @@ from smartcam.frames._gige._assembler import Assembler
 from smartcam.frames._gige._gvcp import Register
 from smartcam.frames._gige._gvsp import IP_UDP
 from smartcam.frames._gige._places import place
-from smartcam.frames._gige._session import Session
+from smartcam.frames._gige._session import GigESession
 from smartcam.frames._gige._setup import connect, lock, set_up
 from smartcam.frames._gige._stream import Stream, StreamSocket
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink, StreamFormat
-    from smartcam.frames._gige._assembler import Counts
-    from smartcam.frames._gige._block import Picture
-    from smartcam.frames._gige._setup import Shape, Wanted
+    from smartcam.frames._gige._assembler import PacketCounts
+    from smartcam.frames._gige._block import WholePicture
+    from smartcam.frames._gige._setup import StreamShape, WantedStream
 
 
 class OwnDriver(FrameDriver):
@@ -32,15 +32,15 @@ class OwnDriver(FrameDriver):
         wanted: the same, read.
     """
 
-    def __init__(self, address: FrameAddress, wanted: Wanted) -> None:
+    def __init__(self, address: FrameAddress, wanted: WantedStream) -> None:
         super().__init__(address)
         self._wanted = wanted
-        self._session: Session | None = None
-        self._shape: Shape | None = None
+        self._session: GigESession | None = None
+        self._shape: StreamShape | None = None
         self._stream: Stream | None = None
         self._sink: FrameSink | None = None
         self._packet_size = 0  # that was found to come through
-        self.counts: Counts | None = None
+        self.counts: PacketCounts | None = None
         """What became of the packets of the stream that is under way, or was the last."""
 
     @property
@@ -51,7 +51,7 @@ class OwnDriver(FrameDriver):
     async def open(self) -> StreamFormat:
         """Take control of the camera and set it."""
         host, port = await place(self.address, self._wanted)
-        self._session = await Session.open(host, port, self.address.shown)
+        self._session = await GigESession.open(host, port, self.address.shown)
         try:
             self._shape = await set_up(self._session, self._wanted)
         except BaseException:
@@ -100,7 +100,7 @@ class OwnDriver(FrameDriver):
             if session is not None:
                 await session.close()
 
-    async def _listen(self, session: Session, shape: Shape) -> Stream:
+    async def _listen(self, session: GigESession, shape: StreamShape) -> Stream:
         """Have the stream come to a socket of ours."""
         try:
             where = StreamSocket(session.control.local_address, session.control.camera_address)
@@ -136,7 +136,7 @@ class OwnDriver(FrameDriver):
         if sink is not None:
             sink.ended(error)
 
-    def _take(self, pictures: list[Picture]) -> None:
+    def _take(self, pictures: list[WholePicture]) -> None:
         """Take what the stream has; it may be closed by whoever takes a frame."""
         for picture in pictures:
             if self._sink is None or self._shape is None or self._session is None:
@@ -152,7 +152,7 @@ class OwnDriver(FrameDriver):
             error.__cause__ = fault
             self._end(error)
 
-    def _changed(self, picture: Picture, shape: Shape) -> FrameFormatError:
+    def _changed(self, picture: WholePicture, shape: StreamShape) -> FrameFormatError:
         leader = picture.leader
         return FrameFormatError(
             f"{self.name}: it streams {shape.format} ({shape.number:#010x}), then came "
@@ -161,7 +161,7 @@ class OwnDriver(FrameDriver):
             available=(str(shape.format),),
         )
 
-    def _frame(self, picture: Picture, shape: Shape, session: Session) -> Frame:
+    def _frame(self, picture: WholePicture, shape: StreamShape, session: GigESession) -> Frame:
         ticks = session.ticks_per_second
         return Frame(
             data=picture.data,

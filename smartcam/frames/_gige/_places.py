@@ -9,11 +9,11 @@ from smartcam.exceptions import FrameSourceError
 from smartcam.frames._driver import FoundSource
 from smartcam.frames._gige._discovery import find, networks
 from smartcam.frames._gige._gvcp import PORT
-from smartcam.frames._gige._setup import FEATURE, PACKETS, Wanted
+from smartcam.frames._gige._setup import FEATURE, PACKETS, WantedStream
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
-    from smartcam.frames._gige._discovery import Camera
+    from smartcam.frames._gige._discovery import AnsweringCamera
 
 _PARAMETERS: Final = (
     "serial",
@@ -30,7 +30,7 @@ _CHOICES: Final = {"resend": ("on", "off"), "through": ("own", "aravis")}
 """Of these parameters the values; the first one is what it is where nobody says."""
 
 
-def wanted(address: FrameAddress) -> Wanted:
+def wanted(address: FrameAddress) -> WantedStream:
     """Read a URL's parameters.
 
     Raises:
@@ -50,7 +50,7 @@ def wanted(address: FrameAddress) -> Wanted:
     asked = 0.0
     if packet_size != "auto":
         asked = address.number("packet_size", packet_size, *PACKETS)
-    return Wanted(
+    return WantedStream(
         said,
         address.size(said["size"]) if "size" in said else None,
         address.number("fps", said["fps"], 0.001, 100_000) if "fps" in said else None,
@@ -59,7 +59,7 @@ def wanted(address: FrameAddress) -> Wanted:
     )
 
 
-async def place(address: FrameAddress, what: Wanted) -> tuple[str, int]:
+async def place(address: FrameAddress, what: WantedStream) -> tuple[str, int]:
     """Return where the camera is: its address and port.
 
     Raises:
@@ -82,7 +82,7 @@ async def place(address: FrameAddress, what: Wanted) -> tuple[str, int]:
     return fitting[0].address, PORT
 
 
-def found(camera: Camera) -> FoundSource:
+def found(camera: AnsweringCamera) -> FoundSource:
     """Return a camera as it is listed."""
     remark = ""
     if not camera.reachable:

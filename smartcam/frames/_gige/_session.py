@@ -9,10 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import FrameSourceError, FrameTimeoutError, MessageError
-from smartcam.frames._gige._control import ControlChannel, RefusedError, heartbeat
+from smartcam.frames._gige._control import ControlChannel, RequestRefusedError, heartbeat
 from smartcam.frames._gige._description import locate, parse, unpack
-from smartcam.frames._gige._features import Features
-from smartcam.frames._gige._gvcp import CONTROL, EXCLUSIVE, Register, Status, text
+from smartcam.frames._gige._features import GenicamFeatures
+from smartcam.frames._gige._gvcp import CONTROL, EXCLUSIVE, GvcpStatus, Register, text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +31,7 @@ HEARTBEATS: Final = (0.5, 60.0)
 """Seconds between which a camera's own heartbeat timeout is taken as it is."""
 
 
-class Session:
+class GigESession:
     """A camera that is ours until :meth:`close`.
 
     Args:
@@ -46,12 +46,12 @@ class Session:
         self.on_lost: Callable[[FrameSourceError], None] = lambda _: None
         self.ticks_per_second = 0
         self.can_resend = False
-        self._features: Features | None = None
+        self._features: GenicamFeatures | None = None
         self._ours = False
         self._heart: asyncio.Task[None] | None = None
 
     @classmethod
-    async def open(cls, host: str, port: int, label: str) -> Session:
+    async def open(cls, host: str, port: int, label: str) -> GigESession:
         """Take control of a camera and read its description.
 
         Raises:
@@ -76,7 +76,7 @@ class Session:
         return session
 
     @property
-    def features(self) -> Features:
+    def features(self) -> GenicamFeatures:
         """What can be asked and set."""
         if self._features is None:
             raise FrameSourceError(f"{self.label}: it is not open", source=self.label)
@@ -116,13 +116,15 @@ class Session:
             Register.TICK_FREQUENCY_HIGH
         ) << 32 | await self._register_or_0(Register.TICK_FREQUENCY_LOW)
         self.can_resend = bool(await self._register_or_0(CAPABILITIES) & RESEND_CAPABILITY)
-        self._features = Features(await self._description(), self.control, self.label)
+        self._features = GenicamFeatures(
+            await read_description(self.control, self.label), self.control, self.label
+        )
 
     async def _register_or_0(self, address: int) -> int:
         """Return a register that a camera need not have."""
         try:
             return await self.control.read_register(address)
-        except RefusedError:
+        except RequestRefusedError:
             return 0
 
     def _on_lost(self, error: FrameSourceError) -> None:
@@ -149,27 +151,32 @@ class Session:
 
         A camera is to say so; aravis' fake one does not answer at all.
         """
-        if isinstance(error, RefusedError):
-            return error.status == Status.ACCESS_DENIED
+        if isinstance(error, RequestRefusedError):
+            return error.status == GvcpStatus.ACCESS_DENIED
         if isinstance(error, FrameTimeoutError):
             privilege = await self.control.read_register(Register.CONTROL_PRIVILEGE)
             return bool(privilege & (CONTROL | EXCLUSIVE))
         return False
 
-    async def _description(self) -> dict[str, Element]:
-        """Read the description; the second URL is tried where the first one leads nowhere."""
-        tried = []
-        for place in (Register.FIRST_URL, Register.FIRST_URL + URL_SIZE):
-            url = text(await self.control.read(place, URL_SIZE))
-            try:
-                lies = locate(url)
-                data = await self.control.read(lies.address, lies.length)
-                return await _in_thread(functools.partial(_nodes, data), self.label)
-            except (MessageError, RefusedError) as exc:
-                tried.append(str(exc))
-        raise FrameSourceError(
-            f"{self.label}: its description cannot be read: {'; '.join(tried)}", source=self.label
-        )
+
+async def read_description(control: ControlChannel, label: str) -> dict[str, Element]:
+    """Read a camera's description; the second URL is tried where the first one leads nowhere.
+
+    Raises:
+        FrameSourceError: neither leads to one.
+    """
+    tried = []
+    for address in (Register.FIRST_URL, Register.FIRST_URL + URL_SIZE):
+        url = text(await control.read(address, URL_SIZE))
+        try:
+            lies = locate(url)
+            data = await control.read(lies.address, lies.length)
+            return await _in_thread(functools.partial(_nodes, data), label)
+        except (MessageError, RequestRefusedError) as exc:
+            tried.append(str(exc))
+    raise FrameSourceError(
+        f"{label}: its description cannot be read: {'; '.join(tried)}", source=label
+    )
 
 
 def _nodes(data: bytes) -> dict[str, Element]:

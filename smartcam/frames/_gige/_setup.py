@@ -21,8 +21,8 @@ from smartcam.frames._pixels import find_format
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.frames._gige._features import Features
-    from smartcam.frames._gige._session import Session
+    from smartcam.frames._gige._features import GenicamFeatures
+    from smartcam.frames._gige._session import GigESession
     from smartcam.frames._gige._stream import StreamSocket
     from smartcam.frames._pixels import PixelFormat
 
@@ -44,18 +44,18 @@ _EXPOSURES: Final = ("ExposureTime", "ExposureTimeAbs")
 """Microseconds. Each by its name of today in the SFNC, then by that of its first editions."""
 
 
-class Open(Protocol):
+class OpenCamera(Protocol):
     """A camera that is open, whoever speaks with it."""
 
     label: str
 
     @property
-    def features(self) -> Features:
+    def features(self) -> GenicamFeatures:
         """What can be asked and set."""
         ...
 
 
-class Wanted(NamedTuple):
+class WantedStream(NamedTuple):
     """What a URL asks for.
 
     Attributes:
@@ -73,7 +73,7 @@ class Wanted(NamedTuple):
     resend: bool
 
 
-class Shape(NamedTuple):
+class StreamShape(NamedTuple):
     """What a camera streams once it is set.
 
     Attributes:
@@ -89,7 +89,7 @@ class Shape(NamedTuple):
     payload: int
 
 
-async def set_up(session: Open, wanted: Wanted) -> Shape:
+async def set_up(session: OpenCamera, wanted: WantedStream) -> StreamShape:
     """Set a camera, in the order in which the URL says it; return what it streams then.
 
     Raises:
@@ -114,14 +114,14 @@ async def set_up(session: Open, wanted: Wanted) -> Shape:
     return await _shape(session)
 
 
-async def lock(features: Features, locked: bool) -> None:
+async def lock(features: GenicamFeatures, locked: bool) -> None:
     """Tell the camera that its stream's shape is fixed, or no longer; not all want to know."""
     if "TLParamsLocked" in features:
         with contextlib.suppress(FrameSourceError):  # of some it is read-only
             await features.set("TLParamsLocked", int(locked))
 
 
-async def _set_format(session: Open, name: str) -> None:
+async def _set_format(session: OpenCamera, name: str) -> None:
     entries = await session.features.entries("PixelFormat")
     for entry, number in entries.items():
         known = _known(number)
@@ -137,7 +137,7 @@ async def _set_format(session: Open, name: str) -> None:
     )
 
 
-async def _set_size(features: Features, size: tuple[int, int]) -> None:
+async def _set_size(features: GenicamFeatures, size: tuple[int, int]) -> None:
     for name in ("OffsetX", "OffsetY"):  # a width has only room up to the offset
         if name in features:
             with contextlib.suppress(FrameSourceError):
@@ -146,7 +146,7 @@ async def _set_size(features: Features, size: tuple[int, int]) -> None:
         await features.set(name, value)
 
 
-async def _set_rate(session: Open, rate: float) -> None:
+async def _set_rate(session: OpenCamera, rate: float) -> None:
     features = session.features
     for name in _RATE_SWITCHES:
         if name in features:
@@ -163,7 +163,7 @@ async def _set_rate(session: Open, rate: float) -> None:
     )
 
 
-async def _shape(session: Open) -> Shape:
+async def _shape(session: OpenCamera) -> StreamShape:
     features = session.features
     entry = await features.get("PixelFormat")
     entries = await features.entries("PixelFormat")
@@ -193,7 +193,7 @@ async def _shape(session: Open) -> Shape:
     exposure = await _first_number(features, _EXPOSURES)
     duration = (exposure or 0.0) / 1e6 + (1 / rate if rate else 0.0)
     rates = (rate,) if rate else ()
-    return Shape(StreamFormat(pixels, width, height, rates), number, duration, payload)
+    return StreamShape(StreamFormat(pixels, width, height, rates), number, duration, payload)
 
 
 def _known(number: int) -> PixelFormat | None:
@@ -203,7 +203,7 @@ def _known(number: int) -> PixelFormat | None:
     return None
 
 
-async def _first_number(features: Features, names: tuple[str, ...]) -> float | None:
+async def _first_number(features: GenicamFeatures, names: tuple[str, ...]) -> float | None:
     for name in names:
         if (number := await features.number(name)) is not None and 0 < number < 1e12:
             return float(number)
@@ -213,7 +213,7 @@ async def _first_number(features: Features, names: tuple[str, ...]) -> float | N
 # the stream channel
 
 
-async def connect(session: Session, where: StreamSocket, asked: int) -> int:
+async def connect(session: GigESession, where: StreamSocket, asked: int) -> int:
     """Have the camera's stream channel send to a socket.
 
     Args:
@@ -241,7 +241,7 @@ async def connect(session: Session, where: StreamSocket, asked: int) -> int:
     return size
 
 
-async def _given(session: Session, asked: int) -> int:
+async def _given(session: GigESession, asked: int) -> int:
     control = session.control
     await control.write_register(Register.STREAM_PACKET_SIZE, asked | DO_NOT_FRAGMENT)
     size = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
@@ -253,7 +253,7 @@ async def _given(session: Session, asked: int) -> int:
     return size
 
 
-async def _tested(session: Session, where: StreamSocket) -> int:
+async def _tested(session: GigESession, where: StreamSocket) -> int:
     """Return the largest size of which a test packet came; without any the camera's own."""
     control = session.control
     own = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK

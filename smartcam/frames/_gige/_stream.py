@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.frames._gige._assembler import Assembler, Resend
-    from smartcam.frames._gige._block import Picture
+    from smartcam.frames._gige._block import WholePicture
 
-MOST_AT_ONCE: Final = 128
-"""Packets that are read before the event loop has its turn: half a millisecond."""
+MOST_AT_ONCE: Final = 64
+"""Packets that are read before the event loop has its turn: a third of a millisecond."""
 
 BUFFER: Final = 8 << 20
 """Bytes that the system is asked to keep for us; Linux gives net.core.rmem_max at most, by default
@@ -94,7 +94,7 @@ class Stream:
         self,
         where: StreamSocket,
         assembler: Assembler,
-        done: Callable[[list[Picture]], None],
+        done: Callable[[list[WholePicture]], None],
         resend: Callable[[Resend], None],
     ) -> None:
         self._where, self.assembler = where, assembler

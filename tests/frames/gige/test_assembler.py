@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from smartcam.exceptions import MessageError
 from smartcam.frames._gige import _assembler
 from smartcam.frames._gige._assembler import MOST_OPEN, Assembler, Resend
-from smartcam.frames._gige._block import Picture
+from smartcam.frames._gige._block import WholePicture
 from tests.frames.gige.packets import FULL, frame, header, leader, payload, trailer
 
 START = 100.0
@@ -21,7 +21,7 @@ class Stream:
     def __init__(self, *, extended: bool = False, resend: bool = True) -> None:
         self.inside = Assembler(256, FULL + (20 if extended else 8), resend=resend)
         self.now = START
-        self.pictures: list[Picture] = []
+        self.pictures: list[WholePicture] = []
         self.wanted: list[Resend] = []
 
     def feed(self, *packets: bytes, step: float = 0.001) -> None:

@@ -12,8 +12,8 @@ import pytest
 from smartcam.exceptions import FrameSourceError, FrameTimeoutError
 from smartcam.frames import FrameAddress
 from smartcam.frames._gige import _places, driver
-from smartcam.frames._gige._control import ControlChannel, RefusedError
-from smartcam.frames._gige._discovery import Camera as Found
+from smartcam.frames._gige._control import ControlChannel, RequestRefusedError
+from smartcam.frames._gige._discovery import AnsweringCamera as Found
 from smartcam.frames._gige._discovery import Network, find, networks
 from smartcam.frames._gige._gvcp import DeviceInfo
 from smartcam.frames._gige.driver import GigEDriver
@@ -116,7 +116,7 @@ async def test_a_wrong_answer_is_said(answer: tuple[int, int, bytes], said: str)
     error, _, _ = await asked(lambda request, _: [ack(answer[0], answer[1], request, answer[2])])
     assert isinstance(error, FrameSourceError)
     assert said in str(error)
-    assert not isinstance(error, RefusedError) or error.status == 0x8003
+    assert not isinstance(error, RequestRefusedError) or error.status == 0x8003
 
 
 async def test_where_nothing_listens_is_said_at_once() -> None:

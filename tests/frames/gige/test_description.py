@@ -14,7 +14,7 @@ from smartcam.exceptions import FrameSourceError, MessageError
 from smartcam.frames._gige import _description
 from smartcam.frames._gige._description import locate, parse, unpack
 from smartcam.frames._gige._expressions import evaluate
-from smartcam.frames._gige._features import Features
+from smartcam.frames._gige._features import GenicamFeatures
 from tests.frames.gige.camera import DESCRIPTION
 
 
@@ -109,9 +109,9 @@ class Memory:
         self.data[address : address + len(data)] = data
 
 
-def features(text: str) -> tuple[Features, Memory]:
+def features(text: str) -> tuple[GenicamFeatures, Memory]:
     memory = Memory()
-    return Features(parse(text.encode()), memory, "cam"), memory
+    return GenicamFeatures(parse(text.encode()), memory, "cam"), memory
 
 
 async def test_features_of_each_kind() -> None:

@@ -15,21 +15,21 @@ from tests.frames.gige.packets import header, leader, trailer
 @pytest.mark.parametrize(
     ("packet", "expected"),
     [
-        (gvcp.encode(gvcp.Command.DISCOVERY, 1, flags=0x11), "4211000200000001"),
+        (gvcp.encode(gvcp.GvcpCommand.DISCOVERY, 1, flags=0x11), "4211000200000001"),
         (
-            gvcp.encode(gvcp.Command.READREG, 2, gvcp.read_registers(0x0A00)),
+            gvcp.encode(gvcp.GvcpCommand.READREG, 2, gvcp.read_registers(0x0A00)),
             "420100800004000200000a00",
         ),
         (
-            gvcp.encode(gvcp.Command.WRITEREG, 3, gvcp.write_registers((0x0A00, 2))),
+            gvcp.encode(gvcp.GvcpCommand.WRITEREG, 3, gvcp.write_registers((0x0A00, 2))),
             "420100820008000300000a0000000002",
         ),
         (
-            gvcp.encode(gvcp.Command.READMEM, 4, gvcp.read_memory(0x200, 512)),
+            gvcp.encode(gvcp.GvcpCommand.READMEM, 4, gvcp.read_memory(0x200, 512)),
             "4201008400080004" + "0000020000000200",
         ),
         (
-            gvcp.encode(gvcp.Command.WRITEMEM, 5, gvcp.write_memory(0x200, b"abcd")),
+            gvcp.encode(gvcp.GvcpCommand.WRITEMEM, 5, gvcp.write_memory(0x200, b"abcd")),
             "4201008600080005" + "0000020061626364",
         ),
         (
@@ -48,7 +48,7 @@ def test_requests(packet: bytes, expected: str) -> None:
 
 def test_an_answer() -> None:
     ack = gvcp.decode_ack(bytes.fromhex("8006008300000003"))
-    assert tuple(ack) == (gvcp.Status.ACCESS_DENIED, 0x83, 3, b"")
+    assert tuple(ack) == (gvcp.GvcpStatus.ACCESS_DENIED, 0x83, 3, b"")
     assert gvcp.status_text(0x8006) == "ACCESS_DENIED (0x8006)"
     assert gvcp.status_text(0x9001) == "status 0x9001"
     with pytest.raises(MessageError, match="4 bytes of payload are announced, got 2"):
