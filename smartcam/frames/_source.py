@@ -394,7 +394,7 @@ class FrameSource(FrameSink):
     async def close(self) -> None:
         """Stop streaming and give the device back; readers end. Idempotent.
 
-        Cancellation: the device is given back all the same.
+        Cancellation: the device is given back first; how long that takes its driver bounds.
         """
         task, self._task, self._format = self._task, None, None
         for reader in self._alive():
@@ -402,7 +402,14 @@ class FrameSource(FrameSink):
         if task is None:
             return
         task.cancel()
-        await asyncio.wait([task])
+        cancelled: asyncio.CancelledError | None = None
+        while not task.done():
+            try:
+                await asyncio.wait([task])
+            except asyncio.CancelledError as error:
+                cancelled = error
+        if cancelled is not None:
+            raise cancelled
         if not task.cancelled() and (error := task.exception()) is not None:
             raise error
 
