@@ -406,8 +406,8 @@ class FrameSource(FrameSink):
         while not task.done():
             try:
                 await asyncio.wait([task])
-            except asyncio.CancelledError as error:
-                cancelled = error
+            except asyncio.CancelledError as again:
+                cancelled = again
         if cancelled is not None:
             raise cancelled
         if not task.cancelled() and (error := task.exception()) is not None:
