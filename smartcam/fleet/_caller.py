@@ -48,7 +48,9 @@ class Met:
     """
 
     def __init__(self, agent: str, epoch: int, hello: dict[str, Any]) -> None:
-        self.agent, self.epoch, self.hello = agent, epoch, hello
+        self.agent: str = agent
+        self.epoch: int = epoch
+        self.hello: dict[str, Any] = hello
 
 
 class Caller:
@@ -77,8 +79,10 @@ class Caller:
         on_met: Callable[[Met], None],
         on_lost: Callable[[LinkError], None],
     ) -> None:
-        self.name, self.camera, self.program = name, camera, program
-        self.counters = counters
+        self.name: str = name
+        self.camera: str = camera
+        self.program: Program = program
+        self.counters: Counters = counters
         self.met: Met | None = None
         self.trouble: LinkError | None = None
         self.end: LinkError | None = None

@@ -135,6 +135,9 @@ class VideoReading(PictureReading):
         try:
             self._stream = self._first_stream()
             self._packets = self._container.demux(self._stream)
+            rate = self._stream.average_rate  # nothing may be asked for once it is closed
+            self._rate = float(rate) if rate else None
+            self._live = self.plan.network and self._container.duration is None
         except BaseException:
             self.close()
             raise
@@ -180,12 +183,12 @@ class VideoReading(PictureReading):
     @property
     def live(self) -> bool:
         """Whether a server sends it, and does not know how long it is."""
-        return self.plan.network and self._container.duration is None
+        return self._live
 
     @property
     def rate(self) -> float | None:
         """As the stream says."""
-        return float(self._stream.average_rate) if self._stream.average_rate else None
+        return self._rate
 
     def read(self) -> Read | None:
         """Return the next picture."""
