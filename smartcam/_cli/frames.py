@@ -24,7 +24,7 @@ from smartcam.exceptions import (
 )
 from smartcam.frames import FrameDriver, discover
 from smartcam.frames import open as open_frames
-from smartcam.frames._source import FRAME_TIMEOUT
+from smartcam.frames._reader import FRAME_TIMEOUT
 from smartcam.models import jsonable
 from smartcam.registry import FRAMES
 

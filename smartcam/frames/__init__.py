@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from smartcam.frames._h264 import H264Decoder, H264Encoder
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
-    from smartcam.frames._source import FrameReader, FrameSource, ReaderStatistics, SourceStatistics
+    from smartcam.frames._reader import FrameReader, ReaderStatistics
+    from smartcam.frames._source import FrameSource, SourceStatistics
     from smartcam.frames._stages import Rectifier, Undistorter
 
 __all__ = [
@@ -69,7 +70,8 @@ if not TYPE_CHECKING:
             "_h264": "H264Decoder H264Encoder",
             "_opening": "discover open",
             "_pixels": "PixelFormat find_format",
-            "_source": "FrameReader FrameSource ReaderStatistics SourceStatistics",
+            "_reader": "FrameReader ReaderStatistics",
+            "_source": "FrameSource SourceStatistics",
             "_stages": "Rectifier Undistorter",
         },
     )

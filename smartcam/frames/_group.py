@@ -13,7 +13,7 @@ from smartcam.exceptions import (
     FrameTimeoutError,
     LocalProtocolError,
 )
-from smartcam.frames._source import FRAME_TIMEOUT, FrameReader
+from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

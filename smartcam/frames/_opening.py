@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, cast
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
 from smartcam.frames._address import FrameAddress
-from smartcam.frames._source import FRAME_TIMEOUT, FrameSource
+from smartcam.frames._reader import FRAME_TIMEOUT
+from smartcam.frames._source import FrameSource
 from smartcam.registry import FRAMES
 
 if TYPE_CHECKING:

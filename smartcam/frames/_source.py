@@ -1,4 +1,4 @@
-"""A source of frames: lazy, latest-only for each of its readers, with an account for each."""
+"""A source of frames: its device streams while somebody reads."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from smartcam.exceptions import (
     ConfigurationError,
     FrameFormatError,
     FrameSourceError,
-    FrameTimeoutError,
     LocalProtocolError,
 )
 from smartcam.frames._clocks import DeviceClock
 from smartcam.frames._driver import FrameSink
+from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,28 +33,6 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
-
-FRAME_TIMEOUT = 5.0
-"""Seconds that a frame is waited for, unless one says otherwise."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReaderStatistics:
-    """What became of the frames that came while a reader was there.
-
-    Attributes:
-        offered: came since it began; always delivered + skipped + waiting.
-        delivered: it took them.
-        skipped: a newer one came before it took them.
-        waiting: 1 where one is there that it has not taken, else 0.
-        lost: never came: lost in the camera or on the way.
-    """
-
-    offered: int
-    delivered: int
-    skipped: int
-    waiting: int
-    lost: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,198 +57,6 @@ class SourceStatistics:
     lost: int
     ahead: int
     clock: ClockStatistics | None
-
-
-class FrameReader:
-    """One reader of a source: an iterator that gives the newest frame, and skips what it missed.
-
-    The device streams while there is a reader. One that is closed, or that nobody holds any
-    longer, is none.
-    """
-
-    def __init__(self, source: FrameSource, timeout: float | None) -> None:
-        self._source: FrameSource | None = source
-        self._timeout = timeout
-        self._next: Frame | None = None
-        self._last: Frame | None = None  # the last one that was taken
-        self._ended = False
-        self._error: FrameSourceError | None = None
-        self._waiters: list[asyncio.Future[bool]] = []
-        self._offered = self._delivered = self._skipped = self._lost = 0
-
-    def statistics(self) -> ReaderStatistics:
-        """Return the account as it is now."""
-        return ReaderStatistics(
-            self._offered,
-            self._delivered,
-            self._skipped,
-            int(self._next is not None),
-            self._lost,
-        )
-
-    def close(self) -> None:
-        """Read no longer; a frame that waits counts as skipped. Idempotent."""
-        if self._next is not None:
-            self._skipped += 1
-            self._next = None
-        self._last = None
-        self._end(None)
-        if self._source is not None:
-            self._source._forget(self)  # noqa: SLF001 - the two are one
-            self._source = None
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def __aiter__(self) -> Self:
-        return self
-
-    async def __anext__(self) -> Frame:
-        """Return the newest frame that was not returned yet.
-
-        Raises:
-            FrameTimeoutError: none came in time; it may be waited for again.
-            FrameSourceError: the source ended with it.
-
-        Cancellation: safe; the frame is there for the next one.
-        """
-        frame = await self._take(self._deadline(self._timeout), "the next frame")
-        if frame is None:
-            raise StopAsyncIteration
-        return frame
-
-    async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the newest frame; one that is older than ``max_age`` is waited past.
-
-        Args:
-            max_age: seconds since it was captured; ``inf``: any.
-            timeout: seconds; None: as long as it takes.
-
-        Raises:
-            FrameTimeoutError: none came in time.
-            FrameSourceError: the source ended.
-
-        Cancellation: safe.
-        """
-        what = f"a frame of the last {max_age:g} s"
-        held = self._next or self._last
-        if held is not None and held.age <= max_age:
-            return self._taken(held)
-        return await self._first(what, timeout, lambda frame: frame.age <= max_age)
-
-    async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the first frame that is here, or comes, whose exposure began after a moment.
-
-        Where the source does not tell when the exposure began, it is the first one of which that is
-        sure: see :attr:`Frame.began`.
-
-        Args:
-            moment: of ``time.monotonic()``.
-            timeout: seconds; None: as long as it takes.
-
-        Raises:
-            FrameTimeoutError: none came in time.
-            FrameSourceError: the source ended.
-
-        Cancellation: safe; frames that came before are skipped.
-        """
-        for held in (self._last, self._next):
-            if held is not None and held.began >= moment:
-                return self._taken(held)
-        what = "a frame exposed after the moment that was given"
-        return await self._first(what, timeout, lambda frame: frame.began >= moment)
-
-    async def _first(
-        self, what: str, timeout: float | None, wanted: Callable[[Frame], bool]
-    ) -> Frame:
-        """Return the first frame that comes and is wanted."""
-        end = self._deadline(timeout)
-        while (frame := await self._take(end, what)) is not None:
-            if wanted(frame):
-                return frame
-        raise FrameSourceError(f"{self._name}: expected {what}, it ended", source=self._name)
-
-    @property
-    def _name(self) -> str:
-        return self._source.name if self._source is not None else "a closed reader"
-
-    @staticmethod
-    def _deadline(timeout: float | None) -> float | None:
-        return None if timeout is None else asyncio.get_running_loop().time() + timeout
-
-    async def _take(self, end: float | None, what: str) -> Frame | None:
-        """Return the next frame as soon as there is one; None at the end of the source."""
-        while self._next is None and not self._ended:
-            if not await self._woken(end):
-                raise FrameTimeoutError(
-                    f"{self._name}: expected {what}, got none in time", source=self._name
-                )
-        if self._next is not None:
-            return self._taken(self._next)
-        if self._error is not None:
-            raise self._error
-        return None
-
-    async def _woken(self, end: float | None) -> bool:
-        """Wait until something came, or return False when its time is over.
-
-        A future and a timer: what asyncio has for it costs twice as much, for each frame.
-        """
-        loop = asyncio.get_running_loop()
-        waiter: asyncio.Future[bool] = loop.create_future()
-        timer = None if end is None else loop.call_at(end, _settle, waiter, False)
-        self._waiters.append(waiter)
-        try:
-            return await waiter or self._next is not None
-        finally:
-            self._waiters.remove(waiter)
-            if timer is not None:
-                timer.cancel()
-
-    def _wake(self) -> None:
-        for waiter in self._waiters:
-            _settle(waiter, True)
-
-    def _offer(self, frame: Frame) -> None:
-        self._offered += 1
-        if self._next is not None:
-            self._skipped += 1
-        self._next = frame
-        self._wake()
-
-    def _miss(self, count: int) -> None:
-        self._lost += count
-
-    def _skip(self, count: int) -> None:
-        self._offered += count
-        self._skipped += count
-
-    def _end(self, error: FrameSourceError | None) -> None:
-        if not self._ended:
-            self._ended, self._error = True, error
-        self._wake()
-
-    def _taken(self, frame: Frame) -> Frame:
-        if frame is self._next:
-            self._next = None
-            self._delivered += 1
-            if self._source is not None:
-                self._source._took.set()  # noqa: SLF001 - the two are one
-        self._last = frame
-        return frame
-
-
-def _settle(waiter: asyncio.Future[bool], came: bool) -> None:
-    if not waiter.done():
-        waiter.set_result(came)
 
 
 class FrameSource(FrameSink):
