@@ -13,7 +13,6 @@ from smartcam.frames._h264 import H264Decoder, H264Encoder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
     from typing import Literal, Self
 
     from smartcam.frames._frame import Frame
@@ -69,12 +68,7 @@ class Codecs:
         self._pool = ThreadPoolExecutor(self._threads, "smartcam codecs")
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:

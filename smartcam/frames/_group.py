@@ -17,7 +17,6 @@ from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import TracebackType
     from typing import Self
 
     from smartcam.frames._frame import Frame
@@ -172,12 +171,7 @@ class FrameGroup:
         self._open = True
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:

@@ -23,7 +23,7 @@ from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import EllipsisType, TracebackType
+    from types import EllipsisType
     from typing import Self
 
     from smartcam.calibration._lens.model import CameraModel
@@ -169,12 +169,7 @@ class FrameSource(FrameSink):
             )
         return form
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:
