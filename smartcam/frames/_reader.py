@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam.exceptions import FrameSourceError, FrameTimeoutError
+from smartcam.exceptions import ConfigurationError, FrameSourceError, FrameTimeoutError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -107,11 +108,14 @@ class FrameReader:
             timeout: seconds; None: as long as it takes.
 
         Raises:
+            ConfigurationError: a time that is none.
             FrameTimeoutError: none came in time.
             FrameSourceError: the source ended.
 
         Cancellation: safe.
         """
+        if not max_age >= 0:
+            raise ConfigurationError(f"max_age: expected 0 or more seconds, got {max_age!r}")
         what = f"a frame of the last {max_age:g} s"
         held = self._next or self._last
         if held is not None and held.age <= max_age:
@@ -129,11 +133,14 @@ class FrameReader:
             timeout: seconds; None: as long as it takes.
 
         Raises:
+            ConfigurationError: a time that is none.
             FrameTimeoutError: none came in time.
             FrameSourceError: the source ended.
 
         Cancellation: safe; frames that came before are skipped.
         """
+        if not math.isfinite(moment):
+            raise ConfigurationError(f"moment: expected seconds, got {moment!r}")
         for held in (self._last, self._next):
             if held is not None and held.began >= moment:
                 return self._taken(held)
@@ -156,7 +163,13 @@ class FrameReader:
 
     @staticmethod
     def _deadline(timeout: float | None) -> float | None:
-        return None if timeout is None else asyncio.get_running_loop().time() + timeout
+        if timeout is None:
+            return None
+        if not timeout >= 0:
+            raise ConfigurationError(
+                f"timeout: expected 0 or more seconds or None, got {timeout!r}"
+            )
+        return asyncio.get_running_loop().time() + timeout
 
     async def _take(self, end: float | None, what: str) -> Frame | None:
         """Return the next frame as soon as there is one; None at the end of the source."""

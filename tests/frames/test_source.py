@@ -162,6 +162,22 @@ async def test_wait_that_runs_out_says_for_what_and_the_next_one_works() -> None
         assert (await anext(reader)).sequence == 1
 
 
+async def test_wait_for_a_time_that_is_none_is_refused() -> None:
+    _, source = scripted(timeout=None)
+    nan = float("nan")
+    async with source, source.reader() as reader:
+        for waiting in (
+            reader.newest(max_age=-1, timeout=None),
+            reader.newest(max_age=nan, timeout=None),
+            reader.newest(timeout=nan),
+            reader.after(nan, timeout=None),
+            reader.after(float("inf"), timeout=None),
+            source.newest(max_age=nan, timeout=None),
+        ):
+            with pytest.raises(ConfigurationError, match="expected .*seconds"):
+                await waiting
+
+
 async def test_wait_that_is_cancelled_loses_no_frame() -> None:
     driver, source = scripted()
     async with source, source.reader() as reader:
