@@ -174,7 +174,7 @@ async def test_wait_for_a_time_that_is_none_is_refused() -> None:
             reader.after(float("inf"), timeout=None),
             source.newest(max_age=nan, timeout=None),
         ):
-            with pytest.raises(ConfigurationError, match="expected .*seconds"):
+            with pytest.raises(ConfigurationError, match=r"expected .*seconds"):
                 await waiting
 
 
