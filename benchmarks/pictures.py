@@ -2,8 +2,8 @@
 
 Colour and 16-bit depth of :mod:`benchmarks.scenes`, 640 x 480 at 30 a second, half of it standing
 still. What loses something is set so that the PSNR of the brightness, over all frames, is what the
-line says; what loses nothing is what it is. The yardstick is the raw picture. Encoding and decoding are
-CPU time of the process with all its threads.
+line says; what loses nothing is what it is. The yardstick is the raw picture. Encoding and decoding
+are CPU time of the process with all its threads.
 """
 
 from __future__ import annotations
