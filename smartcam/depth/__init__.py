@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING
 
 from smartcam._lazy import lazy
 
-if TYPE_CHECKING:
-    pass
-
 __all__: list[str] = []
 
 if not TYPE_CHECKING:

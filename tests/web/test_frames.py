@@ -18,9 +18,10 @@ import pytest
 from smartcam.exceptions import ConfigurationError, FrameFormatError, MissingExtraError
 from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import FramesSite
-from smartcam.web import _frames as frames_module
-from smartcam.web._frames import CALLS, MAX_VIEWERS, PROTOCOL, Press
+from smartcam.web import _pictures as pictures_module
+from smartcam.web._frames import CALLS
 from smartcam.web._jpeg import TABLES, is_whole_jpeg, jpeg, picture
+from smartcam.web._pictures import MAX_VIEWERS, PROTOCOL, Press
 from smartcam.web._streams import SLOW
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.web.sitekit import TOKEN, Caller, Raw, until
@@ -152,7 +153,7 @@ async def test_looker_that_shows_nothing_more_is_disconnected() -> None:
         await all_of.driver.streams()
         all_of.driver.give(plain(1))
         await looker.picture()
-        message = await looker.socket.receive()  # takes no time of ours, but frames_module.SLOW
+        message = await looker.socket.receive()  # takes no time of ours, but pictures_module.SLOW
         assert message.type in {aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR}
         await all_of.driver.rests()
 
@@ -257,7 +258,7 @@ async def test_site_that_stops_says_good_bye() -> None:
 
 
 async def test_viewers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frames_module, "MAX_VIEWERS", 1)
+    monkeypatch.setattr(pictures_module, "MAX_VIEWERS", 1)
     assert MAX_VIEWERS >= 16  # four people before four cameras
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
@@ -369,7 +370,7 @@ async def test_press_makes_a_frame_once_for_all_and_a_cancelled_one_spoils_nothi
         made.append(one.sequence)
         return b"jpeg"
 
-    monkeypatch.setattr(frames_module, "jpeg", slow)
+    monkeypatch.setattr(pictures_module, "jpeg", slow)
     with ThreadPoolExecutor(1) as threads:
         press, one = Press(threads, 80), plain(1)
         waiting = [asyncio.create_task(press.jpeg(one)) for _ in range(3)]
