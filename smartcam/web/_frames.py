@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from aiohttp import web
 
 from smartcam.exceptions import FrameSourceError, LocalProtocolError
 from smartcam.web._errors import RefusedError, shown
 from smartcam.web._jpeg import require_encoder
-from smartcam.web._pictures import Pictures
+from smartcam.web._pictures import FILES, Pictures
 from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._site import API, Site
 
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames import FrameSource
     from smartcam.web._pictures import Viewer
-
-FILES: Final = ("pictures.css", "pictures.js")
-"""What pages with pictures have beside their own."""
 
 
 class FramesSite(Site):

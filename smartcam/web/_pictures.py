@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.web")
 
+FILES: Final = ("pictures.css", "pictures.js")
+"""What pages with pictures have beside their own."""
+
 MAX_VIEWERS: Final = 32
 """WebSockets at a time: eight people before four cameras."""
 
@@ -56,6 +59,10 @@ THREADS: Final = 2
 
 AGAIN: Final = Backoff(initial=0.5, maximum=5.0)
 """When a source that ended with an error is read again."""
+
+
+def _heard(_error: SmartCamError | None) -> None:
+    """Hear of a try."""
 
 
 class Pictures:
@@ -93,7 +100,13 @@ class Pictures:
             one.end()
 
     async def stop(self) -> None:
-        """End the threads; nobody looks any longer."""
+        """End the threads, once nobody looks any longer.
+
+        Cancellation: takes effect at once; the threads end by themselves.
+        """
+        self.end_viewers()
+        for one in tuple(self.viewers):
+            await one.gone.wait()
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)
@@ -125,7 +138,9 @@ class Pictures:
     def _failure(self, place: int) -> str:
         return self.failures.get(place, f"{self.sources[place].name} is not open")
 
-    async def keep_open(self, place: int, tried: Callable[[SmartCamError | None], None]) -> None:
+    async def keep_open(
+        self, place: int, tried: Callable[[SmartCamError | None], None] = _heard
+    ) -> None:
         """Have a source open until this is cancelled, and try again where it cannot be opened.
 
         Args:
@@ -201,6 +216,7 @@ class Viewer:
     Attributes:
         place: of the source.
         address: of who looks.
+        gone: is set when that is over.
     """
 
     def __init__(self, pictures: Pictures, place: int, request: web.Request) -> None:
@@ -213,6 +229,7 @@ class Viewer:
             protocols=(PROTOCOL,), max_msg_size=LONGEST_WORD, timeout=FAREWELL, compress=False
         )
         self._shown = asyncio.Event()  # the page has shown the last picture
+        self.gone = asyncio.Event()
         self._ending = asyncio.Event()
         self._sent = 0
 
@@ -238,6 +255,7 @@ class Viewer:
             pass  # the page is gone
         finally:
             self._pictures.viewers.discard(self)
+            self.gone.set()
             if not any(one.place == self.place for one in self._pictures.viewers):
                 self._pictures.press(self.place).forget()
         return self._socket

@@ -111,6 +111,7 @@ function takeState(value) {
   };
   $("facts").replaceChildren(...list(facts));
   showControls(can);
+  takeFrames();
   $("image-panel").hidden = !can.read_image;
   if (can.read_image) setText("image-note", state.picture_error || ($("image").hidden ? "Not fetched yet." : ""));
   arrange();
@@ -333,7 +334,33 @@ function arrange() {
   const shown = [$("scene-panel"), $("image-panel")].filter((one) => !one.hidden).length;
   $("main").classList.toggle("plain", shown === 0);
   $("main").classList.toggle("both", shown === 2);
+  $("main").classList.toggle("seeing", frames !== null);
 }
+
+// ---------------------------------------------------------------------- frames
+
+let frames = null; // the newest frame of a camera that has some
+
+function takeFrames() {
+  if (state.frames === Boolean(frames)) return;
+  if (frames) {
+    frames.end();
+    frames.panel.remove();
+    frames = null;
+    return;
+  }
+  frames = new Source({ name: "What the camera sees", path: "/api/frames" });
+  frames.view.addEventListener("click", enlarge);
+  $("main").append(frames.panel);
+}
+
+function enlarge() {
+  const large = frames?.panel.classList.toggle("large") ?? false;
+  frames?.view.setAttribute("aria-pressed", String(large));
+}
+
+document.addEventListener("keydown", ({ key }) => key === "Escape" && frames?.panel.classList.contains("large") && enlarge());
+setInterval(() => frames?.age(), 250);
 
 // ---------------------------------------------------------------------- picture
 

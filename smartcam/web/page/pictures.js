@@ -16,8 +16,9 @@ const COUNTS = [
 ];
 
 export class Source {
-  // path: of its WebSocket; place: among others; lost: is called when the connection has gone.
-  constructor({ name, path, place = 0, lost }) {
+  // path: of its WebSocket; place: among others; lost: is called when the connection has gone, and
+  // has connect() called.
+  constructor({ name, path, place = 0, lost = () => this.connect() }) {
     Object.assign(this, { path, lost });
     this.counts = Object.fromEntries(COUNTS.map(([key]) => [key, make("dd", { "data-count": key, textContent: "-" })]));
     this.title = make("h2", { textContent: name });
