@@ -73,7 +73,7 @@ class SharedH264:
         self._resting: asyncio.TimerHandle | None = None
         self._key: Frame | None = None  # the last one since it began to read
         self._key_wanted = False
-        self._key_came = 0.0
+        self._key_came = -KEY_PAUSE
 
     @property
     def viewers(self) -> int:
@@ -81,7 +81,9 @@ class SharedH264:
         return len(self._viewers)
 
     def join(self, viewer: StreamViewer) -> None:
-        """Hand a viewer what is encoded from now on; a key frame comes soon."""
+        """Hand a viewer what is encoded from now on; a key frame comes soon, to the first at once."""
+        if not self._viewers:
+            self._key_came = -KEY_PAUSE
         self._viewers[viewer] = None
         self._key_wanted = True
         self._go()
