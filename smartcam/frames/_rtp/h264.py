@@ -178,6 +178,7 @@ class AccessUnit(NamedTuple):
         lost: packets that were lost since the last one that came whole.
         damaged: frames since then that did not come whole, as far as one saw something of them.
         arrived: when its first packet did, as it was told; 0.0 where it was not.
+        begins: whether it is the first one of a stream: nothing before it belongs to that.
     """
 
     data: bytes
@@ -185,6 +186,7 @@ class AccessUnit(NamedTuple):
     lost: int = 0
     damaged: int = 0
     arrived: float = 0.0
+    begins: bool = False
 
 
 class _Open:
@@ -281,6 +283,7 @@ class H264Depacketizer:
         self._open: _Open | None = None
         self._sure = False  # that the next packet is the first one of a frame
         self._closed: int | None = None  # timestamp of the last frame that ended
+        self._begins = True  # until a frame is whole
         self._odd: int | None = None  # what would follow a sequence number that was far off
 
     def take(self, packet: RtpPacket, now: float = 0.0) -> list[AccessUnit]:
@@ -379,10 +382,12 @@ class H264Depacketizer:
             return
         lost, damaged = self._told
         self._told = (self.lost, self.damaged)
-        data = b"".join(ended.parts)
-        yield AccessUnit(
-            data, ended.timestamp, self.lost - lost, self.damaged - damaged, ended.arrived
+        since, begins, self._begins = (
+            (self.lost - lost, self.damaged - damaged),
+            self._begins,
+            False,
         )
+        yield AccessUnit(b"".join(ended.parts), ended.timestamp, *since, ended.arrived, begins)
 
     def _damage_open(self) -> None:
         if self._open is not None:

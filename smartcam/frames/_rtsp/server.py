@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from smartcam._accepting import Acceptor
 from smartcam._server import Server
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, LocalProtocolError
 from smartcam.frames._codecs import Codecs
 from smartcam.frames._rtsp.addresses import NAME
 from smartcam.frames._rtsp.authentication import Authentication
@@ -58,7 +58,7 @@ class RtspServer(Server):
     encrypted: with Digest the password itself does not go over the network.
 
     Args:
-        sources: that are open as long as this is started, by name: 1 to 64 letters, digits and
+        sources: by name; who asks for one that is not open is answered 503. A name has 1 to 64 letters, digits and
             ``. _ ~ -``, the first a letter or digit.
         host: to listen on.
         port: to listen on; 0: any.
@@ -145,7 +145,6 @@ class RtspServer(Server):
 
         Raises:
             ConfigurationError: it cannot listen there, or a number is out of its range.
-            LocalProtocolError: a source is not open.
             MissingExtraError: the extra ``video`` is not installed.
 
         Cancellation: leaves it stopped.
@@ -201,8 +200,7 @@ class RtspServer(Server):
         for source in self._sources.values():
             if id(source) in shared:
                 continue
-            said = source.format.rates[0] if source.format.rates else RATE
-            rate = self._fps if self._fps is not None else min(max(said, 0.01), 1000.0)
+            rate = self._fps if self._fps is not None else _rate(source)
             encoder = codecs.h264_encoder(
                 fps=rate, keyint=self._keyint, crf=self._crf, bitrate=self._bitrate
             )
@@ -247,6 +245,15 @@ class RtspServer(Server):
         """Count a viewer no longer."""
         self._viewers -= 1
         session.stream.viewers -= 1
+
+
+def _rate(source: FrameSource) -> float:
+    """Return the frames a second that a source says, or the usual where it is not open yet."""
+    try:
+        rates = source.format.rates
+    except LocalProtocolError:
+        rates = ()
+    return min(max(rates[0], 0.01), 1000.0) if rates else RATE
 
 
 class _Open:
