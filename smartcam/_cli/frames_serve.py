@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 import sys
 from datetime import datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from smartcam._cli.frame_players import (
+    USER,
+    Players,
+    address,
+    names_of,
+    rtsp_server,
+    rtsp_urls,
+    send_rtp,
+)
 from smartcam._cli.frame_sources import TIMEOUT, opened
 from smartcam._cli.options import OUTPUT, Options, option, runs
 from smartcam._cli.page import PageOptions, page_options
@@ -19,14 +26,14 @@ from smartcam._cli.running import first
 from smartcam.exceptions import (
     ConfigurationError,
     FrameFormatError,
-    SmartCamError,
     UnsupportedError,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from smartcam.frames import FrameSource
+    from smartcam.exceptions import SmartCamError
+    from smartcam.frames import RtspServer
     from smartcam.web import FramesSite
 
 MOST_SHOWN = 4
@@ -37,36 +44,6 @@ FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
 
 PERIOD = 1.0
 """Seconds between two looks at who looks."""
-
-USER = "smartcam"
-"""Of RTSP, where it wants the token."""
-
-
-class Players(NamedTuple):
-    """What is served beside the page.
-
-    Attributes:
-        rtsp: address to listen on for RTSP, None for none.
-        rtp: address to send one source to, None for none.
-        sdp: file to write the description of that to, None for stdout.
-    """
-
-    rtsp: tuple[str, int] | None = None
-    rtp: tuple[str, int] | None = None
-    sdp: str | None = None
-
-
-def address(_context: object, parameter: click.Parameter, text: str | None) -> Any:
-    """Return the host and port of ``HOST:PORT``, None for None."""
-    if text is None:
-        return None
-    host, colon, port = text.rpartition(":")
-    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    if not (colon and host and port.isdecimal() and len(port) <= 5 and int(port) <= 65535):
-        raise click.BadParameter(
-            f"{text!r}: expected HOST:PORT, such as 127.0.0.1:8554 or [::1]:8554", param=parameter
-        )
-    return host, int(port)
 
 
 def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., None]]:
@@ -177,26 +154,20 @@ async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Opt
     await tries.done.wait()
     tries.check()
     async with contextlib.AsyncExitStack() as stack:
-        served: dict[str, Any] = {}
+        server: RtspServer | None = None
+        urls: dict[str, str] = {}
         if players.rtsp is not None:
-            served["rtsp"] = await _rtsp(site, players.rtsp, stack)
-        if players.rtp is not None:
-            served |= await _rtp(site.sources[0], players, stack)
+            server, password = rtsp_server(site.sources, players.rtsp, site.token)
+            await stack.enter_async_context(server)
+            urls = rtsp_urls(server, site.sources, password)
         await stack.enter_async_context(site)
-        options.show({"page": site.url, **served}, _text({"page": site.url, **served}))
-        await _tell_viewers(site)
-
-
-def _text(served: dict[str, Any]) -> str:
-    """Return what is served, for people."""
-    lines = [f"page: {served['page']}"]
-    lines += [f"rtsp: {url}" for url in served.get("rtsp", {}).values()]
-    if "rtp" in served:
-        lines.append(f"rtp: {served['rtp']}")
-        lines.append(
-            str(served["sdp"]).strip() if "file" not in served else f"sdp: {served['file']}"
-        )
-    return "\n".join(lines)
+        lines = [f"page: {site.url}", *(f"rtsp: {url}" for url in urls.values())]
+        value = {"page": site.url, **({"rtsp": urls} if urls else {})}
+        options.show(value, "\n".join(lines))
+        jobs = [_tell_viewers(site, server)]
+        if players.rtp is not None:
+            jobs.append(send_rtp(site.sources[0], players, options))
+        await first(jobs, None)
 
 
 class _Tries:
@@ -233,82 +204,29 @@ class _Tries:
             raise error
 
 
-# ---------------------------------------------------------------------- players
-
-
-def names_of(sources: Sequence[FrameSource]) -> dict[str, FrameSource]:
-    """Return sources by names that a URL can have, each its own."""
-    named: dict[str, FrameSource] = {}
-    for one in sources:
-        plain = re.sub(r"[^A-Za-z0-9._-]+", "-", one.name).strip("-.") or "camera"
-        numbered = (f"{plain}-{number}" for number in range(2, len(sources) + 2))
-        named[next(name for name in (plain, *numbered) if name not in named)] = one
-    return named
-
-
-def _password(site: FramesSite, host: str) -> str | None:
-    """Return what a player must know: the page's token, or one of its own where others can come."""
-    from smartcam.web._guard import is_loopback, new_token
-
-    return site.token or (None if is_loopback(host) else new_token())
-
-
-async def _rtsp(
-    site: FramesSite, place: tuple[str, int], stack: contextlib.AsyncExitStack
-) -> dict[str, str]:
-    """Serve by RTSP; return the URLs by name."""
-    from smartcam.frames import RtspServer
-
-    (host, port), sources = place, names_of(site.sources)
-    password = _password(site, host)
-    user = None if password is None else USER
-    made = RtspServer(sources, host=host, port=port, user=user, password=password)
-    server = await stack.enter_async_context(made)
-    return {name: server.url(name) for name in sources}
-
-
-async def _rtp(
-    source: FrameSource, players: Players, stack: contextlib.AsyncExitStack
-) -> dict[str, Any]:
-    """Send by RTP; return where to, and what a player has to know."""
-    from smartcam.frames import RtpSender
-
-    host, port = players.rtp or ("", 0)
-    to = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-    sender = await stack.enter_async_context(RtpSender(source, to))
-    said: dict[str, Any] = {"rtp": to, "sdp": sender.sdp}
-    if players.sdp is not None:
-        try:
-            await asyncio.to_thread(Path(players.sdp).write_text, sender.sdp, "utf-8")
-        except OSError as exc:
-            raise ConfigurationError(f"--sdp {players.sdp}: {exc.strerror}") from exc
-        said["file"] = players.sdp
-    return said
-
-
 # ---------------------------------------------------------------------- who looks
 
 
-async def _tell_viewers(site: FramesSite) -> None:
+async def _tell_viewers(site: FramesSite, server: RtspServer | None) -> None:
     """Tell on a terminal's stderr who looks, when that changes; until cancelled."""
     if not sys.stderr.isatty():
         await asyncio.Event().wait()
-    told = viewers_text(site)
+    told = viewers_text(site, server)
     while True:
         await asyncio.sleep(PERIOD)
-        text = viewers_text(site)
+        text = viewers_text(site, server)
         if text != told:
             told = text
             click.echo(f"{datetime.now().astimezone():%H:%M:%S} {text}", err=True)
 
 
-def viewers_text(site: FramesSite) -> str:
-    """Return who looks at which source: addresses of those at the page, how many others."""
-    rows = []
-    for place, source in enumerate(site.sources):
-        at_page = [one.address for one in site.viewers if one.place == place]
-        others = source.statistics().readers - len(at_page)
-        who = [*sorted(at_page), *([f"{others} more"] if others > 0 else [])]
-        if who:
-            rows.append(f"{source.name}: {', '.join(who)}")
+def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
+    """Return who looks at which source: addresses of those at the page, how many by RTSP."""
+    played = {} if server is None else server.statistics()
+    rows: list[str] = []
+    for place, (name, source) in enumerate(names_of(site.sources).items()):
+        who = sorted(one.address for one in site.viewers if one.place == place)
+        by_rtsp = played[name].viewers if name in played else 0
+        who += [f"{by_rtsp} by RTSP"] if by_rtsp else []
+        rows += [f"{source.name}: {', '.join(who)}"] if who else []
     return "; ".join(rows) or "nobody looks"

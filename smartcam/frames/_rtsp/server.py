@@ -58,8 +58,8 @@ class RtspServer(Server):
     encrypted: with Digest the password itself does not go over the network.
 
     Args:
-        sources: by name; who asks for one that is not open is answered 503. A name has 1 to 64 letters, digits and
-            ``. _ ~ -``, the first a letter or digit.
+        sources: by name; who asks for one that is not open is answered 503. A name has 1 to 64
+            letters, digits and ``. _ ~ -``, the first a letter or digit.
         host: to listen on.
         port: to listen on; 0: any.
         user: that may look; None: everybody may.
