@@ -111,7 +111,7 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
 
     host, port = players.rtp or ("", 0)
     to = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-    told, delays = "", Backoff().delays()
+    told, noted, delays = "", "", Backoff().delays()
     while True:
         try:
             async with RtpSender(source, to) as sender:
@@ -119,12 +119,15 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
                 if sender.sdp != told and (players.sdp is not None or not told):
                     await _describe(to, sender.sdp, players.sdp, options, again=bool(told))
                     told = sender.sdp
+                noted, delays = "", Backoff().delays()
                 await sender.wait()
         except LocalProtocolError:  # the source is not open
             await asyncio.sleep(LOOK)
             continue
         except FrameSourceError as exc:
-            click.echo(f"note: RTP to {to}: {exc}; it is tried again", err=True)
+            if str(exc) != noted:
+                click.echo(f"note: {exc}; RTP is tried again", err=True)
+            noted = str(exc)
         await asyncio.sleep(next(delays))
 
 
