@@ -42,6 +42,9 @@ MOST_SHOWN = 4
 FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
 """Errors of a source that will hardly ever be what was asked for."""
 
+FIRST = 3.0
+"""Seconds that the first try of each source is waited for, before the others are served."""
+
 PERIOD = 1.0
 """Seconds between two looks at who looks."""
 
@@ -146,13 +149,14 @@ async def serve_sources(
     site = FramesSite(sources, quality=quality, **web.place)
     tries = _Tries(len(sources))
     keeping = [site.pictures.keep_open(place, tries.of(place)) for place in range(len(sources))]
-    await first([_serve(site, tries, players, options), *keeping], options.seconds)
+    await first([_serve(site, tries, players, options), *keeping], None)
 
 
 async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Options) -> None:
-    """Serve, once each source was tried."""
-    await tries.done.wait()
-    tries.check()
+    """Serve, once each source was tried, or :data:`FIRST` seconds are over."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(FIRST):
+            await tries.check()
     async with contextlib.AsyncExitStack() as stack:
         server: RtspServer | None = None
         urls: dict[str, str] = {}
@@ -164,17 +168,17 @@ async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Opt
         lines = [f"page: {site.url}", *(f"rtsp: {url}" for url in urls.values())]
         value = {"page": site.url, **({"rtsp": urls} if urls else {})}
         options.show(value, "\n".join(lines))
-        jobs = [_tell_viewers(site, server)]
+        jobs = [_tell_viewers(site, server), tries.watch()]
         if players.rtp is not None:
             jobs.append(send_rtp(site.sources[0], players, options))
-        await first(jobs, None)
+        await first(jobs, options.seconds)
 
 
 class _Tries:
     """What became of the first try of each source; later ones that fail are told on stderr."""
 
     def __init__(self, count: int) -> None:
-        self.done = asyncio.Event()  # each was tried
+        self._done = asyncio.Event()  # each was tried
         self._count = count
         self._first: dict[int, SmartCamError | None] = {}
         self._told: dict[int, str] = {}
@@ -189,7 +193,7 @@ class _Tries:
                 click.echo(f"note: {text}; it is awaited", err=True)
             self._told[place] = text
             if len(self._first) == self._count:
-                self.done.set()
+                self._done.set()
 
         return tried
 
@@ -197,11 +201,17 @@ class _Tries:
         wrong = [isinstance(one, FOR_GOOD) for one in self._first.values()]
         return len(wrong) == self._count and all(wrong)
 
-    def check(self) -> None:
-        """Raise what is wrong with the first, where all of them are wrong for good."""
+    async def check(self) -> None:
+        """Wait until each was tried; raise what is wrong with the first, where all are for good."""
+        await self._done.wait()
         error = self._first[0]
         if error is not None and self._all_for_good():
             raise error
+
+    async def watch(self) -> None:
+        """Do so until cancelled."""
+        await self.check()
+        await asyncio.Event().wait()
 
 
 # ---------------------------------------------------------------------- who looks
