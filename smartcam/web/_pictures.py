@@ -48,6 +48,9 @@ MAX_VIEWERS: Final = 32
 PROTOCOL: Final = "smartcam.frames"
 """Of the WebSockets."""
 
+MAX_PICTURE: Final = 1 << 24
+"""Bytes of a picture that is sent; what a camera sends as a JPEG may be of any size."""
+
 ACCOUNT_PERIOD: Final = 1.0
 """Seconds without a frame after which the page is told the account all the same."""
 
@@ -188,7 +191,7 @@ class Press:
         """Return a frame as a JPEG.
 
         Raises:
-            FrameFormatError: its bytes are wrong.
+            FrameFormatError: its bytes are wrong, or too many.
             MissingExtraError: a codec is not installed.
 
         Cancellation: safe; others who wait for it get it.
@@ -196,13 +199,23 @@ class Press:
         if self._made is None or self._frame is not frame:
             loop = asyncio.get_running_loop()
             self._frame = frame
-            self._made = loop.run_in_executor(self._threads, jpeg, frame, self._quality)
+            self._made = loop.run_in_executor(self._threads, _pressed, frame, self._quality)
             self._made.add_done_callback(_seen)
         return await asyncio.shield(self._made)
 
     def forget(self) -> None:
         """Keep no picture."""
         self._frame = self._made = None
+
+
+def _pressed(frame: Frame, quality: int) -> bytes:
+    data = jpeg(frame, quality)
+    if len(data) > MAX_PICTURE:
+        raise FrameFormatError(
+            f"{frame.source}: a JPEG of {len(data)} bytes; expected {MAX_PICTURE} at most",
+            source=frame.source,
+        )
+    return data
 
 
 def _seen(made: asyncio.Future[bytes]) -> None:

@@ -245,6 +245,41 @@ async def test_frame_that_is_broken_is_told_and_the_next_is_shown() -> None:
         assert all_of.driver.calls == ["open", "start"]
 
 
+async def test_looker_that_vanishes_harms_nobody() -> None:
+    async with world() as all_of, Raw.connected(all_of.site) as raw, all_of.looking() as looker:
+        await looker.word()
+        raw.writer.write(
+            b"GET /api/sources/0/pictures HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n"
+            b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+        )
+        await until(lambda: all_of.source.statistics().readers == 2)
+        all_of.driver.give(plain(1))
+        assert (await looker.picture()).frame["sequence"] == 1
+        raw.writer.transport.abort()  # without a word, its picture on the way
+        await until(lambda: all_of.source.statistics().readers == 1)
+        await looker.next()
+        all_of.driver.give(plain(2))
+        assert (await looker.picture()).frame["sequence"] == 2
+        assert all_of.driver.calls == ["open", "start"]
+
+
+async def test_picture_that_is_too_large_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = jpeg(plain(1), 80)
+    monkeypatch.setattr(pictures_module, "MAX_PICTURE", len(small))
+    async with world() as all_of, all_of.looking() as looker:
+        await looker.word()
+        await all_of.driver.streams()
+        for extra, number in ((1, 1), (0, 2)):
+            data = small + bytes(extra)
+            mjpeg = {"data": data, "format": find_format("MJPEG"), "stride": 0}
+            all_of.driver.give(plain(number, **mjpeg))
+            if extra:
+                told = await looker.word()
+                assert told["bad"].endswith(f"expected {len(small)} at most")
+        assert (await looker.picture()).frame["sequence"] == 2
+
+
 async def test_site_that_stops_says_good_bye() -> None:
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
