@@ -11,7 +11,6 @@ from smartcam.web._pictures import Pictures
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.camera import Camera
     from smartcam.frames import FrameSource
 
 _log = logging.getLogger("smartcam.web")
@@ -49,7 +48,7 @@ class LiveFrames:
         pictures: of its frames; None where it has none.
     """
 
-    def __init__(self, camera: Callable[[], Camera[Any]]) -> None:
+    def __init__(self, camera: Callable[[], object]) -> None:
         self.pictures: Pictures | None = None
         self._camera = camera
         self._task: asyncio.Task[None] | None = None
@@ -67,7 +66,7 @@ class LiveFrames:
 
     async def _follow(self) -> None:
         while True:
-            camera = self._camera()
+            camera: object = self._camera()
             if isinstance(camera, HasFrames) and camera.has_frames:
                 await self._show(camera)
             await asyncio.sleep(LOOK)

@@ -55,7 +55,7 @@ class Shelf(ScriptedDriver):
 @pytest.fixture
 def shelf(monkeypatch: pytest.MonkeyPatch) -> dict[str, BaseException]:
     """Have ``shelf://NAME``; what is put here by a name is why that cannot be opened."""
-    reasons: ClassVar[dict[str, BaseException]] = {}
+    reasons: dict[str, BaseException] = {}
     monkeypatch.setattr(FRAMES, "_registered", {"shelf": Shelf})
     monkeypatch.setattr(FRAMES, "_loaded", {})
     monkeypatch.setattr(Shelf, "reasons", reasons)

@@ -272,8 +272,8 @@ async def test_picture_that_is_too_large_is_not_sent(monkeypatch: pytest.MonkeyP
         await all_of.driver.streams()
         for extra, number in ((1, 1), (0, 2)):
             data = small + bytes(extra)
-            mjpeg = {"data": data, "format": find_format("MJPEG"), "stride": 0}
-            all_of.driver.give(plain(number, **mjpeg))
+            mjpeg = plain(number, data=data, format=find_format("MJPEG"), stride=0)
+            all_of.driver.give(mjpeg)
             if extra:
                 told = await looker.word()
                 assert told["bad"].endswith(f"expected {len(small)} at most")
