@@ -14,10 +14,12 @@ from smartcam.frames._rtp.h264 import H264Depacketizer
 from smartcam.frames._rtp.packets import RtpPacket
 from smartcam.frames._synthetic import read_stamp
 from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped
-from tests.handmade import LIMIT
 
 if TYPE_CHECKING:
     from smartcam.frames import Codecs, H264Decoder, RtspServer
+
+LIMIT = 20.0
+"""Seconds for an answer: the server waits itself, for a frame."""
 
 TCP = "RTP/AVP/TCP;unicast;interleaved=0-1"
 

@@ -95,6 +95,9 @@ def test_the_right_password_passes_as_often_as_wanted() -> None:
     challenge = challenged(gate)
     for method in ("DESCRIBE", "SETUP", "PLAY") * 5:
         gate.check(asked(digest(challenge, method, URL, "me", "secret"), method))
+    # live555 says the stream where it asks for the track
+    gate.check(asked(digest(challenge, "SETUP", URL, "me", "secret"), "SETUP", f"{URL}/track1"))
+    gate.check(asked(digest(challenge, "PLAY", f"{URL}/", "me", "secret"), "PLAY", f"{URL}/"))
 
 
 def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
