@@ -180,9 +180,9 @@ async def test_many_requests_at_once_are_answered_in_order(server: Served) -> No
     _, serving = server
     async with await Client.connect(serving) as client:
         client.writer.write(
-            b"".join(b"OPTIONS * RTSP/1.0\r\nCSeq: %d\r\n\r\n" % n for n in range(5000))
+            b"".join(b"OPTIONS * RTSP/1.0\r\nCSeq: %d\r\n\r\n" % n for n in range(1000))
         )
-        for number in range(5000):
+        for number in range(1000):
             assert (await client.reply()).headers["cseq"] == str(number)
 
 
@@ -215,12 +215,10 @@ async def test_a_connection_that_asks_nothing_is_closed(server: Served) -> None:
 async def test_who_takes_no_answers_is_cut_off(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving, room=4096) as client:
-        flood = b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n" * 100
-        with pytest.raises(ConnectionError):
-            for _ in range(1000):
-                client.writer.write(flood)
-                await client.writer.drain()
-                await asyncio.sleep(0)
+        client.writer.write(b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n" * 10_000)
+        await until(lambda: not serving._connections)  # noqa: SLF001
+        answers = await client.everything()
+    assert 100 < answers.count(b"200 OK") < 5000
 
 
 async def test_passwords() -> None:
