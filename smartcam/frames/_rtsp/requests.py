@@ -10,8 +10,9 @@ from smartcam.frames._rtp.h264 import parameter_sets
 from smartcam.frames._rtsp.addresses import TRACK, target_of, wish_of
 from smartcam.frames._rtsp.delivery import ChannelDelivery, DatagramDelivery, port_pair
 from smartcam.frames._rtsp.messages import RtspError
+from smartcam.frames._rtsp.packing import PAYLOAD_TYPE
 from smartcam.frames._rtsp.sdp import describe
-from smartcam.frames._rtsp.session import PAYLOAD_TYPE, TIMEOUT, RtspSession
+from smartcam.frames._rtsp.session import TIMEOUT, RtspSession
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -16,6 +16,8 @@ from smartcam.frames._synthetic import read_stamp
 from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from smartcam.frames import Codecs, H264Decoder, RtspServer
 
 LIMIT = 20.0
@@ -53,7 +55,7 @@ class Client:
         reader, writer = await asyncio.open_connection(sock=sock, limit=1 << 16)
         return cls(reader, writer, server.url(name))
 
-    async def __aenter__(self) -> Client:
+    async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -190,4 +192,3 @@ class Watcher:
             number = stamp[0]
             self.numbers.append(number)
         return number
-

@@ -116,7 +116,7 @@ def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
         asked("Digest"),
     ):
         fresh = Gate(authentication)
-        fresh._nonce = gate._nonce  # noqa: SLF001 - each has its tries
+        fresh._nonce = gate._nonce
         with pytest.raises(RtspError, match="wrong user or password"):
             fresh.check(wrong)
         fresh.check(asked(right))

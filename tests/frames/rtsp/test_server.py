@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.usefixtures("no_leaks")
 
+SECRET = "secret"
 PUBLIC = "OPTIONS, DESCRIBE, SETUP, PLAY, PAUSE, GET_PARAMETER, SET_PARAMETER, TEARDOWN"
 
 
@@ -144,7 +145,9 @@ async def test_refusals(
         reply = await client.ask(method, url, **headers)
         assert reply.status == status
         assert reply.body
-        assert {405: "allow", 501: "public", 551: "unsupported"}.get(status, "cseq") in reply.headers
+        assert {405: "allow", 501: "public", 551: "unsupported"}.get(
+            status, "cseq"
+        ) in reply.headers
         assert (await client.ask("OPTIONS")).status == 200  # the connection goes on
 
 
@@ -216,31 +219,35 @@ async def test_who_takes_no_answers_is_cut_off(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving, room=4096) as client:
         client.writer.write(b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n" * 10_000)
-        await until(lambda: not serving._connections)  # noqa: SLF001
+        await until(lambda: not serving._connections)
         answers = await client.everything()
     assert 100 < answers.count(b"200 OK") < 5000
 
 
 async def test_passwords() -> None:
-    async with served(user="me", password="secret") as (driver, serving):
-        async with await Client.connect(serving) as client:
-            assert (await client.ask("OPTIONS")).status == 200
-            asked = await client.ask("DESCRIBE")
-            assert asked.status == 401
-            for method in ("DESCRIBE", "SETUP", "PLAY", "GET_PARAMETER", "TEARDOWN"):
-                wrong = digest(asked, method, client.base, "me", "wrong")
-                assert (await client.ask(method, Authorization=wrong)).status == 401
-            assert driver.calls == ["open"]  # nobody has had the device stream
-            right = digest(asked, "DESCRIBE", client.base, "me", "secret")
-            assert (await described(client, driver, Authorization=right)).status == 200
+    async with (
+        served(user="me", password=SECRET) as (driver, serving),
+        await Client.connect(serving) as client,
+    ):
+        assert (await client.ask("OPTIONS")).status == 200
+        asked = await client.ask("DESCRIBE")
+        assert asked.status == 401
+        for method in ("DESCRIBE", "SETUP", "PLAY", "GET_PARAMETER", "TEARDOWN"):
+            wrong = digest(asked, method, client.base, "me", "wrong")
+            assert (await client.ask(method, Authorization=wrong)).status == 401
+        assert driver.calls == ["open"]  # nobody has had the device stream
+        right = digest(asked, "DESCRIBE", client.base, "me", "secret")
+        assert (await described(client, driver, Authorization=right)).status == 200
 
 
 async def test_who_guesses_is_cut_off() -> None:
-    async with served(user="me", password="secret") as (_, serving):
-        async with await Client.connect(serving) as client:
-            for _ in range(10):
-                assert (await client.ask("DESCRIBE", Authorization="Digest x=y")).status == 401
-            assert await client.ended()
+    async with (
+        served(user="me", password=SECRET) as (_, serving),
+        await Client.connect(serving) as client,
+    ):
+        for _ in range(10):
+            assert (await client.ask("DESCRIBE", Authorization="Digest x=y")).status == 401
+        assert await client.ended()
 
 
 async def test_a_camera_that_is_gone_is_told_and_tried_again(server: Served) -> None:
@@ -276,7 +283,7 @@ async def test_there_are_so_many_connections_and_viewers() -> None:
                 assert await three.ended()
             assert (await one.ask("TEARDOWN")).status == 200
             await two.set_up()
-        await until(lambda: not serving._connections)  # noqa: SLF001
+        await until(lambda: not serving._connections)
         async with await Client.connect(serving) as client:
             await client.set_up()
 

@@ -7,6 +7,7 @@ import contextlib
 import errno
 import socket
 from contextlib import asynccontextmanager
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -136,7 +137,7 @@ async def test_pictures_over_the_connection(stage: Stage) -> None:
             assert await seen(client, watcher) == number
         first = int(begins["seq"])
         assert watcher.sequences == [first + n & 0xFFFF for n in range(len(watcher.sequences))]
-        steps = {b - a & 0xFFFFFFFF for a, b in zip(watcher.timestamps, watcher.timestamps[1:])}
+        steps = {b - a & 0xFFFFFFFF for a, b in pairwise(watcher.timestamps)}
         assert steps == {CLOCK}  # the pictures were exposed a second after each other
         await client.ask("PAUSE")
         before = stage.counts.sent
