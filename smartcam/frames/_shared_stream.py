@@ -81,8 +81,9 @@ class SharedH264:
         return len(self._viewers)
 
     def join(self, viewer: StreamViewer) -> None:
-        """Hand a viewer what is encoded from now on; a key frame comes soon, for the first one at
-        once.
+        """Hand a viewer what is encoded from now on.
+
+        A key frame comes soon, for the first viewer at once.
         """
         if not self._viewers:
             self._key_came = -KEY_PAUSE
