@@ -43,7 +43,7 @@ class StreamViewer(Protocol):
 
 
 @dataclass(slots=True)
-class StreamCounts:
+class EncodedCounts:
     """What was encoded: frames, key frames among them, and frames that could not be."""
 
     encoded: int = 0
@@ -64,7 +64,7 @@ class SharedH264:
 
     def __init__(self, source: FrameSource, encoder: H264Encoder) -> None:
         self.source = source
-        self.counts = StreamCounts()
+        self.counts = EncodedCounts()
         self._encoder = encoder
         self._viewers: dict[StreamViewer, None] = {}
         self._asking: set[asyncio.Future[Frame]] = set()

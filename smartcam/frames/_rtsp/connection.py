@@ -8,14 +8,14 @@ import logging
 import socket
 from typing import TYPE_CHECKING, Final, Protocol
 
-from smartcam.frames._rtsp.authentication import Gate
+from smartcam.frames._rtsp.authentication import PasswordGate
 from smartcam.frames._rtsp.delivery import MOST_WAITING, SEND_BUFFER, ChannelDelivery
 from smartcam.frames._rtsp.messages import (
     ROOM,
     ChannelData,
-    Request,
     RequestParser,
     RtspError,
+    RtspRequest,
     answer,
     cseq_of,
 )
@@ -44,7 +44,7 @@ MOST_ANSWERS, MOST_BEHIND = 64 << 10, 4 * MOST_WAITING
 """Bytes that may wait for a client: one that does not play, and one that does."""
 
 
-class Owner(Protocol):
+class ConnectionOwner(Protocol):
     """The server, as its connections see it."""
 
     authentication: Authentication
@@ -80,9 +80,9 @@ class RtspConnection(asyncio.Protocol):
 
     transport: asyncio.Transport
 
-    def __init__(self, owner: Owner) -> None:
+    def __init__(self, owner: ConnectionOwner) -> None:
         self.owner = owner
-        self.gate = Gate(owner.authentication)
+        self.gate = PasswordGate(owner.authentication)
         self.sessions: dict[str, RtspSession] = {}
         self.address: tuple[str | int, ...] = ()
         self.peer: tuple[str | int, ...] = ()
@@ -180,7 +180,7 @@ class RtspConnection(asyncio.Protocol):
     async def _run(self) -> None:
         try:
             while (message := await self._next()) is not None:
-                if isinstance(message, Request):
+                if isinstance(message, RtspRequest):
                     self._asked_at = asyncio.get_running_loop().time()
                     await self._answer(message)
                 elif not self._take(message):
@@ -193,7 +193,7 @@ class RtspConnection(asyncio.Protocol):
         finally:
             self.close()
 
-    async def _next(self) -> Request | ChannelData | None:
+    async def _next(self) -> RtspRequest | ChannelData | None:
         """Return the next message; None: there is none in time.
 
         Raises:
@@ -240,7 +240,7 @@ class RtspConnection(asyncio.Protocol):
         idle_since = asyncio.get_running_loop().time() - self._asked_at
         return bool(self.sessions) or idle_since < IDLE
 
-    async def _answer(self, request: Request) -> None:
+    async def _answer(self, request: RtspRequest) -> None:
         cseq = ""
         try:
             cseq = cseq_of(request)

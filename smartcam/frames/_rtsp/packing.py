@@ -20,7 +20,7 @@ PAYLOAD_TYPE: Final = 96
 _HEAD: Final = struct.Struct("!BBHII")
 
 
-class Cutter:
+class UnitCutter:
     """Cuts the encoded frames of one stream; the last one's pieces are kept."""
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Cutter:
         return self._pieces
 
 
-class Numbering:
+class PacketNumbers:
     """Numbers of one viewer's packets.
 
     Attributes:

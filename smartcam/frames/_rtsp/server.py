@@ -114,7 +114,7 @@ class RtspServer(Server):
         self._streams: dict[str, RtspStream] = {}
         self._connections: set[RtspConnection] = set()
         self._viewers = 0
-        self._open: _Open | None = None
+        self._open: _StartedServer | None = None
 
     @property
     def port(self) -> int:
@@ -164,7 +164,7 @@ class RtspServer(Server):
         self._port = listener.getsockname()[1]
         self._streams = streams
         acceptor = Acceptor(lambda: RtspConnection(self), _log, name="smartcam.rtsp")
-        self._open = _Open(codecs, listener, acceptor)
+        self._open = _StartedServer(codecs, listener, acceptor)
         acceptor.open(listener)
 
     async def stop(self) -> None:
@@ -182,7 +182,7 @@ class RtspServer(Server):
             await asyncio.wait({closing})
             raise
 
-    async def _close(self, opened: _Open) -> None:
+    async def _close(self, opened: _StartedServer) -> None:
         opened.acceptor.close()
         opened.listener.close()
         await opened.acceptor.wait_closed()
@@ -249,7 +249,7 @@ class RtspServer(Server):
         session.stream.viewers -= 1
 
 
-class _Open:
+class _StartedServer:
     """What a server has while it is started."""
 
     def __init__(self, codecs: Codecs, listener: socket.socket, acceptor: Acceptor) -> None:

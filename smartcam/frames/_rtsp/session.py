@@ -17,13 +17,13 @@ from smartcam.frames._rtp.packets import (
     compound,
     parse_rtcp,
 )
-from smartcam.frames._rtsp.packing import Numbering
+from smartcam.frames._rtsp.packing import PacketNumbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.frames._frame import Frame
-    from smartcam.frames._rtsp.delivery import Delivery
+    from smartcam.frames._rtsp.delivery import PacketDelivery
     from smartcam.frames._rtsp.streams import RtspStream
 
 
@@ -56,10 +56,10 @@ class RtspSession:
         self.id: str = secrets.token_hex(12)
         self.stream = stream
         self.playing = False
-        self.delivery: Delivery | None = None
+        self.delivery: PacketDelivery | None = None
         self._ended = ended
         self._loop = asyncio.get_running_loop()
-        self._numbering = Numbering()
+        self._numbering = PacketNumbers()
         self._offset = secrets.randbits(32)
         self._last = -1  # the last timestamp, before the offset
         self._wants_key, self._skips = True, False
@@ -72,7 +72,7 @@ class RtspSession:
         """Of its packets."""
         return self._numbering.ssrc
 
-    def start(self, delivery: Delivery) -> None:
+    def start(self, delivery: PacketDelivery) -> None:
         """Have a way to the client; it is closed with the session."""
         self.delivery = delivery
         self._timer = self._loop.call_later(LOOK_EVERY, self._look)
@@ -147,7 +147,9 @@ class RtspSession:
         self.playing = False
         self._end(str(error))
 
-    def _send(self, delivery: Delivery, unit: Frame, ticks: int, key: bool, now: float) -> bool:
+    def _send(
+        self, delivery: PacketDelivery, unit: Frame, ticks: int, key: bool, now: float
+    ) -> bool:
         pieces = self.stream.cutter.pieces(unit)
         packets = self._numbering.numbered(pieces, self._timestamp(ticks))
         if now - self._told_at >= REPORT_EVERY:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from smartcam.frames._rtsp.packing import Cutter
+from smartcam.frames._rtsp.packing import UnitCutter
 
 if TYPE_CHECKING:
     from smartcam.frames._shared_stream import SharedH264
@@ -43,7 +43,7 @@ class RtspStream:
     name: str
     shared: SharedH264
     rate: float
-    cutter: Cutter = field(default_factory=Cutter)
+    cutter: UnitCutter = field(default_factory=UnitCutter)
     viewers: int = 0
     sent: int = 0
     skipped: int = 0

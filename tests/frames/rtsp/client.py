@@ -61,12 +61,13 @@ class Client:
     async def __aexit__(self, *_: object) -> None:
         self.writer.transport.abort()
 
-    async def ask(self, method: str, url: str = "", body: bytes = b"", **headers: str) -> Reply:
+    async def ask(self, method: str, url: str = "", **headers: str) -> Reply:
         """Send a request, and return its answer."""
         self._cseq += 1
         lines = [f"{method} {url or self.base} RTSP/1.0", f"CSeq: {self._cseq}"]
         if self.session and "Session" not in headers:
             headers["Session"] = self.session
+        body = headers.pop("body", "").encode()
         if body:
             headers["Content-Length"] = str(len(body))
         lines += (f"{name.replace('_', '-')}: {value}" for name, value in headers.items() if value)

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.frames._rtsp.addresses import Target, Wish, target_of, wish_of
-from smartcam.frames._rtsp.authentication import MOST_TRIES, Authentication, Gate
-from smartcam.frames._rtsp.messages import Request, RtspError
+from smartcam.frames._rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of
+from smartcam.frames._rtsp.authentication import MOST_TRIES, Authentication, PasswordGate
+from smartcam.frames._rtsp.messages import RtspError, RtspRequest
 from tests.frames.rtsp.client import Reply, digest
 
 URL = "rtsp://h:8554/left"
@@ -21,15 +21,15 @@ US = "192.0.2.7"
 @pytest.mark.parametrize(
     ("url", "target"),
     [
-        ("rtsp://h/left", Target("rtsp://h/left", "left", False)),
-        ("rtsp://a:b@h:8554/left/?x=1", Target("rtsp://h:8554/left", "left", False)),
-        ("rtsp://[::1]:8554/left/track1", Target("rtsp://[::1]:8554/left", "left", True)),
-        ("rtsp://h/%6ceft/track2", Target("rtsp://h/left/track2", "left/track2", False)),
-        ("rtsp://h", Target("rtsp://h/", "", False)),
-        ("rtsp://h/track1", Target("rtsp://h/track1", "track1", False)),
+        ("rtsp://h/left", RtspTarget("rtsp://h/left", "left", False)),
+        ("rtsp://a:b@h:8554/left/?x=1", RtspTarget("rtsp://h:8554/left", "left", False)),
+        ("rtsp://[::1]:8554/left/track1", RtspTarget("rtsp://[::1]:8554/left", "left", True)),
+        ("rtsp://h/%6ceft/track2", RtspTarget("rtsp://h/left/track2", "left/track2", False)),
+        ("rtsp://h", RtspTarget("rtsp://h/", "", False)),
+        ("rtsp://h/track1", RtspTarget("rtsp://h/track1", "track1", False)),
     ],
 )
-def test_urls(url: str, target: Target) -> None:
+def test_urls(url: str, target: RtspTarget) -> None:
     assert target_of(url) == target
 
 
@@ -45,15 +45,15 @@ def test_what_is_no_url(url: str) -> None:
 @pytest.mark.parametrize(
     ("transport", "wish"),
     [
-        ("RTP/AVP;unicast;client_port=5000-5001", Wish(False, 5000, 5001)),
-        ("RTP/AVP/UDP;unicast;client_port=5000;mode=play", Wish(False, 5000, 5001)),
-        (f"RTP/AVP;unicast;destination={US};client_port=9-8", Wish(False, 9, 8)),
-        ("rtp/avp/tcp;interleaved=2-3", Wish(True, 2, 3)),
-        ("RTP/AVP/TCP;unicast", Wish(True, None, None)),
-        ('RTP/SAVP;x, RTP/AVP;multicast,RTP/AVP/TCP;mode="PLAY"', Wish(True, None, None)),
+        ("RTP/AVP;unicast;client_port=5000-5001", TransportWish(False, 5000, 5001)),
+        ("RTP/AVP/UDP;unicast;client_port=5000;mode=play", TransportWish(False, 5000, 5001)),
+        (f"RTP/AVP;unicast;destination={US};client_port=9-8", TransportWish(False, 9, 8)),
+        ("rtp/avp/tcp;interleaved=2-3", TransportWish(True, 2, 3)),
+        ("RTP/AVP/TCP;unicast", TransportWish(True, None, None)),
+        ('RTP/SAVP;x, RTP/AVP;multicast,RTP/AVP/TCP;mode="PLAY"', TransportWish(True, None, None)),
     ],
 )
-def test_transports(transport: str, wish: Wish) -> None:
+def test_transports(transport: str, wish: TransportWish) -> None:
     assert wish_of(transport, US) == wish
 
 
@@ -79,19 +79,19 @@ def test_other_transports_are_refused(transport: str) -> None:
     assert caught.value.status == 461
 
 
-def challenged(gate: Gate) -> Reply:
+def challenged(gate: PasswordGate) -> Reply:
     with pytest.raises(RtspError) as caught:
-        gate.check(Request("DESCRIBE", URL, {}))
+        gate.check(RtspRequest("DESCRIBE", URL, {}))
     assert caught.value.status == 401
     return Reply(401, {name.lower(): value for name, value in caught.value.headers[:1]}, b"")
 
 
-def asked(authorization: str, method: str = "DESCRIBE", url: str = URL) -> Request:
-    return Request(method, url, {"authorization": authorization})
+def asked(authorization: str, method: str = "DESCRIBE", url: str = URL) -> RtspRequest:
+    return RtspRequest(method, url, {"authorization": authorization})
 
 
 def test_the_right_password_passes_as_often_as_wanted() -> None:
-    gate = Gate(Authentication("me", "secret"))
+    gate = PasswordGate(Authentication("me", "secret"))
     challenge = challenged(gate)
     for method in ("DESCRIBE", "SETUP", "PLAY") * 5:
         gate.check(asked(digest(challenge, method, URL, "me", "secret"), method))
@@ -102,7 +102,7 @@ def test_the_right_password_passes_as_often_as_wanted() -> None:
 
 def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
     authentication = Authentication("me", "secret")
-    gate, other = Gate(authentication), Gate(authentication)
+    gate, other = PasswordGate(authentication), PasswordGate(authentication)
     challenge = challenged(gate)
     right = digest(challenge, "DESCRIBE", URL, "me", "secret")
     for wrong in (
@@ -115,7 +115,7 @@ def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
         asked(right + ", algorithm=SHA-256"),
         asked("Digest"),
     ):
-        fresh = Gate(authentication)
+        fresh = PasswordGate(authentication)
         fresh._nonce = gate._nonce
         with pytest.raises(RtspError, match="wrong user or password"):
             fresh.check(wrong)
@@ -123,7 +123,7 @@ def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
 
 
 def test_tries_are_counted() -> None:
-    gate = Gate(Authentication("me", "secret"))
+    gate = PasswordGate(Authentication("me", "secret"))
     ends = []
     for _ in range(MOST_TRIES):
         with pytest.raises(RtspError) as caught:
@@ -134,7 +134,7 @@ def test_tries_are_counted() -> None:
 
 @given(st.text(st.characters(max_codepoint=255), max_size=60))
 def test_no_text_is_an_authorization(text: str) -> None:
-    gate = Gate(Authentication("me", "secret", basic=True))
+    gate = PasswordGate(Authentication("me", "secret", basic=True))
     for scheme in ("Digest ", "Basic ", ""):
         with pytest.raises(RtspError):
             gate.check(asked(scheme + text))
@@ -142,10 +142,10 @@ def test_no_text_is_an_authorization(text: str) -> None:
 
 def test_basic_is_refused_unless_asked_for() -> None:
     said = asked("Basic " + base64.b64encode("me:gehe\u00edm".encode()).decode())
-    Gate(Authentication("me", "gehe\u00edm", basic=True)).check(said)
+    PasswordGate(Authentication("me", "gehe\u00edm", basic=True)).check(said)
     for other in (Authentication("me", "gehe\u00edm"), Authentication("me", "x", basic=True)):
         with pytest.raises(RtspError, match="wrong user or password") as caught:
-            Gate(other).check(said)
+            PasswordGate(other).check(said)
         schemes = [value.partition(" ")[0] for _, value in caught.value.headers]
         assert schemes == (["Digest", "Basic"] if other.basic else ["Digest"])
 

@@ -14,9 +14,9 @@ from smartcam.frames._rtsp.messages import (
     MOST_LINE,
     ROOM,
     ChannelData,
-    Request,
     RequestParser,
     RtspError,
+    RtspRequest,
     answer,
     cseq_of,
 )
@@ -30,16 +30,18 @@ REQUESTS = (
     b"$\7\0\0",
 )
 MESSAGES = (
-    Request("OPTIONS", "*", {"cseq": "1"}),
-    Request("SET_PARAMETER", "rtsp://h/a", {"cseq": "2", "content-length": "6"}, b"$\0\r\n\r\n"),
-    Request("PLAY", "rtsp://h/a", {"cseq": "3", "range": "npt=0-"}),
+    RtspRequest("OPTIONS", "*", {"cseq": "1"}),
+    RtspRequest(
+        "SET_PARAMETER", "rtsp://h/a", {"cseq": "2", "content-length": "6"}, b"$\0\r\n\r\n"
+    ),
+    RtspRequest("PLAY", "rtsp://h/a", {"cseq": "3", "range": "npt=0-"}),
     ChannelData(1, b"abc"),
-    Request("GET_PARAMETER", "rtsp://h/a", {"cseq": "4", "x": "a, b", "content-length": "0"}),
+    RtspRequest("GET_PARAMETER", "rtsp://h/a", {"cseq": "4", "x": "a, b", "content-length": "0"}),
     ChannelData(7, b""),
 )
 
 
-def read(*pieces: bytes) -> list[Request | ChannelData]:
+def read(*pieces: bytes) -> list[RtspRequest | ChannelData]:
     """Return what is cut from pieces, each of which is looked at when it comes."""
     parser, found = RequestParser(), []
     for piece in pieces:
@@ -75,7 +77,7 @@ def test_byte_by_byte() -> None:
 def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
     parts: list[bytes], cuts: list[int]
 ) -> None:
-    def told(*pieces: bytes) -> tuple[list[Request | ChannelData], int]:
+    def told(*pieces: bytes) -> tuple[list[RtspRequest | ChannelData], int]:
         parser, found = RequestParser(), []
         for piece in pieces:
             parser.feed(piece)
@@ -132,14 +134,14 @@ def test_a_half_message_is_known_as_one() -> None:
         assert parser.next() is None
         assert parser.in_midst == midst
     parser.feed(b"\r\n")
-    assert parser.next() == Request("OPTIONS", "*", {})
+    assert parser.next() == RtspRequest("OPTIONS", "*", {})
     assert not parser.in_midst
 
 
 @pytest.mark.parametrize("cseq", [{}, {"cseq": ""}, {"cseq": "-1"}, {"cseq": "1" * 10}])
 def test_a_request_has_a_number(cseq: dict[str, str]) -> None:
     with pytest.raises(RtspError, match="CSeq"):
-        cseq_of(Request("OPTIONS", "*", cseq))
+        cseq_of(RtspRequest("OPTIONS", "*", cseq))
 
 
 def test_answers() -> None:

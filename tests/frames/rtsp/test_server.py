@@ -102,8 +102,8 @@ async def test_what_each_method_answers(server: Served) -> None:
         )
         assert (await client.ask("PLAY")).status == 200
         assert (await client.ask("GET_PARAMETER")).headers["session"].startswith(client.session)
-        assert (await client.ask("SET_PARAMETER", body=b"\r\n")).status == 200
-        assert (await client.ask("SET_PARAMETER", body=b"volume: 11")).status == 451
+        assert (await client.ask("SET_PARAMETER", body="\r\n")).status == 200
+        assert (await client.ask("SET_PARAMETER", body="volume: 11")).status == 451
         assert (await client.ask("PAUSE")).status == 200
         assert serving.statistics()["left"].viewers == 1
         assert (await client.ask("TEARDOWN")).status == 200
@@ -337,7 +337,7 @@ async def test_what_cannot_be_served() -> None:
         ({"": source}, "a name: expected"),
     ):
         with pytest.raises(ConfigurationError, match=text):
-            RtspServer(wrong)  # type: ignore[arg-type]
+            RtspServer(wrong)
     with pytest.raises(ConfigurationError, match="max_viewers"):
         RtspServer({"a": source}, max_viewers=0)
     with pytest.raises(ConfigurationError, match="user and password"):
