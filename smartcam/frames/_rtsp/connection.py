@@ -87,7 +87,7 @@ class RtspConnection(asyncio.Protocol):
         self.address: tuple[str | int, ...] = ()
         self.peer: tuple[str | int, ...] = ()
         self._parser = RequestParser()
-        self._came = asyncio.Event()
+        self._came, self._lost = asyncio.Event(), asyncio.Event()
         self._asked_at = asyncio.get_running_loop().time()
         self._closing = False
         self._reading = True
@@ -128,6 +128,7 @@ class RtspConnection(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """End what it has."""
         self._closing = True
+        self._lost.set()
         self._end_sessions("")
         if self._cut is not None:
             self._cut.cancel()
@@ -152,12 +153,15 @@ class RtspConnection(asyncio.Protocol):
         self.transport.abort()
 
     def session_ended(self, session: RtspSession, why: str) -> None:
-        """Forget a session that has ended by itself, and end with it."""
+        """Forget a session that has ended by itself, and end with the last one.
+
+        Where the client takes nothing, nothing can be said to it: that is the end of all.
+        """
         self.forget(session)
-        if why:
-            self.close(why)
-        else:
+        if not why:
             self.abort()
+        elif not self.sessions:
+            self.close()
 
     def forget(self, session: RtspSession) -> None:
         """Have a session no longer that is closed."""
@@ -192,6 +196,7 @@ class RtspConnection(asyncio.Protocol):
             _log.exception("! RTSP: a connection failed")
         finally:
             self.close()
+        await self._lost.wait()
 
     async def _next(self) -> RtspRequest | ChannelData | None:
         """Return the next message; None: there is none in time.

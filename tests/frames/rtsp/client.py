@@ -41,7 +41,7 @@ class Client:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, base: str
     ) -> None:
         self.reader, self.writer, self.base = reader, writer, base
-        self.packets: dict[int, list[bytes]] = {0: [], 1: []}
+        self.packets: dict[int, list[bytes]] = {0: [], 1: [], 2: [], 3: []}
         self.session = self.transport = ""
         self._cseq = 0
 

@@ -49,6 +49,12 @@ async def server() -> AsyncIterator[tuple[ScriptedDriver, RtspServer]]:
         yield made
 
 
+def connections(server: RtspServer) -> set[Any]:
+    """Return those that are open."""
+    assert server._serving is not None
+    return server._serving.connections
+
+
 Served = tuple["ScriptedDriver", RtspServer]
 
 
@@ -219,7 +225,7 @@ async def test_who_takes_no_answers_is_cut_off(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving, room=4096) as client:
         client.writer.write(b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n" * 10_000)
-        await until(lambda: not serving._connections)
+        await until(lambda: not connections(serving))
         answers = await client.everything()
     assert 100 < answers.count(b"200 OK") < 5000
 
@@ -283,7 +289,7 @@ async def test_there_are_so_many_connections_and_viewers() -> None:
                 assert await three.ended()
             assert (await one.ask("TEARDOWN")).status == 200
             await two.set_up()
-        await until(lambda: not serving._connections)
+        await until(lambda: not connections(serving))
         async with await Client.connect(serving) as client:
             await client.set_up()
 

@@ -313,6 +313,18 @@ async def test_a_viewer_over_the_connection_that_takes_pictures_need_say_nothing
         assert await client.ended()
 
 
+async def test_a_session_that_nobody_uses_ends_alone(stage: Stage) -> None:
+    watcher = stage.watcher()
+    async with await Client.connect(stage.server) as client:
+        await client.set_up("RTP/AVP/TCP;unicast;interleaved=2-3")
+        client.session = ""
+        await client.play()
+        await asyncio.sleep(TIMEOUT + 2)
+        assert (stage.counts.viewers, stage.counts.silent) == (1, 1)
+        await stage.show(1)
+        assert await seen(client, watcher) == 1
+
+
 async def test_a_report_on_a_channel_counts_and_may_ask_for_a_key_frame(stage: Stage) -> None:
     watcher = stage.watcher()
     async with await Client.connect(stage.server) as client:
