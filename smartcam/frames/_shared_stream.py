@@ -43,7 +43,7 @@ class StreamViewer(Protocol):
 
 
 @dataclass(slots=True)
-class StreamCounts:
+class EncodedCounts:
     """What was encoded: frames, key frames among them, and frames that could not be."""
 
     encoded: int = 0
@@ -64,7 +64,7 @@ class SharedH264:
 
     def __init__(self, source: FrameSource, encoder: H264Encoder) -> None:
         self.source = source
-        self.counts = StreamCounts()
+        self.counts = EncodedCounts()
         self._encoder = encoder
         self._viewers: dict[StreamViewer, None] = {}
         self._asking: set[asyncio.Future[Frame]] = set()
@@ -81,7 +81,10 @@ class SharedH264:
         return len(self._viewers)
 
     def join(self, viewer: StreamViewer) -> None:
-        """Hand a viewer what is encoded from now on; a key frame comes soon, to the first at once."""
+        """Hand a viewer what is encoded from now on.
+
+        A key frame comes soon, for the first viewer at once.
+        """
         if not self._viewers:
             self._key_came = -KEY_PAUSE
         self._viewers[viewer] = None
@@ -213,14 +216,16 @@ class SharedH264:
                     raise
                 continue
             failures = 0
-            self._hand_out(unit, entry_point(bytes(unit.data))[0])
+            await self._hand_out(unit, entry_point(bytes(unit.data))[0])
 
-    def _hand_out(self, unit: Frame, key: bool) -> None:
-        self.counts.encoded += 1
+    async def _hand_out(self, unit: Frame, key: bool) -> None:
         if key:
             self.counts.keys += 1
             self._key, self._key_wanted = unit, False
             self._key_came = asyncio.get_running_loop().time()
             self._answer(unit)
         for viewer in list(self._viewers):
-            viewer.take(unit, key)
+            if viewer in self._viewers:
+                viewer.take(unit, key)
+                await asyncio.sleep(0)  # many viewers do not hold up the loop
+        self.counts.encoded += 1

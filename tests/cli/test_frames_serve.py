@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import re
 import signal
@@ -302,5 +303,6 @@ async def test_who_looks_by_rtsp_is_counted(monkeypatch: pytest.MonkeyPatch) -> 
         server, _ = rtsp_server([source], ("127.0.0.1", 0), None)
         async with server:
             assert viewers_text(site, server) == "nobody looks"
-            server.stream("scripted").viewers = 2
+            counted = dataclasses.replace(server.statistics()["scripted"], viewers=2)
+            monkeypatch.setattr(server, "statistics", lambda: {"scripted": counted})
             assert viewers_text(site, server) == "scripted: 2 by RTSP"

@@ -15,7 +15,7 @@ NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
 """What a stream may be called, so that it stands in a URL as it is."""
 
 
-class Target(NamedTuple):
+class RtspTarget(NamedTuple):
     """What a request is about.
 
     Attributes:
@@ -29,7 +29,7 @@ class Target(NamedTuple):
     track: bool
 
 
-def target_of(url: str) -> Target:
+def target_of(url: str) -> RtspTarget:
     """Read a request's URL.
 
     Raises:
@@ -48,10 +48,10 @@ def target_of(url: str) -> Target:
     name = "/".join(names[:-1] if track else names)
     where = f"[{host}]" if ":" in host else host
     base = f"rtsp://{where}{'' if port is None else f':{port}'}/{name}"
-    return Target(base, name, track)
+    return RtspTarget(base, name, track)
 
 
-class Wish(NamedTuple):
+class TransportWish(NamedTuple):
     """A transport that we have: over the connection's own channels, or from ports to ports.
 
     Attributes:
@@ -65,7 +65,7 @@ class Wish(NamedTuple):
     rtcp: int | None
 
 
-def wish_of(header: str, client: str) -> Wish:
+def wish_of(header: str, client: str) -> TransportWish:
     """Return the first transport of a client's that we have.
 
     Args:
@@ -86,7 +86,7 @@ def wish_of(header: str, client: str) -> Wish:
     )
 
 
-def _read(said: str, client: str) -> Wish | None:
+def _read(said: str, client: str) -> TransportWish | None:
     protocol, *rest = (part.strip() for part in said.split(";"))
     options = {key.lower(): value for key, _, value in (one.partition("=") for one in rest)}
     tcp = protocol.upper() == "RTP/AVP/TCP"
@@ -97,10 +97,10 @@ def _read(said: str, client: str) -> Wish | None:
     if options.get("mode", "play").strip('"').lower() != "play":
         return None
     if tcp and "interleaved" not in options:
-        return Wish(True, None, None)
+        return TransportWish(True, None, None)
     least, most = (0, 255) if tcp else (1, 65535)
     pair = _pair(options.get("interleaved" if tcp else "client_port", ""), least, most)
-    return None if pair is None else Wish(tcp, *pair)
+    return None if pair is None else TransportWish(tcp, *pair)
 
 
 def _pair(text: str, least: int, most: int) -> tuple[int, int] | None:

@@ -14,7 +14,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.frames._rtsp.messages import RtspError
 
 if TYPE_CHECKING:
-    from smartcam.frames._rtsp.messages import Request
+    from smartcam.frames._rtsp.messages import RtspRequest
 
 
 REALM: Final = "smartcam"
@@ -49,22 +49,23 @@ class Authentication:
         self._user, self._secret = (user or "").encode(), (password or "").encode()
         self._hashed = _md5(self._user, REALM.encode(), self._secret)
 
-    def accepts(self, request: Request, nonce: str) -> bool:
+    def accepts(self, request: RtspRequest, nonce: str) -> bool:
         """Return whether a request is one of the user's, by the nonce of its connection."""
         scheme, _, said = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "digest":
             return self._accepts_digest(request, nonce, said)
         return scheme.lower() == "basic" and self.basic and self._accepts_basic(said)
 
-    def _accepts_digest(self, request: Request, nonce: str, said: str) -> bool:
+    def _accepts_digest(self, request: RtspRequest, nonce: str, said: str) -> bool:
         parts = _parts(said)
         expected = {"username": self._user.decode(), "realm": REALM, "nonce": nonce}
         same = [_same(parts.get(name, ""), value) for name, value in expected.items()]
         if parts.get("algorithm", "MD5").upper() != "MD5" or "qop" in parts:
             return False
-        if parts.get("uri", "") != request.url:
-            return False
-        asked = _md5(request.method.encode(), request.url.encode())
+        uri = parts.get("uri", "")
+        if not f"{request.url}/".startswith(f"{uri.rstrip('/')}/"):
+            return False  # live555 always says the stream, also where it asks for its track
+        asked = _md5(request.method.encode(), uri.encode())
         response = _md5(self._hashed.encode(), nonce.encode(), asked.encode())
         return _same(parts.get("response", "").lower(), response) and all(same)
 
@@ -83,7 +84,7 @@ class Authentication:
         return asked + basic if self.basic else asked
 
 
-class Gate:
+class PasswordGate:
     """What one connection has to answer: a nonce of its own, and a bounded number of tries."""
 
     def __init__(self, authentication: Authentication) -> None:
@@ -91,7 +92,7 @@ class Gate:
         self._nonce = secrets.token_hex(16)
         self._wrong = 0
 
-    def check(self, request: Request) -> None:
+    def check(self, request: RtspRequest) -> None:
         """Let a request pass.
 
         Raises:

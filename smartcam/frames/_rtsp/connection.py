@@ -8,14 +8,14 @@ import logging
 import socket
 from typing import TYPE_CHECKING, Final, Protocol
 
-from smartcam.frames._rtsp.authentication import Gate
+from smartcam.frames._rtsp.authentication import PasswordGate
 from smartcam.frames._rtsp.delivery import MOST_WAITING, SEND_BUFFER, ChannelDelivery
 from smartcam.frames._rtsp.messages import (
     ROOM,
     ChannelData,
-    Request,
     RequestParser,
     RtspError,
+    RtspRequest,
     answer,
     cseq_of,
 )
@@ -44,7 +44,7 @@ MOST_ANSWERS, MOST_BEHIND = 64 << 10, 4 * MOST_WAITING
 """Bytes that may wait for a client: one that does not play, and one that does."""
 
 
-class Owner(Protocol):
+class ConnectionOwner(Protocol):
     """The server, as its connections see it."""
 
     authentication: Authentication
@@ -80,14 +80,14 @@ class RtspConnection(asyncio.Protocol):
 
     transport: asyncio.Transport
 
-    def __init__(self, owner: Owner) -> None:
+    def __init__(self, owner: ConnectionOwner) -> None:
         self.owner = owner
-        self.gate = Gate(owner.authentication)
+        self.gate = PasswordGate(owner.authentication)
         self.sessions: dict[str, RtspSession] = {}
         self.address: tuple[str | int, ...] = ()
         self.peer: tuple[str | int, ...] = ()
         self._parser = RequestParser()
-        self._came = asyncio.Event()
+        self._came, self._lost = asyncio.Event(), asyncio.Event()
         self._asked_at = asyncio.get_running_loop().time()
         self._closing = False
         self._reading = True
@@ -128,6 +128,7 @@ class RtspConnection(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """End what it has."""
         self._closing = True
+        self._lost.set()
         self._end_sessions("")
         if self._cut is not None:
             self._cut.cancel()
@@ -152,12 +153,15 @@ class RtspConnection(asyncio.Protocol):
         self.transport.abort()
 
     def session_ended(self, session: RtspSession, why: str) -> None:
-        """Forget a session that has ended by itself, and end with it."""
+        """Forget a session that has ended by itself, and end with the last one.
+
+        Where the client takes nothing, nothing can be said to it: that is the end of all.
+        """
         self.forget(session)
-        if why:
-            self.close(why)
-        else:
+        if not why:
             self.abort()
+        elif not self.sessions:
+            self.close()
 
     def forget(self, session: RtspSession) -> None:
         """Have a session no longer that is closed."""
@@ -180,7 +184,7 @@ class RtspConnection(asyncio.Protocol):
     async def _run(self) -> None:
         try:
             while (message := await self._next()) is not None:
-                if isinstance(message, Request):
+                if isinstance(message, RtspRequest):
                     self._asked_at = asyncio.get_running_loop().time()
                     await self._answer(message)
                 elif not self._take(message):
@@ -192,8 +196,9 @@ class RtspConnection(asyncio.Protocol):
             _log.exception("! RTSP: a connection failed")
         finally:
             self.close()
+        await self._lost.wait()
 
-    async def _next(self) -> Request | ChannelData | None:
+    async def _next(self) -> RtspRequest | ChannelData | None:
         """Return the next message; None: there is none in time.
 
         Raises:
@@ -240,7 +245,7 @@ class RtspConnection(asyncio.Protocol):
         idle_since = asyncio.get_running_loop().time() - self._asked_at
         return bool(self.sessions) or idle_since < IDLE
 
-    async def _answer(self, request: Request) -> None:
+    async def _answer(self, request: RtspRequest) -> None:
         cseq = ""
         try:
             cseq = cseq_of(request)

@@ -30,7 +30,7 @@ PAIRS: Final = 32
 """Tries to find two ports, an even one and the next."""
 
 
-class Delivery(Protocol):
+class PacketDelivery(Protocol):
     """A way for the packets of one viewer."""
 
     transport: str
@@ -131,7 +131,7 @@ class DatagramDelivery:
         loop = asyncio.get_running_loop()
         try:
             self._control, _ = await loop.create_datagram_endpoint(
-                lambda: _Reports(str(self._to[0]), self._heard), sock=self._control_socket
+                lambda: _ControlPort(str(self._to[0]), self._heard), sock=self._control_socket
             )
         except BaseException:
             self.close()
@@ -163,7 +163,7 @@ class DatagramDelivery:
             self._control_socket.close()
 
 
-class _Reports(asyncio.DatagramProtocol):
+class _ControlPort(asyncio.DatagramProtocol):
     """Hands on what comes from one host."""
 
     def __init__(self, host: str, heard: Callable[[bytes], None]) -> None:
@@ -173,7 +173,7 @@ class _Reports(asyncio.DatagramProtocol):
         if addr[0] == self._host:
             self._heard(data)
 
-    def error_received(self, exc: OSError) -> None:
+    def error_received(self, exc: Exception) -> None:
         """Leave what ICMP says: it may be anybody's."""
 
 

@@ -59,7 +59,7 @@ class RtspError(Exception):
         self.status, self.text, self.headers, self.fatal = status, text, headers, fatal
 
 
-class Request(NamedTuple):
+class RtspRequest(NamedTuple):
     """A request; the names of its headers are in small letters."""
 
     method: str
@@ -114,7 +114,7 @@ class RequestParser:
         """Whether a message has begun and is not whole."""
         return self._start is not None or bool(self._data)
 
-    def next(self) -> Request | ChannelData | None:
+    def next(self) -> RtspRequest | ChannelData | None:
         """Return the next whole message; None: it is not there yet.
 
         Raises:
@@ -130,7 +130,7 @@ class RequestParser:
                 self._start = _start_line(line)
         return self._request(*self._start)
 
-    def _request(self, method: str, url: str) -> Request | None:
+    def _request(self, method: str, url: str) -> RtspRequest | None:
         while (line := self._line(self._size())) is not None:
             if line:
                 self._add_header(line)
@@ -138,7 +138,7 @@ class RequestParser:
             size = self._size()
             body = bytes(self._data[:size])
             del self._data[:size]
-            request = Request(method, url, self._headers, body)
+            request = RtspRequest(method, url, self._headers, body)
             self._start, self._headers = None, {}
             return request
         return None
@@ -205,7 +205,7 @@ def _is_number(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS
 
 
-def cseq_of(request: Request) -> str:
+def cseq_of(request: RtspRequest) -> str:
     """Return the number of a request, which its answer repeats.
 
     Raises:

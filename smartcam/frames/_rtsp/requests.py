@@ -10,16 +10,17 @@ from smartcam.frames._rtp.h264 import parameter_sets
 from smartcam.frames._rtsp.addresses import TRACK, target_of, wish_of
 from smartcam.frames._rtsp.delivery import ChannelDelivery, DatagramDelivery, port_pair
 from smartcam.frames._rtsp.messages import RtspError
+from smartcam.frames._rtsp.packing import PAYLOAD_TYPE
 from smartcam.frames._rtsp.sdp import describe
-from smartcam.frames._rtsp.session import PAYLOAD_TYPE, TIMEOUT, RtspSession
+from smartcam.frames._rtsp.session import TIMEOUT, RtspSession
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from smartcam.frames._rtsp.addresses import Target, Wish
+    from smartcam.frames._rtsp.addresses import RtspTarget, TransportWish
     from smartcam.frames._rtsp.connection import RtspConnection
-    from smartcam.frames._rtsp.delivery import Delivery
-    from smartcam.frames._rtsp.messages import Request
+    from smartcam.frames._rtsp.delivery import PacketDelivery
+    from smartcam.frames._rtsp.messages import RtspRequest
 
 
 MOST_SESSIONS: Final = 8
@@ -32,14 +33,14 @@ ELSEWHERE: Final = ("ANNOUNCE", "RECORD", "REDIRECT")
 """Methods that there are, but not here."""
 
 
-class Answer(NamedTuple):
+class RtspAnswer(NamedTuple):
     """What a request is answered with, when it is not refused."""
 
     headers: tuple[tuple[str, str], ...] = ()
     body: bytes = b""
 
 
-async def answer_to(connection: RtspConnection, request: Request) -> Answer:
+async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     """Do what a request asks for.
 
     Raises:
@@ -62,13 +63,13 @@ async def answer_to(connection: RtspConnection, request: Request) -> Answer:
     return await METHODS[method](connection, request)
 
 
-async def _options(connection: RtspConnection, request: Request) -> Answer:
+async def _options(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     if request.url != "*":
         target_of(request.url)
-    return Answer((("Public", PUBLIC),))
+    return RtspAnswer((("Public", PUBLIC),))
 
 
-async def _describe(connection: RtspConnection, request: Request) -> Answer:
+async def _describe(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     accepted = request.headers.get("accept", "application/sdp").lower()
     if "application/sdp" not in accepted and "*/*" not in accepted:
         raise RtspError(406, f"Accept: expected application/sdp, got {accepted[:80]!r}")
@@ -83,10 +84,12 @@ async def _describe(connection: RtspConnection, request: Request) -> Answer:
         raise RtspError(503, f"{target.name}: a key frame without parameter sets")
     rate, host = stream.rate, str(connection.address[0])
     body = describe(stream.name, host, connection.owner.number, sets, PAYLOAD_TYPE, rate)
-    return Answer((("Content-Type", "application/sdp"), ("Content-Base", f"{target.base}/")), body)
+    return RtspAnswer(
+        (("Content-Type", "application/sdp"), ("Content-Base", f"{target.base}/")), body
+    )
 
 
-async def _setup(connection: RtspConnection, request: Request) -> Answer:
+async def _setup(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     target = target_of(request.url)
     stream = connection.owner.stream(target.name)
     if "session" in request.headers:
@@ -107,10 +110,12 @@ async def _setup(connection: RtspConnection, request: Request) -> Answer:
     session.start(delivery)
     connection.sessions[session.id] = session
     transport = f'{delivery.transport};ssrc={session.ssrc:08X};mode="PLAY"'
-    return Answer((_session_header(session), ("Transport", transport)))
+    return RtspAnswer((_session_header(session), ("Transport", transport)))
 
 
-async def _delivery(connection: RtspConnection, wish: Wish, session: RtspSession) -> Delivery:
+async def _delivery(
+    connection: RtspConnection, wish: TransportWish, session: RtspSession
+) -> PacketDelivery:
     if wish.tcp:
         return ChannelDelivery(connection.transport, *_channels(connection, wish))
     address = connection.address
@@ -125,7 +130,7 @@ async def _delivery(connection: RtspConnection, wish: Wish, session: RtspSession
     return delivery
 
 
-def _channels(connection: RtspConnection, wish: Wish) -> tuple[int, int]:
+def _channels(connection: RtspConnection, wish: TransportWish) -> tuple[int, int]:
     taken = set(connection.channels())
     if wish.rtp is None or wish.rtcp is None:
         first = next(one for one in range(0, 256, 2) if not {one, one + 1} & taken)
@@ -135,10 +140,10 @@ def _channels(connection: RtspConnection, wish: Wish) -> tuple[int, int]:
     return wish.rtp, wish.rtcp
 
 
-async def _play(connection: RtspConnection, request: Request) -> Answer:
+async def _play(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     target, session = _aimed(connection, request)
     begins = session.play()
-    return Answer(
+    return RtspAnswer(
         (
             _session_header(session),
             ("Range", "npt=now-"),
@@ -147,41 +152,41 @@ async def _play(connection: RtspConnection, request: Request) -> Answer:
     )
 
 
-async def _pause(connection: RtspConnection, request: Request) -> Answer:
+async def _pause(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     _, session = _aimed(connection, request)
     if not session.playing:
         raise RtspError(455, "it does not play")
     session.pause()
-    return Answer((_session_header(session),))
+    return RtspAnswer((_session_header(session),))
 
 
-async def _teardown(connection: RtspConnection, request: Request) -> Answer:
+async def _teardown(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     _, session = _aimed(connection, request)
     session.close()
     connection.forget(session)
-    return Answer()
+    return RtspAnswer()
 
 
-async def _parameter(connection: RtspConnection, request: Request) -> Answer:
+async def _parameter(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
     """Take that the client is there, which is what it is for; we have no parameters."""
     if request.url != "*":
         target_of(request.url)
-    headers = ()
+    headers: tuple[tuple[str, str], ...] = ()
     if "session" in request.headers:
         headers = (_session_header(_session(connection, request)),)
     if request.body.strip():
         raise RtspError(451, f"no parameter is known, got {request.body[:60]!r}", headers)
-    return Answer(headers)
+    return RtspAnswer(headers)
 
 
-def _session(connection: RtspConnection, request: Request) -> RtspSession:
+def _session(connection: RtspConnection, request: RtspRequest) -> RtspSession:
     said = request.headers.get("session", "").partition(";")[0].strip()
     if said not in connection.sessions:
         raise RtspError(454, f"Session: expected one of this connection's, got {said[:40]!r}")
     return connection.sessions[said]
 
 
-def _aimed(connection: RtspConnection, request: Request) -> tuple[Target, RtspSession]:
+def _aimed(connection: RtspConnection, request: RtspRequest) -> tuple[RtspTarget, RtspSession]:
     """Return what a request is about, and its session."""
     target = target_of(request.url)
     stream = connection.owner.stream(target.name)
@@ -197,7 +202,7 @@ def _session_header(session: RtspSession) -> tuple[str, str]:
     return "Session", f"{session.id};timeout={TIMEOUT}"
 
 
-METHODS: Final[dict[str, Callable[[RtspConnection, Request], Awaitable[Answer]]]] = {
+METHODS: Final[dict[str, Callable[[RtspConnection, RtspRequest], Awaitable[RtspAnswer]]]] = {
     "OPTIONS": _options,
     "DESCRIBE": _describe,
     "SETUP": _setup,

@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-import secrets
 import socket
 from typing import TYPE_CHECKING, Final
 
-from smartcam._accepting import Acceptor
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError, LocalProtocolError
 from smartcam.frames._codecs import Codecs
 from smartcam.frames._rtsp.addresses import NAME
 from smartcam.frames._rtsp.authentication import Authentication
-from smartcam.frames._rtsp.connection import RtspConnection
-from smartcam.frames._rtsp.messages import RtspError
+from smartcam.frames._rtsp.serving import RtspServing, listen
 from smartcam.frames._rtsp.streams import RtspStream
 from smartcam.frames._shared_stream import SharedH264
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.frames._rtsp.session import RtspSession
     from smartcam.frames._rtsp.streams import RtspStatistics
     from smartcam.frames._source import FrameSource
 
-
-_log = logging.getLogger(__name__)
 
 PORT: Final = 8554
 
 RATE: Final = 30.0
 """Frames a second of a source that does not say."""
 
-BACKLOG: Final = 16
-RESOLVE_TIMEOUT: Final = 5.0
 _ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
 
 
@@ -105,16 +96,13 @@ class RtspServer(Server):
             if not 1 <= most <= 1000:
                 raise ConfigurationError(f"RtspServer: {what}: expected 1 to 1000, got {most!r}")
         self.host: str = host
-        self.authentication: Authentication = Authentication(user, password, basic=basic)
-        self.number: int = secrets.randbits(31)  # of its descriptions
+        self._authentication = Authentication(user, password, basic=basic)
         self._sources = dict(sources)
         self._port = port
         self._fps, self._keyint, self._crf, self._bitrate = fps, keyint, crf, bitrate
         self._max_connections, self._max_viewers = max_connections, max_viewers
         self._streams: dict[str, RtspStream] = {}
-        self._connections: set[RtspConnection] = set()
-        self._viewers = 0
-        self._open: _Open | None = None
+        self._serving: RtspServing | None = None
 
     @property
     def port(self) -> int:
@@ -149,12 +137,12 @@ class RtspServer(Server):
 
         Cancellation: leaves it stopped.
         """
-        if self._open is not None:
+        if self._serving is not None:
             return
         codecs = Codecs(threads=min(4, len(self._sources)))
         streams = self._made(codecs)
         try:
-            listener = await _listen(self.host, self._port)
+            listener = await listen(self.host, self._port)
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
                 f"RTSP: cannot listen on {self.host} port {self._port}: {exc}"
@@ -162,37 +150,24 @@ class RtspServer(Server):
         await codecs.__aenter__()
         self._port = listener.getsockname()[1]
         self._streams = streams
-        acceptor = Acceptor(lambda: RtspConnection(self), _log, name="smartcam.rtsp")
-        self._open = _Open(codecs, listener, acceptor)
-        acceptor.open(listener)
+        limits = (self._max_connections, self._max_viewers)
+        self._serving = RtspServing(streams, codecs, self._authentication, *limits)
+        self._serving.open(listener)
 
     async def stop(self) -> None:
         """Say goodbye to the viewers and close everything; does nothing if stopped.
 
         Cancellation: takes effect when all is closed, which a second or two take at most.
         """
-        opened, self._open = self._open, None
-        if opened is None:
+        serving, self._serving = self._serving, None
+        if serving is None:
             return
-        closing = asyncio.ensure_future(self._close(opened))
+        closing = asyncio.ensure_future(serving.close())
         try:
             await asyncio.shield(closing)
         except asyncio.CancelledError:
             await asyncio.wait({closing})
             raise
-
-    async def _close(self, opened: _Open) -> None:
-        opened.acceptor.close()
-        opened.listener.close()
-        await opened.acceptor.wait_closed()
-        for connection in list(self._connections):
-            connection.close("the server is stopped")
-        tasks = {one.task for one in self._connections if one.task is not None}
-        if tasks:
-            await asyncio.wait(tasks)
-        for shared in {id(one.shared): one.shared for one in self._streams.values()}.values():
-            await shared.close()
-        await opened.codecs.close()
 
     def _made(self, codecs: Codecs) -> dict[str, RtspStream]:
         """Return the streams; two names of a source share one encoder."""
@@ -207,45 +182,6 @@ class RtspServer(Server):
             shared[id(source)] = SharedH264(source, encoder), rate
         return {name: RtspStream(name, *shared[id(one)]) for name, one in self._sources.items()}
 
-    # what its connections ask
-
-    def enter(self, connection: RtspConnection) -> bool:
-        """Take a new connection; return whether there is room for it."""
-        if self._open is None or len(self._connections) >= self._max_connections:
-            return False
-        self._connections.add(connection)
-        return True
-
-    def leave(self, connection: RtspConnection) -> None:
-        """Forget a connection that is closed."""
-        self._connections.discard(connection)
-
-    def stream(self, name: str) -> RtspStream:
-        """Return a stream.
-
-        Raises:
-            RtspError: there is none of that name.
-        """
-        if name not in self._streams:
-            raise RtspError(404, f"expected one of {', '.join(self._streams)}, got {name[:80]!r}")
-        return self._streams[name]
-
-    def admit(self, session: RtspSession) -> None:
-        """Count a viewer.
-
-        Raises:
-            RtspError: there are too many.
-        """
-        if self._viewers >= self._max_viewers:
-            raise RtspError(453, f"{self._max_viewers} others look already")
-        self._viewers += 1
-        session.stream.viewers += 1
-
-    def dismiss(self, session: RtspSession) -> None:
-        """Count a viewer no longer."""
-        self._viewers -= 1
-        session.stream.viewers -= 1
-
 
 def _rate(source: FrameSource) -> float:
     """Return the frames a second that a source says, or the usual where it is not open yet."""
@@ -254,20 +190,3 @@ def _rate(source: FrameSource) -> float:
     except LocalProtocolError:
         rates = ()
     return min(max(rates[0], 0.01), 1000.0) if rates else RATE
-
-
-class _Open:
-    """What a server has while it is started."""
-
-    def __init__(self, codecs: Codecs, listener: socket.socket, acceptor: Acceptor) -> None:
-        self.codecs, self.listener, self.acceptor = codecs, listener, acceptor
-
-
-async def _listen(host: str, port: int) -> socket.socket:
-    loop = asyncio.get_running_loop()
-    async with asyncio.timeout(RESOLVE_TIMEOUT):
-        found = await loop.getaddrinfo(host or "0.0.0.0", port, type=socket.SOCK_STREAM)  # noqa: S104
-    family, _, _, _, address = found[0]
-    listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)
-    listener.setblocking(False)
-    return listener

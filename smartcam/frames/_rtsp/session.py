@@ -8,7 +8,6 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import FrameSourceError, MessageError
-from smartcam.frames._rtp.h264 import H264Packetizer
 from smartcam.frames._rtp.packets import (
     Goodbye,
     PictureLost,
@@ -18,12 +17,13 @@ from smartcam.frames._rtp.packets import (
     compound,
     parse_rtcp,
 )
+from smartcam.frames._rtsp.packing import PacketNumbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.frames._frame import Frame
-    from smartcam.frames._rtsp.delivery import Delivery
+    from smartcam.frames._rtsp.delivery import PacketDelivery
     from smartcam.frames._rtsp.streams import RtspStream
 
 
@@ -36,7 +36,6 @@ REPORT_EVERY: Final = 5.0
 LOOK_EVERY: Final = 1.0
 """Seconds between two looks whether the client is still there."""
 
-PAYLOAD_TYPE: Final = 96
 CLOCK: Final = 90_000
 NTP_EPOCH: Final = 2_208_988_800
 """Seconds from 1900, where NTP's time begins, to 1970."""
@@ -57,10 +56,10 @@ class RtspSession:
         self.id: str = secrets.token_hex(12)
         self.stream = stream
         self.playing = False
-        self.delivery: Delivery | None = None
+        self.delivery: PacketDelivery | None = None
         self._ended = ended
         self._loop = asyncio.get_running_loop()
-        self._packetizer = H264Packetizer(PAYLOAD_TYPE)
+        self._numbering = PacketNumbers()
         self._offset = secrets.randbits(32)
         self._last = -1  # the last timestamp, before the offset
         self._wants_key, self._skips = True, False
@@ -71,9 +70,9 @@ class RtspSession:
     @property
     def ssrc(self) -> int:
         """Of its packets."""
-        return self._packetizer.ssrc
+        return self._numbering.ssrc
 
-    def start(self, delivery: Delivery) -> None:
+    def start(self, delivery: PacketDelivery) -> None:
         """Have a way to the client; it is closed with the session."""
         self.delivery = delivery
         self._timer = self._loop.call_later(LOOK_EVERY, self._look)
@@ -84,7 +83,7 @@ class RtspSession:
             self.playing, self._wants_key, self._skips = True, True, False
             self.stream.shared.join(self)
         now = self._timestamp(self._ticks(time.monotonic()))
-        return f"seq={self._packetizer.sequence};rtptime={now}"
+        return f"seq={self._numbering.sequence};rtptime={now}"
 
     def pause(self) -> None:
         """Send no more, until it plays again."""
@@ -136,7 +135,7 @@ class RtspSession:
                 self.stream.shared.key_frame()
             return
         ticks = max(self._ticks(unit.captured), self._last + 1)
-        if not (ready and self._send(delivery, bytes(unit.data), ticks, key, now)):
+        if not (ready and self._send(delivery, unit, ticks, key, now)):
             self.stream.skipped += 1
             self._wants_key = self._skips = True
             return
@@ -148,8 +147,11 @@ class RtspSession:
         self.playing = False
         self._end(str(error))
 
-    def _send(self, delivery: Delivery, data: bytes, ticks: int, key: bool, now: float) -> bool:
-        packets = self._packetizer.packets(data, self._timestamp(ticks))
+    def _send(
+        self, delivery: PacketDelivery, unit: Frame, ticks: int, key: bool, now: float
+    ) -> bool:
+        pieces = self.stream.cutter.pieces(unit)
+        packets = self._numbering.numbered(pieces, self._timestamp(ticks))
         if now - self._told_at >= REPORT_EVERY:
             self._tell(now)
         return delivery.send(packets, key, now)
@@ -163,9 +165,8 @@ class RtspSession:
     def _report(self) -> tuple[SenderReport, SourceDescription]:
         ntp = int((time.time() + NTP_EPOCH) * (1 << 32))
         stamp = self._timestamp(self._ticks(time.monotonic()))
-        made = self._packetizer
-        counts = (made.packets_made & 0xFFFFFFFF, made.octets_made & 0xFFFFFFFF)
-        report = SenderReport(self.ssrc, ntp, stamp, *counts)
+        made = self._numbering
+        report = SenderReport(self.ssrc, ntp, stamp, made.packets, made.octets)
         return report, SourceDescription(self.ssrc, "smartcam")
 
     def _tell(self, now: float) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+from smartcam.frames._rtsp.packing import UnitCutter
 
 if TYPE_CHECKING:
     from smartcam.frames._shared_stream import SharedH264
@@ -41,6 +43,7 @@ class RtspStream:
     name: str
     shared: SharedH264
     rate: float
+    cutter: UnitCutter = field(default_factory=UnitCutter)
     viewers: int = 0
     sent: int = 0
     skipped: int = 0
