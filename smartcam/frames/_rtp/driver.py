@@ -321,7 +321,7 @@ class _Stream:
 
 def _frames_lost(unit: AccessUnit) -> int:
     """Return how many frames were lost before one, as far as that was seen."""
-    return max(unit.damaged, 1 if unit.lost else 0)
+    return max(unit.damaged, 1 if unit.lost or unit.begins else 0)
 
 
 def _shown(size: tuple[int, int] | None) -> str:
