@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 WAITING: Final = 16
 """Encoded frames that wait for the decoder; what comes beyond ends with a key frame."""
 
+MOST_FAILED: Final = 10
+"""Encoded frames in a row that cannot be decoded: then it ends with the reason."""
+
 KNOWN: Final = ("delay", "name", "payload", "repair", "size", "timeout")
 
 
@@ -192,6 +195,7 @@ class _Stream:
         self._overflows = 0
         self._skipped = 0  # units that were thrown away
         self._missed = self._number = 0
+        self._failed = 0  # frames in a row that could not be decoded
         self._shown = False
         self._ended = False
         self._codecs = Codecs(threads=1)
@@ -307,9 +311,14 @@ class _Stream:
             source=self._name,
         )
         try:
-            return await decoder.decode(frame)
-        except FrameFormatError:  # damaged by its sender, who is asked for another
-            return None
+            decoded = await decoder.decode(frame)
+        except FrameFormatError as exc:  # one may be damaged; if all are it is something else
+            self._failed += 1
+            if self._failed < MOST_FAILED:
+                return None
+            raise FrameFormatError(f"{self._name}: {exc}", available=exc.available) from exc
+        self._failed = 0
+        return decoded
 
     def _show(self, picture: Frame) -> None:
         lost, self._missed = self._missed if self._shown else 0, 0

@@ -325,6 +325,7 @@ class RtpSender:
                 self._audience.left(ssrc)
         elif isinstance(report, wire.ReceiverReport) and self._audience.report(report, address):
             self._wanted = True
+            self._say(link)  # it wants to know our clock
 
     def _send_again(self, link: _Link, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:

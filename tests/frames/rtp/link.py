@@ -67,7 +67,7 @@ def run(*arguments: str) -> None:
 
 @contextlib.contextmanager
 def thin_link(rate: str) -> Iterator[Link]:
-    """Give a link on which each end sends at a rate, such as ``20mbit``; skip where there is none."""
+    """Give a link whose ends send at a rate, such as ``20mbit``; skip where none can be made."""
     fcntl = pytest.importorskip("fcntl")
     for tool in ("ip", "tc"):
         if shutil.which(tool) is None:
