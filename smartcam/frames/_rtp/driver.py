@@ -190,10 +190,11 @@ class _Stream:
         self._expected = self._size = size
         self._name = plan.name
         self._loop = asyncio.get_running_loop()
-        self._units: collections.deque[AccessUnit] = collections.deque()
+        self._units: collections.deque[tuple[AccessUnit, float | None]] = collections.deque()
         self._came = asyncio.Event()
         self._overflows = 0
-        self._skipped = 0  # units that were thrown away
+        self._skipped = 0  # units that were thrown away since the last one was decoded
+        self._anew = True  # that what comes is another stream than what was decoded
         self._missed = self._number = 0
         self._failed = 0  # frames in a row that could not be decoded
         self._shown = False
@@ -228,11 +229,12 @@ class _Stream:
 
     def _take(self, units: list[AccessUnit]) -> None:
         """Have encoded frames wait for the decoder, all or none."""
-        self._units += units
+        self._units += [(one, self._receiver.utc(one.timestamp)) for one in units]
         if len(self._units) > WAITING:
             self._overflows += 1
             self._skipped += len(self._units)
-            self._missed += sum(_frames_lost(one) for one in self._units)
+            self._missed += sum(_frames_lost(one) for one, _ in self._units)
+            self._anew |= any(one.begins for one, _ in self._units)
             self._units.clear()
             self._receiver.want_picture()
         self._came.set()
@@ -264,28 +266,30 @@ class _Stream:
             self._over(error)
 
     async def _decode_all(self) -> None:
-        decoder: H264Decoder | None = None
+        decoder = self._codecs.h264_decoder()
         while not self._ended:
             if not self._units:
                 self._came.clear()
                 await self._came.wait()
                 continue
-            unit = self._units.popleft()
+            unit, device_time = self._units.popleft()
             missing = _frames_lost(unit) + self._skipped
-            self._skipped = 0
             self._missed += missing
-            if decoder is None or unit.begins:
+            if unit.begins or self._anew:
                 decoder = self._codecs.h264_decoder()
             elif missing:
                 decoder.lost()
-            picture = await self._decoded(decoder, unit)
+            self._skipped, self._anew = 0, False
+            picture = await self._decoded(decoder, unit, device_time)
             if picture is not None:
                 self._show(picture)
             else:
                 self._missed += 1
                 self._receiver.want_picture()
 
-    async def _decoded(self, decoder: H264Decoder, unit: AccessUnit) -> Frame | None:
+    async def _decoded(
+        self, decoder: H264Decoder, unit: AccessUnit, device_time: float | None
+    ) -> Frame | None:
         size = self._size = size_in(unit.data) or self._size
         if size is None:
             return None
@@ -306,7 +310,7 @@ class _Stream:
             utc=time.time() - passed,
             moment=Moment.ARRIVAL,
             duration=self._plan.delay,
-            device_time=self._receiver.utc(unit.timestamp),
+            device_time=device_time,
             sequence=0,
             source=self._name,
         )

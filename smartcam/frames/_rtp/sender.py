@@ -190,10 +190,10 @@ class RtpSender:
         """
         if self._entered:
             raise LocalProtocolError("RtpSender: entered before; make a new one")
-        self._entered = True
         rates = self._source.format.rates
+        self._entered = True
         if self._fps is None and rates:
-            self._encoder = self._made_encoder(rates[0])
+            self._encoder = self._made_encoder(min(max(rates[0], 0.01), 1000.0))
         host, port = self._to
         who = f"RTP to {host}:{port}"
         self._endpoint = to = await resolved(host, port, who)
@@ -209,6 +209,7 @@ class RtpSender:
                 for work, what in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
             ]
         except BaseException:
+            self._link = None
             link.pair.close()
             raise
         return self
@@ -228,6 +229,9 @@ class RtpSender:
             task.cancel()
         try:
             await asyncio.wait(self._tasks)
+            for task in self._tasks:
+                if not task.cancelled():
+                    task.exception()  # it was told, and stands in the log
         finally:
             link.pair.close()
             await self._codecs.close()
@@ -263,6 +267,9 @@ class RtpSender:
                         await link.pair.writable(BLOCKED)
         except FrameSourceError as error:
             _log.warning("! RTP to %s: %s", link.to, error)
+            raise
+        except Exception:
+            _log.exception("! RTP to %s", link.to)
             raise
         finally:
             self._say(link, wire.Goodbye((self._packetizer.ssrc,)))

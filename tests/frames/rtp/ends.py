@@ -17,13 +17,17 @@ from smartcam.frames._rtp.driver import RtpDriver
 from smartcam.frames._synthetic import read_stamp
 
 
+def say(what: object) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+
+
 async def send(to: str, seconds: float, crf: float) -> None:
     async with (
         frames.open("synthetic://?size=640x480&fps=30") as source,
         frames.RtpSender(source, to, crf=crf) as sender,
     ):
         await asyncio.sleep(seconds)
-        print(json.dumps(dataclasses.asdict(sender.statistics())))
+        say(dataclasses.asdict(sender.statistics()))
 
 
 async def receive(url: str, seconds: float) -> None:
@@ -35,11 +39,11 @@ async def receive(url: str, seconds: float) -> None:
             async with asyncio.timeout(seconds):
                 async for frame in reader:
                     stamp = read_stamp(frame.grey())
-                    print(json.dumps([*(stamp or (None, None)), time.monotonic_ns()]))
+                    say([*(stamp or (None, None)), time.monotonic_ns()])
                     counted = driver.statistics()
         except (TimeoutError, FrameSourceError):
             pass
-        print(json.dumps(dataclasses.asdict(counted)))
+        say(dataclasses.asdict(counted))
 
 
 if __name__ == "__main__":

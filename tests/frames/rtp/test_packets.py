@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -143,10 +145,8 @@ def test_all_that_is_missing_is_asked_for_and_nothing_else(sequences: list[int])
 def test_any_bytes_are_read_or_refused(data: bytes) -> None:
     for head in (b"", b"\x81\xc8\x00\x06", b"\x81\xca\x00\x03", b"\x82\xcb\x00\x02", b"\xbf"):
         for read in (RtpPacket.parse, parse_rtcp):
-            try:
-                read(head + data)
-            except MessageError as error:
-                assert str(error)
+            with contextlib.suppress(MessageError):
+                assert read(head + data) is not None
 
 
 def test_a_loss_beyond_its_field_is_held_within() -> None:
