@@ -21,7 +21,7 @@ from smartcam.frames._rtp.sockets import SocketPair, resolved
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._h264 import H264Decoder
-    from smartcam.frames._rtp.h264 import AccessUnit
+    from smartcam.frames._rtp.assembling import AccessUnit
     from smartcam.frames._rtp.sockets import Endpoint
 
 
@@ -261,9 +261,9 @@ class _Stream:
         except FrameSourceError as error:
             self._over(error)
         except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
-            error = FrameSourceError(f"{self._name}: {exc!r}")
-            error.__cause__ = exc
-            self._over(error)
+            failed = FrameSourceError(f"{self._name}: {exc!r}")
+            failed.__cause__ = exc
+            self._over(failed)
 
     async def _decode_all(self) -> None:
         decoder = self._codecs.h264_decoder()

@@ -118,7 +118,7 @@ class H264Packetizer:
         payloads = [
             part for group in self._groups(units(access_unit)) for part in self._payloads(group)
         ]
-        made = []
+        made: list[bytes] = []
         for payload in payloads:
             last = len(made) == len(payloads) - 1
             head = (last, self.payload_type, self._sequence, timestamp & 0xFFFFFFFF, self.ssrc)

@@ -17,7 +17,7 @@ from smartcam.frames._rtp.reception import Reception
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.frames._rtp.h264 import AccessUnit
+    from smartcam.frames._rtp.assembling import AccessUnit
     from smartcam.frames._rtp.packets import RtpPacket
     from smartcam.frames._rtp.sockets import SocketPair
 

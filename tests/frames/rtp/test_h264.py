@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames import Codecs
+from smartcam.frames._rtp.assembling import AccessUnit
 from smartcam.frames._rtp.h264 import (
     MOST_AHEAD,
-    AccessUnit,
     H264Depacketizer,
     H264Packetizer,
     parameter_sets,
