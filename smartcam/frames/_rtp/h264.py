@@ -218,6 +218,15 @@ class H264Depacketizer:
         gone = (one for one in range(self._next, max(self._held)) if one not in self._held)
         return [one & 0xFFFF for one in gone]
 
+    def tail(self) -> int | None:
+        """Return the sequence number that a frame goes on with whose end did not come yet.
+
+        None: none is begun, or others are missing before that.
+        """
+        if self._open is None or not self._open.whole or self._held or self._next is None:
+            return None
+        return self._next & 0xFFFF
+
     def waits_since(self) -> float | None:
         """Return when the first packet came that waits for another; None: none does."""
         return min((now for _, now in self._held.values()), default=None)

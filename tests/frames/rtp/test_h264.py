@@ -201,6 +201,17 @@ def test_who_waits_tells_for_what_and_since_when() -> None:
     assert depacketizer.duplicates == 1
 
 
+def test_who_is_in_the_midst_of_a_frame_tells_with_what_it_goes_on() -> None:
+    depacketizer = begun()
+    assert depacketizer.tail() is None
+    assert took(depacketizer, packet(PPS, 1, 9)) == []
+    assert depacketizer.tail() == 2
+    assert took(depacketizer, packet(SLICE, 3, 9, last=True)) == []
+    assert (depacketizer.tail(), depacketizer.missing()) == (None, [2])
+    assert len(took(depacketizer, packet(SLICE, 2, 9))) == 1
+    assert depacketizer.tail() is None
+
+
 def test_another_ssrc_is_a_new_stream() -> None:
     depacketizer = begun()
     assert took(depacketizer, packet("7c 85 aa", 1, 9)) == []

@@ -24,6 +24,7 @@ from smartcam.frames._rtp import driver as receiving
 from smartcam.frames._rtp.h264 import H264Packetizer
 from smartcam.frames._rtp.packets import (
     Goodbye,
+    PacketsMissing,
     PictureLost,
     ReceiverReport,
     RtpPacket,
@@ -147,6 +148,47 @@ async def test_packets_that_are_lost_are_sent_again() -> None:
             assert sum(frame.lost for frame in got) == 0
             assert seen(source).lost == 0
             assert sender.statistics().resent >= seen(source).repaired
+
+
+async def test_a_frame_s_end_is_asked_for_before_the_next_frame_comes() -> None:
+    port, packetizer = two_ports(), H264Packetizer(mtu_payload=200)
+    async with Codecs(threads=1) as codecs:
+        pictures = [frame_of(stamped(number), "Mono8") for number in (1, 2)]
+        coded = [await codecs.h264_encoder(crf=5).encode(one) for one in pictures]
+    first, second = (
+        packetizer.packets(bytes(one.data), 3000 * number) for number, one in enumerate(coded)
+    )
+    assert min(len(first), len(second)) > 2
+    url = f"rtp://{HOST}:{port}?{SIZE}&repair=1"
+    with (
+        socket.socket(type=socket.SOCK_DGRAM) as rtp,
+        socket.socket(type=socket.SOCK_DGRAM) as rtcp,
+    ):
+        rtp.bind((HOST, here := two_ports()))
+        rtcp.bind((HOST, here + 1))
+        rtcp.setblocking(False)
+
+        async def asked() -> int:
+            while True:
+                for report in parse_rtcp(await asyncio.get_running_loop().sock_recv(rtcp, 2000)):
+                    if isinstance(report, PacketsMissing):
+                        return report.sequences[0]
+
+        def give(*packets: bytes) -> None:
+            for one in packets:
+                rtp.sendto(one, (HOST, port))
+
+        async with frames.open(url, timeout=LIMIT) as source, source.reader() as reader:
+            await until(lambda: source.statistics().streaming)
+            async with asyncio.timeout(LIMIT):
+                give(first[0], *first[2:])
+                assert await asked() == RtpPacket.parse(first[1]).sequence
+                give(first[1])
+                assert read_stamp((await anext(reader)).grey()) == (1, 1000)
+                give(*second[:-1])
+                assert await asked() == RtpPacket.parse(second[-1]).sequence
+                give(second[-1])
+                assert read_stamp((await anext(reader)).grey()) == (2, 2000)
 
 
 @pytest.mark.parametrize("back", [True, False], ids=["with key frames", "by refresh alone"])
