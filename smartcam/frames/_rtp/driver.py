@@ -21,12 +21,15 @@ from smartcam.frames._rtp.sockets import SocketPair, resolved
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._h264 import H264Decoder
-    from smartcam.frames._rtp.h264 import AccessUnit
+    from smartcam.frames._rtp.assembling import AccessUnit
     from smartcam.frames._rtp.sockets import Endpoint
 
 
 WAITING: Final = 16
 """Encoded frames that wait for the decoder; what comes beyond ends with a key frame."""
+
+MOST_FAILED: Final = 10
+"""Encoded frames in a row that cannot be decoded: then it ends with the reason."""
 
 KNOWN: Final = ("delay", "name", "payload", "repair", "size", "timeout")
 
@@ -187,11 +190,13 @@ class _Stream:
         self._expected = self._size = size
         self._name = plan.name
         self._loop = asyncio.get_running_loop()
-        self._units: collections.deque[AccessUnit] = collections.deque()
+        self._units: collections.deque[tuple[AccessUnit, float | None]] = collections.deque()
         self._came = asyncio.Event()
         self._overflows = 0
-        self._skipped = 0  # units that were thrown away
+        self._skipped = 0  # units that were thrown away since the last one was decoded
+        self._anew = True  # that what comes is another stream than what was decoded
         self._missed = self._number = 0
+        self._failed = 0  # frames in a row that could not be decoded
         self._shown = False
         self._ended = False
         self._codecs = Codecs(threads=1)
@@ -224,11 +229,12 @@ class _Stream:
 
     def _take(self, units: list[AccessUnit]) -> None:
         """Have encoded frames wait for the decoder, all or none."""
-        self._units += units
+        self._units += [(one, self._receiver.utc(one.timestamp)) for one in units]
         if len(self._units) > WAITING:
             self._overflows += 1
             self._skipped += len(self._units)
-            self._missed += sum(_frames_lost(one) for one in self._units)
+            self._missed += sum(_frames_lost(one) for one, _ in self._units)
+            self._anew |= any(one.begins for one, _ in self._units)
             self._units.clear()
             self._receiver.want_picture()
         self._came.set()
@@ -255,33 +261,35 @@ class _Stream:
         except FrameSourceError as error:
             self._over(error)
         except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
-            error = FrameSourceError(f"{self._name}: {exc!r}")
-            error.__cause__ = exc
-            self._over(error)
+            failed = FrameSourceError(f"{self._name}: {exc!r}")
+            failed.__cause__ = exc
+            self._over(failed)
 
     async def _decode_all(self) -> None:
-        decoder: H264Decoder | None = None
+        decoder = self._codecs.h264_decoder()
         while not self._ended:
             if not self._units:
                 self._came.clear()
                 await self._came.wait()
                 continue
-            unit = self._units.popleft()
+            unit, device_time = self._units.popleft()
             missing = _frames_lost(unit) + self._skipped
-            self._skipped = 0
             self._missed += missing
-            if decoder is None or unit.begins:
+            if unit.begins or self._anew:
                 decoder = self._codecs.h264_decoder()
             elif missing:
                 decoder.lost()
-            picture = await self._decoded(decoder, unit)
+            self._skipped, self._anew = 0, False
+            picture = await self._decoded(decoder, unit, device_time)
             if picture is not None:
                 self._show(picture)
             else:
                 self._missed += 1
                 self._receiver.want_picture()
 
-    async def _decoded(self, decoder: H264Decoder, unit: AccessUnit) -> Frame | None:
+    async def _decoded(
+        self, decoder: H264Decoder, unit: AccessUnit, device_time: float | None
+    ) -> Frame | None:
         size = self._size = size_in(unit.data) or self._size
         if size is None:
             return None
@@ -302,14 +310,19 @@ class _Stream:
             utc=time.time() - passed,
             moment=Moment.ARRIVAL,
             duration=self._plan.delay,
-            device_time=self._receiver.utc(unit.timestamp),
+            device_time=device_time,
             sequence=0,
             source=self._name,
         )
         try:
-            return await decoder.decode(frame)
-        except FrameFormatError:  # damaged by its sender, who is asked for another
-            return None
+            decoded = await decoder.decode(frame)
+        except FrameFormatError as exc:  # one may be damaged; if all are it is something else
+            self._failed += 1
+            if self._failed < MOST_FAILED:
+                return None
+            raise FrameFormatError(f"{self._name}: {exc}", available=exc.available) from exc
+        self._failed = 0
+        return decoded
 
     def _show(self, picture: Frame) -> None:
         lost, self._missed = self._missed if self._shown else 0, 0
@@ -321,7 +334,7 @@ class _Stream:
 
 def _frames_lost(unit: AccessUnit) -> int:
     """Return how many frames were lost before one, as far as that was seen."""
-    return max(unit.damaged, 1 if unit.lost else 0)
+    return max(unit.damaged, 1 if unit.lost or unit.begins else 0)
 
 
 def _shown(size: tuple[int, int] | None) -> str:

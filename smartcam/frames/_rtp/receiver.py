@@ -17,7 +17,7 @@ from smartcam.frames._rtp.reception import Reception
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.frames._rtp.h264 import AccessUnit
+    from smartcam.frames._rtp.assembling import AccessUnit
     from smartcam.frames._rtp.packets import RtpPacket
     from smartcam.frames._rtp.sockets import SocketPair
 
@@ -30,6 +30,10 @@ TICK: Final = 0.005
 
 ASKED_AGAIN: Final = 0.02
 """Seconds after which a packet is asked for once more."""
+
+PAUSE: Final = 0.008
+"""Seconds without a packet in the midst of a frame, after which its next one counts as missing:
+else that is only seen when the next frame comes."""
 
 MOST_ASKED: Final = 256
 """Packets that are asked for at a time: where more are missing, a key frame is the shorter way."""
@@ -193,7 +197,8 @@ class Receiver:
     def _read(self) -> None:
         """Hand on what is whole, and have a look later where something is missing."""
         made, self._made = self._made, []
-        if self._tick is None and self._depacketizer.waits_since() is not None:
+        taken = self._depacketizer
+        if self._tick is None and (taken.waits_since() is not None or self._tail_due()):
             self._tick = self._loop.call_later(TICK, self._look)
         if made:
             self._done(made)
@@ -210,8 +215,17 @@ class Receiver:
             self._asked.clear()
             self.want_picture()
         elif self._repair and len(missing) <= MOST_ASKED:
+            tail = self._depacketizer.tail()
+            if tail is not None and self._tail_due() and now - self.heard >= PAUSE:
+                missing = [tail]
             self._ask(missing, now)
         self._read()
+
+    def _tail_due(self) -> bool:
+        """Return whether the rest of a frame is to be asked for, by who is known to answer."""
+        if not self._repaired or self._loop.time() - self.heard > self._repair:
+            return False
+        return self._depacketizer.tail() is not None
 
     def _ask(self, missing: list[int], now: float) -> None:
         asked = self._asked

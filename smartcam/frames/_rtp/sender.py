@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import collections
 import contextlib
 import logging
 import secrets
@@ -21,9 +20,10 @@ from smartcam.exceptions import (
 )
 from smartcam.frames._codecs import Codecs
 from smartcam.frames._rtp import packets as wire
+from smartcam.frames._rtp.feedback import Audience, History
 from smartcam.frames._rtp.h264 import H264Packetizer, parameter_sets
 from smartcam.frames._rtp.parameters import CLOCK_RATE, description
-from smartcam.frames._rtp.reception import middle, ntp_time
+from smartcam.frames._rtp.reception import ntp_time
 from smartcam.frames._rtp.sockets import SocketPair, host_and_port, resolved
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames._frame import Frame
     from smartcam.frames._h264 import H264Encoder
+    from smartcam.frames._rtp.feedback import RtpReceiver
     from smartcam.frames._rtp.sockets import Endpoint
     from smartcam.frames._source import FrameSource
 
@@ -40,43 +41,11 @@ _log = logging.getLogger("smartcam.frames")
 REPORTED: Final = 2.0
 """Seconds between two sender reports."""
 
-REMEMBERED: Final = 1024
-"""Packets that can be sent again."""
-
-RESENT: Final = 5
-"""Times that one packet is sent again at most."""
-
 ANEW: Final = 0.2
 """Seconds between two key frames that are asked for: they are large."""
 
 BLOCKED: Final = 1.0
 """Seconds that a full socket is waited for before the next frame is tried all the same."""
-
-SILENT: Final = 10.0
-"""Seconds after which a receiver that no longer reports is forgotten."""
-
-MOST_RECEIVERS: Final = 64
-
-
-@dataclass(frozen=True, slots=True)
-class RtpReceiver:
-    """What a receiver said in its last report.
-
-    Attributes:
-        address: it reports from, ``HOST:PORT``.
-        loss: share of the packets that did not reach it since the report before, 0 to 1.
-        lost: packets since the beginning.
-        jitter: of the arrival, seconds.
-        round_trip: seconds there and back; None: not known.
-        age: seconds since that report.
-    """
-
-    address: str
-    loss: float
-    lost: int
-    jitter: float
-    round_trip: float | None
-    age: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,27 +71,11 @@ class RtpSenderStatistics:
     receivers: tuple[RtpReceiver, ...]
 
 
-class _Sent:
-    """A packet that can be sent again."""
-
-    __slots__ = ("data", "times")
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.times = data, 0
-
-
 class _Link(NamedTuple):
     """What it sends through, and where."""
 
     pair: SocketPair
     to: Endpoint
-
-
-class _Heard(NamedTuple):
-    address: str
-    block: wire.ReportBlock
-    round_trip: float | None
-    at: float
 
 
 class RtpSender:
@@ -178,8 +131,8 @@ class RtpSender:
         self._first = secrets.randbits(32)  # timestamp at the clock's 0
         self._ticks = 0
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
-        self._sent: collections.OrderedDict[int, _Sent] = collections.OrderedDict()
-        self._receivers: dict[int, _Heard] = {}
+        self._history = History()
+        self._audience = Audience(self._packetizer.ssrc)
         self._sets: tuple[bytes, bytes] | None = None
         self._frames = self._packets = self._bytes = self._cut = self._resent = self._anew = 0
         self._octets = 0
@@ -216,7 +169,6 @@ class RtpSender:
 
     def statistics(self) -> RtpSenderStatistics:
         """Return what it did since it began."""
-        now = time.monotonic()
         return RtpSenderStatistics(
             self._frames,
             self._packets,
@@ -224,18 +176,7 @@ class RtpSender:
             self._cut,
             self._resent,
             self._anew,
-            tuple(
-                RtpReceiver(
-                    one.address,
-                    one.block.fraction / 256,
-                    one.block.lost,
-                    one.block.jitter / CLOCK_RATE,
-                    one.round_trip,
-                    now - one.at,
-                )
-                for one in self._receivers.values()
-                if now - one.at < SILENT
-            ),
+            self._audience.receivers(),
         )
 
     async def __aenter__(self) -> Self:
@@ -249,10 +190,10 @@ class RtpSender:
         """
         if self._entered:
             raise LocalProtocolError("RtpSender: entered before; make a new one")
-        self._entered = True
         rates = self._source.format.rates
+        self._entered = True
         if self._fps is None and rates:
-            self._encoder = self._made_encoder(rates[0])
+            self._encoder = self._made_encoder(min(max(rates[0], 0.01), 1000.0))
         host, port = self._to
         who = f"RTP to {host}:{port}"
         self._endpoint = to = await resolved(host, port, who)
@@ -268,6 +209,7 @@ class RtpSender:
                 for work, what in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
             ]
         except BaseException:
+            self._link = None
             link.pair.close()
             raise
         return self
@@ -287,6 +229,9 @@ class RtpSender:
             task.cancel()
         try:
             await asyncio.wait(self._tasks)
+            for task in self._tasks:
+                if not task.cancelled():
+                    task.exception()  # it was told, and stands in the log
         finally:
             link.pair.close()
             await self._codecs.close()
@@ -323,6 +268,9 @@ class RtpSender:
         except FrameSourceError as error:
             _log.warning("! RTP to %s: %s", link.to, error)
             raise
+        except Exception:
+            _log.exception("! RTP to %s", link.to)
+            raise
         finally:
             self._say(link, wire.Goodbye((self._packetizer.ssrc,)))
 
@@ -343,13 +291,11 @@ class RtpSender:
                 link.pair.rtp.sendto(packet, to)
             except OSError:  # it is full, or there is no way there just now
                 return False
-            self._sent[sequence] = _Sent(packet)
+            self._history.sent(sequence, packet)
             sequence = sequence + 1 & 0xFFFF
             self._packets += 1
             self._bytes += len(packet)
             self._octets += len(packet) - 12
-        while len(self._sent) > REMEMBERED:
-            self._sent.popitem(last=False)
         self._frames += 1
         return True
 
@@ -357,10 +303,6 @@ class RtpSender:
         while True:
             self._say(link)
             await asyncio.sleep(REPORTED)
-            now = time.monotonic()
-            for ssrc, one in [*self._receivers.items()]:
-                if now - one.at >= SILENT:
-                    del self._receivers[ssrc]
 
     def _say(self, link: _Link, *more: wire.Report) -> None:
         now = int(time.monotonic() * CLOCK_RATE) + self._first & 0xFFFF_FFFF
@@ -387,37 +329,18 @@ class RtpSender:
             self._wanted = True
         elif isinstance(report, wire.Goodbye):
             for ssrc in report.ssrcs:
-                self._receivers.pop(ssrc, None)
-        elif isinstance(report, wire.ReceiverReport):
-            if report.ssrc not in self._receivers:
-                if len(self._receivers) >= MOST_RECEIVERS:
-                    return
-                self._wanted = True
-            before = self._receivers.get(report.ssrc, _Heard(address, _NOTHING, None, 0.0))
-            block = next((one for one in report.blocks if one.ssrc == ours), None)
-            if block is not None:  # what is asked for in a hurry comes with none
-                before = _Heard(address, block, _round_trip(block), 0.0)
-            self._receivers[report.ssrc] = before._replace(at=time.monotonic())
+                self._audience.left(ssrc)
+        elif isinstance(report, wire.ReceiverReport) and self._audience.report(report, address):
+            self._wanted = True
+            self._say(link)  # it wants to know our clock
 
     def _send_again(self, link: _Link, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:
-            sent = self._sent.get(sequence)
-            if sent is None or sent.times >= RESENT:
+            packet = self._history.again(sequence)
+            if packet is None:
                 continue
-            sent.times += 1
             try:
-                link.pair.rtp.sendto(sent.data, link.to[1:])
+                link.pair.rtp.sendto(packet, link.to[1:])
             except OSError:
                 return
             self._resent += 1
-
-
-_NOTHING: Final = wire.ReportBlock(0, 0, 0, 0, 0)
-
-
-def _round_trip(block: wire.ReportBlock) -> float | None:
-    """Return RFC 3550's round-trip time, seconds, where a sender report came back."""
-    if not block.last_report:
-        return None
-    ticks = middle(ntp_time(time.time())) - block.last_report - block.delay & 0xFFFF_FFFF
-    return ticks / 65536 if ticks < 1 << 31 else 0.0
