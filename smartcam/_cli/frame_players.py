@@ -27,7 +27,7 @@ LONGEST_NAME = 60
 LOOK = 0.1
 """Seconds between two looks whether a source is there."""
 
-DESCRIBED = 2.0
+DESCRIBED = 5.0
 """Seconds that the first frame is waited for, after which its description has all that helps."""
 
 

@@ -9,7 +9,7 @@ from aiohttp import web
 from smartcam.exceptions import FrameSourceError, LocalProtocolError
 from smartcam.web._errors import RefusedError, shown
 from smartcam.web._jpeg import require_encoder
-from smartcam.web._pictures import FILES, Pictures
+from smartcam.web._pictures import FILES, SitePictures
 from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._site import API, Site
 
@@ -60,7 +60,7 @@ class FramesSite(Site):
         token: str | None = None,
     ) -> None:
         super().__init__(CALLS, "frames", host=host, port=port, token=token, files=FILES)
-        self.pictures: Pictures = Pictures(sources, quality)
+        self.pictures: SitePictures = SitePictures(sources, quality)
         require_encoder()
         self.sources: tuple[FrameSource, ...] = self.pictures.sources
         self.failures: dict[int, str] = self.pictures.failures

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
-from smartcam.web._pictures import Pictures
+from smartcam.web._pictures import SitePictures
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -49,7 +49,7 @@ class LiveFrames:
     """
 
     def __init__(self, camera: Callable[[], object]) -> None:
-        self.pictures: Pictures | None = None
+        self.pictures: SitePictures | None = None
         self._camera = camera
         self._task: asyncio.Task[None] | None = None
 
@@ -73,7 +73,7 @@ class LiveFrames:
 
     async def _show(self, camera: HasFrames) -> None:
         """Have its frames there until the page shows another camera."""
-        pictures = Pictures([camera.frame_source("jpeg", QUALITY)], QUALITY)
+        pictures = SitePictures([camera.frame_source("jpeg", QUALITY)], QUALITY)
         pictures.start()
         keeping = asyncio.create_task(pictures.keep_open(0), name="smartcam.live.source")
         self.pictures = pictures

@@ -68,7 +68,7 @@ def _heard(_error: SmartCamError | None) -> None:
     """Hear of a try."""
 
 
-class Pictures:
+class SitePictures:
     """The sources of a site, and who looks at them.
 
     Args:
@@ -232,7 +232,7 @@ class Viewer:
         gone: is set when that is over.
     """
 
-    def __init__(self, pictures: Pictures, place: int, request: web.Request) -> None:
+    def __init__(self, pictures: SitePictures, place: int, request: web.Request) -> None:
         self._pictures = pictures
         self._source = pictures.sources[place]
         self._request = request

@@ -84,42 +84,28 @@ def described(url: str) -> str:
 
 
 @pytest.mark.real_time
-def test_page_and_rtsp_are_served_until_ctrl_c() -> None:
-    with Process(
-        *("smartcam", "frames", "serve", LEFT, RIGHT, "--rtsp", "127.0.0.1:0", "--json")
-    ) as process:
-        served = json.loads(process.read_until(b"\n"))
-        assert list(served["rtsp"]) == ["left", "right"]
-        told = get(f"{served['page']}api/sources")["sources"]
-        assert [(one["name"], one["started"]) for one in told] == [("left", 0), ("right", 0)]
-        assert described(served["rtsp"]["right"]).startswith("RTSP/1.0 200 OK")
-        left, right = get(f"{served['page']}api/sources")["sources"]
-        assert (left["started"], right["started"]) == (0, 1)
-        process.send_signal(signal.SIGINT)
-        ended = process.wait()
-    assert (ended.code, ended.err) == (0, "")
-
-
-@pytest.mark.real_time
-def test_rtp_is_sent_until_sigterm_with_its_description_in_a_file(tmp_path: Path) -> None:
+def test_page_rtsp_and_rtp_are_served_until_sigterm(tmp_path: Path) -> None:
     file = tmp_path / "left.sdp"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(PATIENCE)
         port = receiver.getsockname()[1]
-        to = f"127.0.0.1:{port}"
-        with Process(
-            *("smartcam", "frames", "serve", LEFT, "--rtp", to, "--sdp", str(file), "--json")
-        ) as process:
-            page, told = map(json.loads, process.read_until(b"\n", count=2).splitlines())
+        beside = ("--rtsp", "127.0.0.1:0", "--rtp", f"127.0.0.1:{port}", "--sdp", str(file))
+        with Process("smartcam", "frames", "serve", LEFT, *beside, "--json") as process:
+            served, sent = map(json.loads, process.read_until(b"\n", count=2).splitlines())
             packet = receiver.recv(65536)
+            (told,) = get(f"{served['page']}api/sources")["sources"]
+            assert described(served["rtsp"]["left"]).startswith("RTSP/1.0 200 OK")
             process.send_signal(signal.SIGTERM)
             ended = process.wait()
     assert (ended.code, ended.err) == (0, "")
-    assert list(page) == ["page"]
-    assert (told["rtp"], told["sdp"].replace("\r\n", "\n")) == (to, file.read_text("utf-8"))
-    assert f"m=video {port} RTP/AVP 96" in told["sdp"]
-    assert "sprop-parameter-sets=" in told["sdp"]
+    assert (told["name"], told["started"], told["readers"]) == ("left", 1, 1)
+    assert (sent["rtp"], sent["sdp"].splitlines()) == (
+        f"127.0.0.1:{port}",
+        file.read_text("utf-8").splitlines(),
+    )
+    assert f"m=video {port} RTP/AVP 96" in sent["sdp"]
+    assert "sprop-parameter-sets=" in sent["sdp"]
     assert (packet[0] >> 6, packet[1] & 0x7F) == (2, 96)
 
 
