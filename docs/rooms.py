@@ -40,6 +40,7 @@ ROOMS = (
     Room("doctor", "what is wrong", 1, 2),
     Room("connecting", "from a URL to a camera", 2, 3, ("connecting", "sync")),
     Room("fleet", "cameras, shared", 2, 4),
+    Room("depth", "metres and clouds", 0.5, 4),
     Room("frames", "pictures of any camera", 1, 5),
     Room("client", "what a program uses", 1.5, 6, ("camera", "client")),
     Room("emulator", "cameras without one", 3, 6),
