@@ -227,9 +227,7 @@ class StereoMatcher:
         before = max(0, self.nearest + 1)
         after = max(0, -int(self.parameters["min_disparity"]))
         wide = [
-            cv2.copyMakeBorder(
-                np.ascontiguousarray(one), 0, 0, before, after, cv2.BORDER_REPLICATE
-            )
+            cv2.copyMakeBorder(np.ascontiguousarray(one), 0, 0, before, after, cv2.BORDER_REPLICATE)
             for one in (left, right)
         ]
         width = left.shape[1]
@@ -281,7 +279,7 @@ def _disagreement(
 
     Sixteenths; infinite where either is none, or the point is outside of the right picture.
     """
-    height, width = there.shape
+    width = there.shape[1]
     column = np.arange(width, dtype=np.int32)[None] - ((there.astype(np.int32) + 8) >> 4)
     inside = (column >= 0) & (column < width) & (there > none)
     other = np.take_along_axis(back, np.clip(column, 0, width - 1), axis=1)

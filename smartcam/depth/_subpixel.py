@@ -19,7 +19,7 @@ COARSE: Final = 0.5
 STEPS: Final = 3
 """Of Gauss and Newton."""
 
-FARTHEST: Final = 1.0
+FARTHEST: Final = 0.5
 """Pixels by which a disparity may be moved: farther off is another point."""
 
 ROUGHEST: Final = 0.5

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from smartcam.calibration import CameraModel, Transform
+
 SIZE = (320, 240)
 
 
@@ -87,3 +89,57 @@ def _seen(
 ) -> NDArray[np.uint8]:
     noisy = brightness + rng.normal(0, noise, brightness.shape)
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+class Room(NamedTuple):
+    """A wall and a board before it, in the left camera's frame, with a texture each."""
+
+    wall: tuple[float, float, float]  # Z = z0 + zx X + zy Y of the wall, metres
+    board: float | None  # distance of the board, metres, parallel to the picture
+    half: tuple[float, float] = (0.12, 0.1)  # of the board's width and height, metres
+    detail: float = 0.01  # the finest wave, metres
+    seed: int = 1
+
+    def rays(
+        self, origin: NDArray[np.float64], rays: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where rays (N, 3) from a point meet the room, (N, 3), and its brightness (N,)."""
+        z0, zx, zy = self.wall
+        along = (z0 + zx * origin[0] + zy * origin[1] - origin[2]) / (
+            rays[:, 2] - zx * rays[:, 0] - zy * rays[:, 1]
+        )
+        points = origin + along[:, None] * rays
+        back = Texture(self.seed, finest=self.detail)
+        brightness = back(points[:, 0], points[:, 1])
+        if self.board is not None:
+            near = origin + ((self.board - origin[2]) / rays[:, 2])[:, None] * rays
+            hit = (abs(near[:, 0]) < self.half[0]) & (abs(near[:, 1]) < self.half[1])
+            front = Texture(self.seed + 1, finest=self.detail)
+            points[hit] = near[hit]
+            brightness[hit] = front(near[hit, 0], near[hit, 1])
+        return points, brightness
+
+    def picture(
+        self, camera: CameraModel, pose: Transform | None = None, *, noise: float = 0, seed: int = 1
+    ) -> NDArray[np.uint8]:
+        """Return what a camera sees; ``pose`` is T_camera_left, None: the left one."""
+        width, height = camera.size
+        v, u = np.mgrid[:height, :width]
+        flat = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
+        rays = np.column_stack([flat, np.ones(len(flat))])
+        origin = np.zeros(3)
+        if pose is not None:
+            back = pose.inverse()
+            rays, origin = rays @ back.rotation.T, back.translation
+        brightness = self.rays(origin, rays)[1].reshape(height, width)
+        return _seen(brightness, noise, np.random.default_rng(seed))
+
+    def depth(self, camera: CameraModel, turn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the true depth of a camera without distortion whose frame is turned from the left
+        one's."""
+        width, height = camera.size
+        v, u = np.mgrid[:height, :width]
+        flat = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
+        rays = np.column_stack([flat, np.ones(len(flat))]) @ turn  # back into the left frame
+        points = self.rays(np.zeros(3), rays)[0]
+        return np.asarray((points @ turn.T)[:, 2].reshape(height, width))
