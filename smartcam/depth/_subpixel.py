@@ -28,6 +28,9 @@ ROUGHEST: Final = 0.5
 FILLED: Final = 0.5
 """Part of a window that has disparities, at least."""
 
+BESIDE: Final = 2
+"""Pixels from a hole within which nothing is refined."""
+
 LAGS: Final = 2
 """Pixels over which noise is looked at for correlation."""
 
@@ -51,7 +54,8 @@ def refined(
     sums = _Windows(window)
     start = np.where(known, coarse, 0).astype(np.float64)
     plane = _plane(start, known, sums)
-    smooth = known & (plane.rough <= ROUGHEST) & (plane.count >= FILLED * window**2)
+    smooth = (plane.rough <= ROUGHEST) & (plane.count >= FILLED * window**2)
+    smooth &= _whole_around(known)
     # near an edge of depth a coarse value may be that of its other side
     told = np.fmax(sigma, plane.rough)
     found, usable = start, known
@@ -65,6 +69,12 @@ def refined(
     told = np.where(usable, fit.sigma, told)
     told[~known] = np.nan
     return found.astype(np.float32), told.astype(np.float32)
+
+
+def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return what has no hole next to it: behind a near thing's edge there is one."""
+    around = np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8)
+    return np.asarray(load("cv2").erode(known.astype(np.uint8), around) > 0)
 
 
 class _Windows:
