@@ -11,7 +11,7 @@ from smartcam.calibration._optional_imports import load
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Field = NDArray[np.float64]
+    Field = NDArray[np.float32]
 
 COARSE: Final = 0.5
 """Least sigma of a disparity that least squares could not refine, pixels."""
@@ -52,7 +52,8 @@ def refined(
     if not window or not known.any():
         return coarse, sigma
     sums = _Windows(window)
-    start = np.where(known, coarse, 0).astype(np.float64)
+    pictures = left.astype(np.float32), right.astype(np.float32)
+    start = np.where(known, coarse, np.float32(0))
     plane = _plane(start, known, sums)
     smooth = (plane.rough <= ROUGHEST) & (plane.count >= FILLED * window**2)
     smooth &= _whole_around(known)
@@ -62,13 +63,15 @@ def refined(
     for step in range(STEPS):
         if step:
             plane = _plane(found, known, sums)
-        fit = _fitted((left, right), found, known, usable, plane, sums)
+        fit = _fitted(_linearized(pictures, found, known), found, usable, plane, sums)
+        if step == STEPS - 1:
+            fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
         usable = smooth & (fit.sigma < COARSE) & (np.abs(fit.disparity - start) < FARTHEST)
         found = np.where(usable, fit.disparity, start)
-    found[~known] = np.nan
     told = np.where(usable, fit.sigma, told)
+    found[~known] = np.nan
     told[~known] = np.nan
-    return found.astype(np.float32), told.astype(np.float32)
+    return found, told
 
 
 def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -78,17 +81,24 @@ def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 class _Windows:
-    """Sums over the window around each pixel."""
+    """Sums over the window around each pixel; outside of the picture there is nothing."""
 
     def __init__(self, side: int) -> None:
-        self._ones = np.ones(side)
-        self._ramp = np.arange(side) - side // 2.0
-        self._border = load("cv2").BORDER_CONSTANT
+        self._cv2 = load("cv2")
+        self._side = (side, side)
+        self._ramp = np.arange(side, dtype=np.float32) - side // 2
+        self._border = self._cv2.BORDER_CONSTANT
 
     def __call__(self, values: Field, across: int = 0, down: int = 0) -> Field:
         """Return the sums of values times powers of the distance from the window's middle."""
-        x, y = self._ramp**across, self._ramp**down
-        return np.asarray(load("cv2").sepFilter2D(values, -1, x, y, borderType=self._border))
+        if not (across or down):
+            found = self._cv2.boxFilter(
+                values, -1, self._side, normalize=False, borderType=self._border
+            )
+        else:
+            x, y = self._ramp**across, self._ramp**down
+            found = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
+        return np.asarray(found, dtype=np.float32)
 
 
 class _Plane(NamedTuple):
@@ -101,9 +111,9 @@ class _Plane(NamedTuple):
 
 
 def _plane(disparity: Field, known: NDArray[np.bool_], sums: _Windows) -> _Plane:
-    mask = known.astype(np.float64)
+    mask = known.astype(np.float32)
     # near 0, so that the squares below keep their digits
-    values = (disparity - disparity.mean(where=known)) * mask
+    values = (disparity - disparity.mean(where=known, dtype=np.float64).astype(np.float32)) * mask
     count = np.maximum(sums(mask), 1)
     total = sums(values)
     left = sums(values * values) - total * total / count
@@ -117,17 +127,38 @@ def _plane(disparity: Field, known: NDArray[np.bool_], sums: _Windows) -> _Plane
     return _Plane(slopes[0], slopes[1], np.sqrt(np.maximum(left, 0) / count), count)
 
 
-class _Fit(NamedTuple):
-    """Both (H, W), pixels; the sigma is infinite where there is no texture."""
+class _Linear(NamedTuple):
+    """How the pictures differ, and by how much more with a disparity; 0 where that is unknown."""
 
-    disparity: Field
-    sigma: Field
+    e: Field  # left less right, grey levels
+    g: Field  # slope of both, grey levels a pixel
+    mask: Field  # 1 where they are known
+
+
+def _linearized(
+    pictures: tuple[Field, Field], disparity: Field, known: NDArray[np.bool_]
+) -> _Linear:
+    left, right = pictures
+    width = left.shape[1]
+    there = np.arange(width, dtype=np.float32) - disparity
+    inside = known & (there >= 1) & (there <= width - 2)
+    mask = inside.astype(np.float32)
+    moved, slope = _sampled(right, np.where(inside, there, np.float32(1)))
+    slope += np.gradient(left, axis=1)
+    return _Linear((left - moved) * mask, slope * mask / 2, mask)
+
+
+class _Fit(NamedTuple):
+    """All (H, W); the sigma is infinite where there is no texture."""
+
+    disparity: Field  # pixels
+    sigma: Field  # of noise that is not correlated, pixels
+    linear: _Linear
 
 
 def _fitted(
-    pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    linear: _Linear,
     disparity: Field,
-    known: NDArray[np.bool_],
     trusted: NDArray[np.bool_],
     plane: _Plane,
     sums: _Windows,
@@ -139,22 +170,14 @@ def _fitted(
     # With the right picture's row taken at u - d_q, L - R_q = b - g (D + s (q - p) - d_q) + noise
     # for all q of the window around p: linear in D and b. g is the mean of both pictures' slopes,
     # whose noise does not go with that of their difference.
-    left, right = pictures
-    width = left.shape[1]
-    there = np.arange(width) - disparity
-    inside = known & (there >= 1) & (there <= width - 2)
-    moved, slope = _sampled(right, np.where(inside, there, 1.0))
-    mask = inside.astype(np.float64)
-    e = (left - moved) * mask
-    g = (np.gradient(left.astype(np.float64), axis=1) + slope) / 2 * mask
-    d = disparity * mask
-    gg = g * g
+    e, g, mask = linear
+    gd, gg = g * disparity, g * g
     n = np.maximum(sums(mask), 1)
-    sg, sgg = sums(g), sums(gg)
-    sgd = sums(g * d) - plane.across * sums(g, 1) - plane.down * sums(g, 0, 1)
-    sggd = sums(gg * d) - plane.across * sums(gg, 1) - plane.down * sums(gg, 0, 1)
+    sg = sums(g)
+    sgd = sums(gd) - plane.across * sums(g, 1) - plane.down * sums(g, 0, 1)
+    sggd = sums(g * gd) - plane.across * sums(gg, 1) - plane.down * sums(gg, 0, 1)
     sgy, sy = sums(g * e) - sggd, sums(e) - sgd
-    curvature = sgg - sg * sg / n
+    curvature = sums(gg) - sg * sg / n
     trust = mask * trusted
     m = np.maximum(sums(trust), 1)
     se = sums(e * trust)
@@ -162,27 +185,27 @@ def _fitted(
     # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's
     texture = curvature - n * variance / 8
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = -(sgy - sg * sy / n) / curvature
-        sigma = np.sqrt(variance * _correlation(e * trust, g * trust, trust) / texture)
-    usable = (texture > 0) & np.isfinite(found) & inside
-    return _Fit(np.where(usable, found, disparity), np.where(usable, sigma, np.inf))
+        found = (sg * sy / n - sgy) / curvature
+        sigma = np.sqrt(variance / texture)
+    usable = (texture > 0) & np.isfinite(found) & (mask > 0)
+    return _Fit(np.where(usable, found, disparity), np.where(usable, sigma, np.inf), linear)
 
 
-def _sampled(picture: NDArray[np.uint8], columns: Field) -> tuple[Field, Field]:
+def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
     """Return brightness and slope at columns (H, W) of each row."""
     # Lagrange's polynomial through six pixels. OpenCV's remap is of no use here: its cubic kernel
     # (a = -0.75) moves a ramp by up to 0.03 pixels.
     height, width = picture.shape
-    wide = np.pad(picture, ((0, 0), (3, 3)), mode="edge").astype(np.float64).ravel()
+    wide = np.pad(picture, ((0, 0), (3, 3)), mode="edge").ravel()
     whole = np.floor(columns)
     t = columns - whole
-    start = whole.astype(np.int64) + 1 + (np.arange(height) * (width + 6))[:, None]
-    pixels = [wide.take(start + k) for k in range(6)]  # at -2 to 3 from the column
-    factors = {node: t - node for node in range(-2, 4)}
+    start = whole.astype(np.int32) + (1 + np.arange(height, dtype=np.int32) * (width + 6))[:, None]
+    pixels = [wide[k:].take(start) for k in range(6)]  # at -2 to 3 from the column
+    factors = {node: t - np.float32(node) for node in range(-2, 4)}
     value = np.zeros_like(t)
     for node, pixel in zip(factors, pixels, strict=True):
         others = [one for one in factors if one != node]
-        weight = pixel / np.prod([node - one for one in others])
+        weight = pixel * np.float32(1 / np.prod([node - one for one in others]))
         for one in others:
             weight *= factors[one]
         value += weight
@@ -191,22 +214,25 @@ def _sampled(picture: NDArray[np.uint8], columns: Field) -> tuple[Field, Field]:
     return value, slope
 
 
-def _correlation(e: Field, g: Field, mask: Field) -> float:
+def _correlation(fit: _Fit, trusted: NDArray[np.bool_]) -> float:
     """Return by how much the noise e of neighbours is correlated, as it counts for sums of g e.
 
     1: not at all. A picture that was rectified has some: its pixels share those of the source.
     """
     # Var(sum g e) = sum over all lags of C_g C_e; of white noise only lag 0 is there
-    e = e - e.sum() / max(mask.sum(), 1) * mask
+    mask = fit.linear.mask * trusted
+    e, g = fit.linear.e * mask, fit.linear.g * mask
+    e = (e - e.sum() / np.maximum(mask.sum(), 1)) * mask
     height, width = e.shape
-    power = float((e * e).sum() * (g * g).sum())
+
+    def products(values: Field, u: int, v: int) -> float:
+        here = values[v:, max(u, 0) : width + min(u, 0)]
+        there = values[: height - v, max(-u, 0) : width + min(-u, 0)]
+        return float(np.einsum("ij,ij->", here, there))
+
+    power = products(e, 0, 0) * products(g, 0, 0)
     if power <= 0:
         return 1.0
-    whole = 1.0
-    for v in range(LAGS + 1):
-        for u in range(-LAGS if v else 1, LAGS + 1):
-            here = slice(v, height), slice(max(u, 0), width + min(u, 0))
-            there = slice(0, height - v), slice(max(-u, 0), width + min(-u, 0))
-            both = float((e[here] * e[there]).sum() * (g[here] * g[there]).sum())
-            whole += 2 * both / power
+    lags = [(u, v) for v in range(LAGS + 1) for u in range(-LAGS if v else 1, LAGS + 1)]
+    whole = 1 + 2 * sum(products(e, *lag) * products(g, *lag) for lag in lags) / power
     return max(whole, LEAST)
