@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from smartcam.depth._from_reader import ReaderDriver
 from smartcam.depth._matcher import MOST, StereoMatcher
 from smartcam.depth._pair import CalibratedPair
 from smartcam.depth._pair_clock import PairClock
 from smartcam.depth._worker import Worker
 from smartcam.exceptions import ConfigurationError, LocalProtocolError
-from smartcam.frames import FrameGroup
+from smartcam.frames import FrameGroup, FrameSource
 from smartcam.frames._reader import FRAME_TIMEOUT
 
 if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
     from typing import Any, Self
 
     from numpy.typing import NDArray
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._stereo.calibration import StereoCalibration
     from smartcam.calibration.formats import CameraChain
-    from smartcam.frames import Frame, FrameSet, FrameSource, GroupStatistics
+    from smartcam.frames import Frame, FrameReader, FrameSet, GroupStatistics
 
 SEARCHED: Final = 5
 """Part of the width, one in so many, that disparities are searched in by default."""
@@ -96,8 +98,8 @@ class StereoDepth:
     is slow skips pairs, and never lags.
 
     Args:
-        left: the left camera, as ``smartcam.frames.open`` gives it, not open; it belongs to this
-            object from now on.
+        left: the left camera, as ``smartcam.frames.open`` or ``camera.frames()`` gives it, not
+            open; it belongs to this object from now on.
         right: the right one.
         calibration: of the pair: ours, that of :func:`read_camera_infos`, or of
             ``smartcam.calibration.formats.read_cameras`` with two cameras.
@@ -117,8 +119,8 @@ class StereoDepth:
 
     def __init__(
         self,
-        left: FrameSource,
-        right: FrameSource,
+        left: FrameSource | AbstractAsyncContextManager[FrameReader],
+        right: FrameSource | AbstractAsyncContextManager[FrameReader],
         calibration: StereoCalibration | CameraChain,
         *,
         matcher: StereoMatcher | None = None,
@@ -138,7 +140,11 @@ class StereoDepth:
         self._make = partial(
             CalibratedPair, calibration, size=size, alpha=alpha, focal_sigma=focal_sigma
         )
-        self._group = FrameGroup({"left": left, "right": right}, within=within, timeout=timeout)
+        sources = {
+            name: one if isinstance(one, FrameSource) else FrameSource(ReaderDriver(one, name))
+            for name, one in (("left", left), ("right", right))
+        }
+        self._group = FrameGroup(sources, within=within, timeout=timeout)
         self._matcher, self._colour = matcher, colour
         self._clock = PairClock()
         self._worker: Worker | None = None

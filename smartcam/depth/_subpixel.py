@@ -31,6 +31,9 @@ FILLED: Final = 0.5
 BESIDE: Final = 2
 """Pixels from a hole within which nothing is refined."""
 
+ROUNDED: Final = 1 / 6
+"""Variance of the difference of two pictures of whole grey levels, at least."""
+
 LAGS: Final = 2
 """Pixels over which noise is looked at for correlation."""
 
@@ -181,7 +184,8 @@ def _fitted(
     trust = mask * trusted
     m = np.maximum(sums(trust), 1)
     se = sums(e * trust)
-    variance = np.maximum(sums(e * e * trust) - se * se / m, 0) / np.maximum(m - 2, 1)
+    variance = (sums(e * e * trust) - se * se / m) / np.maximum(m - 2, 1)
+    variance = np.maximum(variance, ROUNDED)
     # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's
     texture = curvature - n * variance / 8
     with np.errstate(divide="ignore", invalid="ignore"):
