@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -171,6 +172,9 @@ class StereoMatcher:
             name: _PARAMETERS[algorithm][name].check(value)
             for name, value in self.parameters.items()
         }
+        # OpenCV's own check is between its guesses only; it is in whole pixels, and -1 does not
+        # turn that of SGBM off
+        numbers["disp12_max_diff"] = MOST if left_right is None else math.ceil(left_right)
         self._compute = _ALGORITHMS[algorithm](numbers)
         self._lock = threading.Lock()  # OpenCV's matchers keep their buffers
 
@@ -323,11 +327,12 @@ def _sgbm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
         "uniqueness_ratio": "uniquenessRatio",
         "pre_filter_cap": "preFilterCap",
         "mode": "mode",
+        "disp12_max_diff": "disp12MaxDiff",
     }
     given = {names[name]: value for name, value in numbers.items() if name in names}
-    # its own comparison and speckles come later, from both ways
+    # speckles come later, when both ways were compared
     compute: Callable[..., Any] = (
-        load("cv2").StereoSGBM_create(**given, disp12MaxDiff=-1, speckleWindowSize=0).compute
+        load("cv2").StereoSGBM_create(**given, speckleWindowSize=0).compute
     )
     return compute
 
@@ -340,7 +345,7 @@ def _bm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
     made.setPreFilterSize(numbers["pre_filter_size"])
     made.setPreFilterCap(numbers["pre_filter_cap"])
     made.setTextureThreshold(numbers["texture_threshold"])
-    made.setDisp12MaxDiff(-1)
+    made.setDisp12MaxDiff(numbers["disp12_max_diff"])
     made.setSpeckleWindowSize(0)
     compute: Callable[..., Any] = made.compute
     return compute

@@ -34,6 +34,12 @@ BESIDE: Final = 2
 ROUNDED: Final = 1 / 6
 """Variance of the difference of two pictures of whole grey levels, at least."""
 
+OUTLIER: Final = 4.0
+"""A pixel that differs by more times its noise does not count."""
+
+LEAST_PIXELS: Final = 12
+"""Of a window, whose least squares have two unknowns."""
+
 LAGS: Final = 2
 """Pixels over which noise is looked at for correlation."""
 
@@ -63,10 +69,13 @@ def refined(
     # near an edge of depth a coarse value may be that of its other side
     told = np.fmax(sigma, plane.rough)
     found, usable = start, known
+    fit: _Fit | None = None
     for step in range(STEPS):
-        if step:
-            plane = _plane(found, known, sums)
-        fit = _fitted(_linearized(pictures, found, known), found, usable, plane, sums)
+        linear = _linearized(pictures, found, known)
+        if fit is not None:
+            plane = _plane(found, usable if usable.any() else known, sums)
+            linear = _without_outliers(linear, fit)
+        fit = _fitted(linear, found, usable, plane, sums)
         if step == STEPS - 1:
             fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
         usable = smooth & (fit.sigma < COARSE) & (np.abs(fit.disparity - start) < FARTHEST)
@@ -144,9 +153,9 @@ def _linearized(
     left, right = pictures
     width = left.shape[1]
     there = np.arange(width, dtype=np.float32) - disparity
-    inside = known & (there >= 1) & (there <= width - 2)
+    inside = known & (there >= 2) & (there <= width - 4)  # six pixels are looked at
     mask = inside.astype(np.float32)
-    moved, slope = _sampled(right, np.where(inside, there, np.float32(1)))
+    moved, slope = _sampled(right, np.where(inside, there, np.float32(2)))
     slope += np.gradient(left, axis=1)
     return _Linear((left - moved) * mask, slope * mask / 2, mask)
 
@@ -157,6 +166,14 @@ class _Fit(NamedTuple):
     disparity: Field  # pixels
     sigma: Field  # of noise that is not correlated, pixels
     linear: _Linear
+    mean: Field  # of linear.e in each window, grey levels
+    variance: Field  # of linear.e, grey levels^2
+
+
+def _without_outliers(linear: _Linear, fit: _Fit) -> _Linear:
+    """Return the equations without pixels of another surface, whose disparity is far off."""
+    fits = np.abs(linear.e - fit.mean) <= OUTLIER * np.sqrt(fit.variance)
+    return _Linear(linear.e * fits, linear.g * fits, linear.mask * fits)
 
 
 def _fitted(
@@ -191,8 +208,14 @@ def _fitted(
     with np.errstate(divide="ignore", invalid="ignore"):
         found = (sg * sy / n - sgy) / curvature
         sigma = np.sqrt(variance / texture)
-    usable = (texture > 0) & np.isfinite(found) & (mask > 0)
-    return _Fit(np.where(usable, found, disparity), np.where(usable, sigma, np.inf), linear)
+    usable = (texture > 0) & np.isfinite(found) & (n >= LEAST_PIXELS)
+    return _Fit(
+        np.where(usable, found, disparity),
+        np.where(usable, sigma, np.inf),
+        linear,
+        se / m,
+        variance,
+    )
 
 
 def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from smartcam.calibration import CameraModel, Transform
 
-SIZE = (320, 240)
+SIZE = (256, 160)
 
 
 class Scene(NamedTuple):
@@ -26,7 +26,7 @@ class Texture:
 
     def __init__(self, seed: int, contrast: float = 30.0, finest: float = 4.0) -> None:
         rng = np.random.default_rng(seed)
-        count = 60
+        count = 40
         length = finest * np.exp(rng.uniform(0, np.log(12), count))
         angle = rng.uniform(0, np.pi, count)
         self.u = 2 * np.pi * np.cos(angle) / length
