@@ -30,6 +30,9 @@ SAME_SHAPE: Final = 0.01
 ROUNDED: Final = 1e-3
 """By which an element of a rotation may be off: ROS writes five digits."""
 
+REMAPPED: Final = 2 * (1 / 32) ** 2 / 12
+"""Variance of a disparity, pixels^2: OpenCV's remap goes in steps of 1/32 in both pictures."""
+
 SMALLER: Final = 1.25
 """A picture that is made smaller by more is averaged first: remap looks at four pixels."""
 
@@ -195,7 +198,7 @@ class CalibratedPair:
         # counts as a disparity, too
         known = depth > 0
         z = np.where(known, depth, np.float32(1))
-        variance = disparity_sigma.astype(np.float32) ** 2
+        variance = disparity_sigma.astype(np.float32) ** 2 + np.float32(REMAPPED)
         if self._spread is not None:
             variance += self._of_calibration(z, self._spread)
         sigma = z * z / np.float32(self.focal * self.baseline) * np.sqrt(variance)

@@ -129,14 +129,15 @@ def _plane(disparity: Field, known: NDArray[np.bool_], sums: _Windows) -> _Plane
     count = np.maximum(sums(mask), 1)
     total = sums(values)
     left = sums(values * values) - total * total / count
-    slopes = []
-    for across, down in ((1, 0), (0, 1)):
-        first = sums(mask, across, down)
-        spread = np.maximum(sums(mask, 2 * across, 2 * down) - first * first / count, 1)
-        slope = (sums(values, across, down) - total * first / count) / spread
-        left -= slope * slope * spread
-        slopes.append(slope)
-    return _Plane(slopes[0], slopes[1], np.sqrt(np.maximum(left, 0) / count), count)
+    x, y = sums(mask, 1, 0), sums(mask, 0, 1)
+    xx = np.maximum(sums(mask, 2, 0) - x * x / count, 1)
+    yy = np.maximum(sums(mask, 0, 2) - y * y / count, 1)
+    xy = sums(mask, 1, 1) - x * y / count
+    xd, yd = sums(values, 1, 0) - total * x / count, sums(values, 0, 1) - total * y / count
+    scale = np.maximum(xx * yy - xy * xy, 1)
+    across, down = (yy * xd - xy * yd) / scale, (xx * yd - xy * xd) / scale
+    left -= across * xd + down * yd
+    return _Plane(across, down, np.sqrt(np.maximum(left, 0) / count), count)
 
 
 class _Linear(NamedTuple):

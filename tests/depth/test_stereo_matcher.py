@@ -172,7 +172,7 @@ def test_pictures_that_are_none_are_refused(shape: tuple[int, ...]) -> None:
 def test_pictures_that_do_not_fit_are_refused() -> None:
     with pytest.raises(FrameFormatError, match="20x10 and 21x10"):
         matcher()(np.zeros((10, 20), np.uint8), np.zeros((10, 21), np.uint8))
-    with pytest.raises(FrameFormatError, match="left: .*got .* of float64"):
+    with pytest.raises(FrameFormatError, match=r"left: .*got .* of float64"):
         matcher()(np.zeros((10, 20)), np.zeros((10, 20), np.uint8))  # type: ignore[arg-type]
 
 
