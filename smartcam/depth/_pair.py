@@ -30,8 +30,11 @@ SAME_SHAPE: Final = 0.01
 ROUNDED: Final = 1e-3
 """By which an element of a rotation may be off: ROS writes five digits."""
 
-REMAPPED: Final = 2 * (1 / 32) ** 2 / 12
-"""Variance of a disparity, pixels^2: OpenCV's remap goes in steps of 1/32 in both pictures."""
+REMAPPED: Final = (1 / 32) ** 2 / 12
+"""Variance of a disparity, pixels^2: OpenCV's remap goes in steps of 1/32.
+
+It does so in both pictures, of which a window averages about a half.
+"""
 
 SMALLER: Final = 1.25
 """A picture that is made smaller by more is averaged first: remap looks at four pixels."""

@@ -247,20 +247,26 @@ def _correlation(fit: _Fit, trusted: NDArray[np.bool_]) -> float:
 
     1: not at all. A picture that was rectified has some: its pixels share those of the source.
     """
-    # Var(sum g e) = sum over all lags of C_g C_e; of white noise only lag 0 is there
+    # Var(sum g e) = sum over all lags of C_ee C_gg + C_eg C_ge, as of normal values: Isserlis, On a
+    # formula for the product-moment coefficient (1918). Of white noise only lag 0 is there. Where
+    # one picture is sharper e has texture in it; that goes with g, and for the most part cancels.
     mask = fit.linear.mask * trusted
     e, g = fit.linear.e * mask, fit.linear.g * mask
     e = (e - e.sum() / np.maximum(mask.sum(), 1)) * mask
     height, width = e.shape
 
-    def products(values: Field, u: int, v: int) -> float:
-        here = values[v:, max(u, 0) : width + min(u, 0)]
-        there = values[: height - v, max(-u, 0) : width + min(-u, 0)]
+    def products(one: Field, other: Field, u: int, v: int) -> float:
+        here = one[v:, max(u, 0) : width + min(u, 0)]
+        there = other[: height - v, max(-u, 0) : width + min(-u, 0)]
         return float(np.einsum("ij,ij->", here, there))
 
-    power = products(e, 0, 0) * products(g, 0, 0)
+    power = products(e, e, 0, 0) * products(g, g, 0, 0)
     if power <= 0:
         return 1.0
-    lags = [(u, v) for v in range(LAGS + 1) for u in range(-LAGS if v else 1, LAGS + 1)]
-    whole = 1 + 2 * sum(products(e, *lag) * products(g, *lag) for lag in lags) / power
+    whole = 1.0
+    for v in range(LAGS + 1):
+        for u in range(-LAGS if v else 1, LAGS + 1):
+            both = products(e, e, u, v) * products(g, g, u, v)
+            crossed = products(e, g, u, v) * products(g, e, u, v)
+            whole += 2 * (both + crossed) / power
     return max(whole, LEAST)

@@ -53,7 +53,7 @@ CHAIN = CameraChain(
     transforms=(RIGHT_LEFT,),
     names=("left", "right"),
 )
-ROOM = Room((1.6, 0.2, 0.1), 0.9, detail=0.02)
+ROOM = Room((1.6, 0.2, 0.1), 0.9, detail=0.04)
 MATCHER = {"num_disparities": 48}
 
 
@@ -382,7 +382,7 @@ def test_sizes_lenses_and_maps_go_together() -> None:
         found = large.rectified(soft.picture(scaled(CHAIN.cameras[0], size)), 0, "left")
         assert np.median(np.abs(found.astype(float) - expected)) <= 1, size
         moved = np.roll(found, 1, axis=1).astype(float)
-        assert np.median(np.abs(moved - expected)) > 3, size  # of which a pixel would be seen
+        assert np.median(np.abs(moved - expected)) >= 3, size  # of which a pixel would be seen
 
 
 @pytest.mark.parametrize(
