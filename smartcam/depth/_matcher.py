@@ -207,23 +207,28 @@ class StereoMatcher:
         return Disparity(*refined(first, second, found, self._refine))
 
     def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return OpenCV's disparities, NaN where there is none."""
         cv2 = load("cv2")
         none = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
         sixteenths = self._padded(left, right)
-        if self._left_right is not None:
-            # seen in a mirror, the right picture is the left one of a pair
-            back = self._padded(right[:, ::-1], left[:, ::-1])[:, ::-1]
-            apart = _disagreement(sixteenths, back, none)
-            sixteenths[~(apart <= self._left_right * SUBPIXELS)] = none
         if self._smooth is not None:
-            sixteenths = np.asarray(self._smooth(sixteenths, left))
+            sixteenths = self._smooth(sixteenths, left, np.negative(self._back(left, right)))
+        elif self._left_right is not None:
+            apart = _disagreement(sixteenths, self._back(left, right), none)
+            sixteenths[~(apart <= self._left_right * SUBPIXELS)] = none
+        column = np.arange(left.shape[1])
+        there = column - np.round(sixteenths / SUBPIXELS)
+        sixteenths[(there < 0) | (there >= left.shape[1])] = none
         size = int(self.parameters["speckle_window_size"])
         if size:
             reach = int(self.parameters["speckle_range"]) * SUBPIXELS
             cv2.filterSpeckles(sixteenths, none, size, reach)
-        found = sixteenths.astype(np.float32) / SUBPIXELS
-        found[sixteenths <= none] = np.nan
-        return found
+        return np.where(sixteenths > none, sixteenths / np.float32(SUBPIXELS), np.float32(np.nan))
+
+    def _back(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+        """Return sixteenths from right to left, above 0 where those from left to right are."""
+        # seen in a mirror, the right picture is the left one of a pair
+        return np.ascontiguousarray(self._padded(right[:, ::-1], left[:, ::-1])[:, ::-1])
 
     def _padded(self, left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.int16]:
         """Return sixteenths, also where OpenCV would have no room for all disparities."""
@@ -288,12 +293,11 @@ def _disagreement(
     inside = (column >= 0) & (column < width) & (there > none)
     other = np.take_along_axis(back, np.clip(column, 0, width - 1), axis=1)
     apart = np.abs(other.astype(np.float32) - there)
-    apart[~inside | (other <= none)] = np.inf
-    return apart
+    return np.where(inside & (other > none), apart, np.float32(np.inf))
 
 
 def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
-    """Return OpenCV's filter of sixteenths and the left picture."""
+    """Return OpenCV's filter of sixteenths, the left picture, and sixteenths from right to left."""
     cv2 = load("cv2")
     if not hasattr(cv2, "ximgproc"):
         raise ConfigurationError(
@@ -307,12 +311,14 @@ def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
         smoothness = edges = -1.0
     if not (0 < smoothness < 1e9 and 0 < edges < 1e3):
         raise _wrong("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)
-    made = cv2.ximgproc.createDisparityWLSFilterGeneric(False)
+    made = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # what both ways say, counts more
     made.setLambda(smoothness)
     made.setSigmaColor(edges)
 
-    def smooth(sixteenths: NDArray[np.int16], left: NDArray[np.uint8]) -> NDArray[np.int16]:
-        return np.asarray(made.filter(sixteenths, left), dtype=np.int16)
+    def smooth(
+        sixteenths: NDArray[np.int16], left: NDArray[np.uint8], back: NDArray[np.int16]
+    ) -> NDArray[np.int16]:
+        return np.array(made.filter(sixteenths, left, None, back), dtype=np.int16)
 
     return smooth
 

@@ -133,8 +133,8 @@ class CalibratedPair:
     ) -> None:
         lenses, transform, covariance = _parts(calibration)
         self._shapes = tuple(lens.size for lens in lenses)
-        size = tuple(lenses[0].size) if size is None else size
-        left, right = (scaled(lens, size) for lens in lenses)
+        wanted = lenses[0].size if size is None else size
+        left, right = (scaled(lens, wanted) for lens in lenses)
         found = rectify(left, right, transform, alpha=alpha)
         self.size = found.size
         projection = found.projections[1]
@@ -147,7 +147,7 @@ class CalibratedPair:
                 "swap the two, or turn both by a quarter"
             )
         self.camera_info = CameraModel(size=found.size, matrix=found.projections[0][:, :3])
-        self._focal_sigma = focal_sigma * size[0] / lenses[0].size[0]
+        self._focal_sigma = focal_sigma * wanted[0] / lenses[0].size[0]
         self._spread = _spread(found.rotations[1], covariance)
         self._maps, self._masks = found.maps, found.masks
         self._fixed: list[tuple[tuple[int, int], Any]] = [((0, 0), None)] * 2
@@ -233,7 +233,7 @@ class CalibratedPair:
 
 def _parts(
     calibration: StereoCalibration | CameraChain,
-) -> tuple[tuple[CameraModel, ...], Transform, NDArray[np.float64] | None]:
+) -> tuple[tuple[CameraModel, CameraModel], Transform, NDArray[np.float64] | None]:
     """Return lenses, ``T_right_left`` and its covariance, where that is known."""
     if not isinstance(calibration, CameraChain):
         return (
@@ -246,7 +246,8 @@ def _parts(
             f"stereo: expected the calibration of two cameras, got {len(calibration.cameras)}: "
             f"{', '.join(calibration.names)}"
         )
-    return calibration.cameras, calibration.transforms[0], None
+    left, right = calibration.cameras
+    return (left, right), calibration.transforms[0], None
 
 
 def _spread(

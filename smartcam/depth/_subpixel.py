@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from smartcam.calibration._optional_imports import load
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Field = NDArray[np.float32]
+    Field = NDArray[np.floating[Any]]
 
 COARSE: Final = 0.5
 """Least sigma of a disparity that least squares could not refine, pixels."""
@@ -64,18 +64,17 @@ def refined(
     pictures = left.astype(np.float32), right.astype(np.float32)
     start = np.where(known, coarse, np.float32(0))
     plane = _plane(start, known, sums)
-    smooth = (plane.rough <= ROUGHEST) & (plane.count >= FILLED * window**2)
+    smooth = (plane.rough <= ROUGHEST) & (plane.pixels >= FILLED * window**2)
     smooth &= _whole_around(known)
     # near an edge of depth a coarse value may be that of its other side
     told = np.fmax(sigma, plane.rough)
     found, usable = start, known
-    fit: _Fit | None = None
+    fit = _fitted(_linearized(pictures, found, known), found, usable, plane, sums)
     for step in range(STEPS):
-        linear = _linearized(pictures, found, known)
-        if fit is not None:
+        if step:
             plane = _plane(found, usable if usable.any() else known, sums)
-            linear = _without_outliers(linear, fit)
-        fit = _fitted(linear, found, usable, plane, sums)
+            linear = _without_outliers(_linearized(pictures, found, known), fit)
+            fit = _fitted(linear, found, usable, plane, sums)
         if step == STEPS - 1:
             fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
         usable = smooth & (fit.sigma < COARSE) & (np.abs(fit.disparity - start) < FARTHEST)
@@ -83,7 +82,7 @@ def refined(
     told = np.where(usable, fit.sigma, told)
     found[~known] = np.nan
     told[~known] = np.nan
-    return found, told
+    return found.astype(np.float32, copy=False), told.astype(np.float32, copy=False)
 
 
 def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -119,7 +118,7 @@ class _Plane(NamedTuple):
     across: Field  # slope, pixels a pixel
     down: Field
     rough: Field  # how far the disparities are from it, rms, pixels
-    count: Field  # of disparities
+    pixels: Field  # how many have a disparity
 
 
 def _plane(disparity: Field, known: NDArray[np.bool_], sums: _Windows) -> _Plane:
@@ -135,7 +134,8 @@ def _plane(disparity: Field, known: NDArray[np.bool_], sums: _Windows) -> _Plane
     xy = sums(mask, 1, 1) - x * y / count
     xd, yd = sums(values, 1, 0) - total * x / count, sums(values, 0, 1) - total * y / count
     scale = np.maximum(xx * yy - xy * xy, 1)
-    across, down = (yy * xd - xy * yd) / scale, (xx * yd - xy * xd) / scale
+    across: Field = (yy * xd - xy * yd) / scale
+    down: Field = (xx * yd - xy * xd) / scale
     left -= across * xd + down * yd
     return _Plane(across, down, np.sqrt(np.maximum(left, 0) / count), count)
 

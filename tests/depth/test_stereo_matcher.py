@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from smartcam.calibration._optional_imports import load
 from smartcam.depth import Disparity, StereoMatcher
 from smartcam.depth._subpixel import COARSE
 from smartcam.exceptions import ConfigurationError, FrameFormatError
@@ -218,7 +219,7 @@ def test_aloe_is_found_better_than_by_opencv_s_sample() -> None:
     left, right, truth = _aloe("aloeL.jpg"), _aloe("aloeR.jpg"), _aloe("aloeGT.png")
     ours = score(StereoMatcher(num_disparities=224)(left, right).pixels, truth)
     for first, count in ((16, 96), (0, 224)):  # the sample's range, and that of the truth
-        sample = cv2.StereoSGBM_create(
+        sample = load("cv2").StereoSGBM_create(
             minDisparity=first,
             numDisparities=count,
             blockSize=16,
