@@ -135,13 +135,17 @@ class StereoDepth:
             raise ConfigurationError(f"stereo: alpha: expected 0 to 1, got {alpha!r}")
         if not 0 <= focal_sigma < math.inf:
             raise ConfigurationError(f"stereo: focal_sigma: expected pixels, got {focal_sigma!r}")
-        if size is not None and not (len(size) == 2 and min(size) > 0):
+        if size is not None and not (
+            len(size) == 2 and all(isinstance(one, int) and one > 0 for one in size)
+        ):
             raise ConfigurationError(f"stereo: size: expected width and height, got {size!r}")
         self._make = partial(
             CalibratedPair, calibration, size=size, alpha=alpha, focal_sigma=focal_sigma
         )
         sources = {
-            name: one if isinstance(one, FrameSource) else FrameSource(ReaderDriver(one, name))
+            name: one
+            if isinstance(one, FrameSource)
+            else FrameSource(ReaderDriver(one, name), stall=None)
             for name, one in (("left", left), ("right", right))
         }
         self._group = FrameGroup(sources, within=within, timeout=timeout)

@@ -160,10 +160,10 @@ async def test_cancelling_while_it_matches_leaves_it_working() -> None:
         waiting = await streaming(cameras, left, right)
         left.give(shown(pictures[0], 1))
         right.give(shown(pictures[1], 1))
-        await until(lambda: cameras._worker is not None and cameras._worker._running is not None)
-        running = cameras._worker._running if cameras._worker is not None else None
         await until(lambda: cameras.statistics().group.delivered == 1)
-        await asyncio.sleep(0)
+        worker = cameras._opened()[0]
+        assert worker._running is not None
+        assert not worker._running.done()
         waiting.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await waiting
@@ -172,7 +172,6 @@ async def test_cancelling_while_it_matches_leaves_it_working() -> None:
             left.give(shown(pictures[0], number))
             right.give(shown(pictures[1], number))
         assert (await again).sequences in ((2, 2), (3, 3))
-        assert running is not None
 
 
 @pytest.mark.real_time
@@ -430,6 +429,7 @@ def test_camera_infos_of_ros_are_a_pair(tmp_path: Path) -> None:
         ({"alpha": 2}, "alpha: expected 0 to 1"),
         ({"focal_sigma": -1}, "focal_sigma: expected pixels"),
         ({"size": (0, 10)}, "size: expected width and height"),
+        ({"size": (0.5, 10)}, "size: expected width and height"),
         ({"within": -1}, "within: expected seconds"),
     ],
 )
