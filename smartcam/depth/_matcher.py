@@ -44,7 +44,7 @@ class Disparity(NamedTuple):
     sigma: NDArray[np.float32]
 
 
-class _Whole(NamedTuple):
+class _WholeParameter(NamedTuple):
     """A parameter that is a whole number."""
 
     default: int
@@ -65,7 +65,7 @@ class _Whole(NamedTuple):
         return number if (number - self.low) % self.every == 0 else None
 
 
-class _Choice(NamedTuple):
+class _WordParameter(NamedTuple):
     """A parameter that is one of some words; the first is the default."""
 
     words: tuple[str, ...]
@@ -86,31 +86,31 @@ class _Choice(NamedTuple):
         return int(getattr(load("cv2"), self.prefix + str(value).upper()))
 
 
-_BOTH: Final[dict[str, _Whole | _Choice]] = {
-    "min_disparity": _Whole(0, -MOST, MOST),
-    "num_disparities": _Whole(128, 16, MOST, 16),
-    "speckle_window_size": _Whole(100, 0, 1_000_000),
-    "speckle_range": _Whole(1, 0, 1000),
+_BOTH: Final[dict[str, _WholeParameter | _WordParameter]] = {
+    "min_disparity": _WholeParameter(0, -MOST, MOST),
+    "num_disparities": _WholeParameter(128, 16, MOST, 16),
+    "speckle_window_size": _WholeParameter(100, 0, 1_000_000),
+    "speckle_range": _WholeParameter(1, 0, 1000),
 }
 
-_PARAMETERS: Final[dict[str, dict[str, _Whole | _Choice]]] = {
+_PARAMETERS: Final[dict[str, dict[str, _WholeParameter | _WordParameter]]] = {
     "sgbm": {
         **_BOTH,
-        "block_size": _Whole(5, 1, 51, 2),
-        "P1": _Whole(0, 0, 1_000_000),
-        "P2": _Whole(0, 0, 1_000_000),
-        "uniqueness_ratio": _Whole(5, 0, 100),
-        "pre_filter_cap": _Whole(63, 1, 63),
-        "mode": _Choice(("sgbm_3way", "sgbm", "hh", "hh4"), "StereoSGBM_MODE_"),
+        "block_size": _WholeParameter(5, 1, 51, 2),
+        "P1": _WholeParameter(0, 0, 1_000_000),
+        "P2": _WholeParameter(0, 0, 1_000_000),
+        "uniqueness_ratio": _WholeParameter(5, 0, 100),
+        "pre_filter_cap": _WholeParameter(63, 1, 63),
+        "mode": _WordParameter(("sgbm_3way", "sgbm", "hh", "hh4"), "StereoSGBM_MODE_"),
     },
     "bm": {
         **_BOTH,
-        "block_size": _Whole(15, 5, 255, 2),
-        "uniqueness_ratio": _Whole(5, 0, 100),
-        "pre_filter_type": _Choice(("xsobel", "normalized_response"), "StereoBM_PREFILTER_"),
-        "pre_filter_size": _Whole(9, 5, 255, 2),
-        "pre_filter_cap": _Whole(31, 1, 63),
-        "texture_threshold": _Whole(10, 0, 1_000_000),
+        "block_size": _WholeParameter(15, 5, 255, 2),
+        "uniqueness_ratio": _WholeParameter(5, 0, 100),
+        "pre_filter_type": _WordParameter(("xsobel", "normalized_response"), "StereoBM_PREFILTER_"),
+        "pre_filter_size": _WholeParameter(9, 5, 255, 2),
+        "pre_filter_cap": _WholeParameter(31, 1, 63),
+        "texture_threshold": _WholeParameter(10, 0, 1_000_000),
     },
 }
 """By OpenCV's names, words with underscores between them; what is ours has other defaults."""

@@ -25,7 +25,7 @@ LEAST: Final = 30
 """Pairs that tell a rate."""
 
 
-class _Seen(NamedTuple):
+class _SeenPair(NamedTuple):
     captured: tuple[float, float]  # left and right, seconds of ours
     sequence: tuple[int, int]
 
@@ -34,11 +34,11 @@ class PairClock:
     """Skew and drift of two cameras, from the frames that were paired."""
 
     def __init__(self) -> None:
-        self._seen: collections.deque[_Seen] = collections.deque(maxlen=KEPT)
+        self._seen: collections.deque[_SeenPair] = collections.deque(maxlen=KEPT)
 
     def saw(self, left: Frame, right: Frame) -> None:
         """Take a pair; one whose numbers begin again begins everything again."""
-        now = _Seen((left.captured, right.captured), (left.sequence, right.sequence))
+        now = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
         if self._seen and not all(
             a < b for a, b in zip(self._seen[-1].sequence, now.sequence, strict=True)
         ):

@@ -11,9 +11,9 @@ import numpy as np
 
 from smartcam.depth._from_reader import ReaderDriver
 from smartcam.depth._matcher import MOST, StereoMatcher
+from smartcam.depth._one_thread import OneThread
 from smartcam.depth._pair import CalibratedPair
 from smartcam.depth._pair_clock import PairClock
-from smartcam.depth._worker import Worker
 from smartcam.exceptions import ConfigurationError, LocalProtocolError
 from smartcam.frames import FrameGroup, FrameSource
 from smartcam.frames._reader import FRAME_TIMEOUT
@@ -151,7 +151,7 @@ class StereoDepth:
         self._group = FrameGroup(sources, within=within, timeout=timeout)
         self._matcher, self._colour = matcher, colour
         self._clock = PairClock()
-        self._worker: Worker | None = None
+        self._worker: OneThread | None = None
         self._pair: CalibratedPair | None = None
         self._closed = False
 
@@ -168,7 +168,7 @@ class StereoDepth:
         """
         if self._worker is not None or self._closed:
             raise LocalProtocolError("the pair of cameras was opened before; make a new one")
-        self._worker = Worker("stereo")
+        self._worker = OneThread("stereo")
         try:
             self._pair = await self._worker.run(self._make)
             if self._matcher is None:
@@ -246,7 +246,7 @@ class StereoDepth:
         self._clock.saw(both["left"], both["right"])
         return await worker.run(partial(_depth, both, pair, matcher, self._colour))
 
-    def _opened(self) -> tuple[Worker, CalibratedPair, StereoMatcher]:
+    def _opened(self) -> tuple[OneThread, CalibratedPair, StereoMatcher]:
         if self._worker is None or self._pair is None or self._matcher is None:
             raise LocalProtocolError("the pair of cameras is not open: async with it")
         return self._worker, self._pair, self._matcher

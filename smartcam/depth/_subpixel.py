@@ -60,7 +60,7 @@ def refined(
     sigma = np.where(known, np.float32(COARSE), np.float32(np.nan))
     if not window or not known.any():
         return coarse, sigma
-    sums = _Windows(window)
+    sums = _WindowSums(window)
     pictures = left.astype(np.float32), right.astype(np.float32)
     start = np.where(known, coarse, np.float32(0))
     plane = _plane(start, known, sums)
@@ -91,7 +91,7 @@ def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(load("cv2").erode(known.astype(np.uint8), around) > 0)
 
 
-class _Windows:
+class _WindowSums:
     """Sums over the window around each pixel; outside of the picture there is nothing."""
 
     def __init__(self, side: int) -> None:
@@ -112,7 +112,7 @@ class _Windows:
         return np.asarray(found, dtype=np.float32)
 
 
-class _Plane(NamedTuple):
+class _DisparityPlane(NamedTuple):
     """The disparities in each window, as a plane; all are (H, W)."""
 
     across: Field  # slope, pixels a pixel
@@ -121,7 +121,7 @@ class _Plane(NamedTuple):
     pixels: Field  # how many have a disparity
 
 
-def _plane(disparity: Field, known: NDArray[np.bool_], sums: _Windows) -> _Plane:
+def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _DisparityPlane:
     mask = known.astype(np.float32)
     # near 0, so that the squares below keep their digits
     values = (disparity - disparity.mean(where=known, dtype=np.float64).astype(np.float32)) * mask
@@ -137,10 +137,10 @@ def _plane(disparity: Field, known: NDArray[np.bool_], sums: _Windows) -> _Plane
     across: Field = (yy * xd - xy * yd) / scale
     down: Field = (xx * yd - xy * xd) / scale
     left -= across * xd + down * yd
-    return _Plane(across, down, np.sqrt(np.maximum(left, 0) / count), count)
+    return _DisparityPlane(across, down, np.sqrt(np.maximum(left, 0) / count), count)
 
 
-class _Linear(NamedTuple):
+class _LinearMatch(NamedTuple):
     """How the pictures differ, and by how much more with a disparity; 0 where that is unknown."""
 
     e: Field  # left less right, grey levels
@@ -150,7 +150,7 @@ class _Linear(NamedTuple):
 
 def _linearized(
     pictures: tuple[Field, Field], disparity: Field, known: NDArray[np.bool_]
-) -> _Linear:
+) -> _LinearMatch:
     left, right = pictures
     width = left.shape[1]
     there = np.arange(width, dtype=np.float32) - disparity
@@ -158,32 +158,32 @@ def _linearized(
     mask = inside.astype(np.float32)
     moved, slope = _sampled(right, np.where(inside, there, np.float32(2)))
     slope += np.gradient(left, axis=1)
-    return _Linear((left - moved) * mask, slope * mask / 2, mask)
+    return _LinearMatch((left - moved) * mask, slope * mask / 2, mask)
 
 
-class _Fit(NamedTuple):
+class _Refined(NamedTuple):
     """All (H, W); the sigma is infinite where there is no texture."""
 
     disparity: Field  # pixels
     sigma: Field  # of noise that is not correlated, pixels
-    linear: _Linear
+    linear: _LinearMatch
     mean: Field  # of linear.e in each window, grey levels
     variance: Field  # of linear.e, grey levels^2
 
 
-def _without_outliers(linear: _Linear, fit: _Fit) -> _Linear:
+def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
     """Return the equations without pixels of another surface, whose disparity is far off."""
     fits = np.abs(linear.e - fit.mean) <= OUTLIER * np.sqrt(fit.variance)
-    return _Linear(linear.e * fits, linear.g * fits, linear.mask * fits)
+    return _LinearMatch(linear.e * fits, linear.g * fits, linear.mask * fits)
 
 
 def _fitted(
-    linear: _Linear,
+    linear: _LinearMatch,
     disparity: Field,
     trusted: NDArray[np.bool_],
-    plane: _Plane,
-    sums: _Windows,
-) -> _Fit:
+    plane: _DisparityPlane,
+    sums: _WindowSums,
+) -> _Refined:
     """Return one step of Gauss and Newton for every window.
 
     What noise there is follows from the ``trusted`` pixels.
@@ -210,7 +210,7 @@ def _fitted(
         found = (sg * sy / n - sgy) / curvature
         sigma = np.sqrt(variance / texture)
     usable = (texture > 0) & np.isfinite(found) & (n >= LEAST_PIXELS)
-    return _Fit(
+    return _Refined(
         np.where(usable, found, disparity),
         np.where(usable, sigma, np.inf),
         linear,
@@ -242,7 +242,7 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
     return value, slope
 
 
-def _correlation(fit: _Fit, trusted: NDArray[np.bool_]) -> float:
+def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
     """Return by how much the noise e of neighbours is correlated, as it counts for sums of g e.
 
     1: not at all. A picture that was rectified has some: its pixels share those of the source.

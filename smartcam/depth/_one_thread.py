@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-class Worker:
+class OneThread:
     """One thread; its owner closes it.
 
     Cancellation: what the thread is at is finished and thrown away.
