@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import secrets
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError
+from smartcam.frames._rtp.assembling import END, FU_A, STAP_A, START, AccessUnit, OpenUnit
 from smartcam.frames._rtp.packets import RtpPacket
 
 if TYPE_CHECKING:
@@ -18,19 +19,8 @@ MTU_PAYLOAD: Final = 1380
 SLICES, SPS, PPS, DELIMITER = range(1, 6), 7, 8, 9
 """Kinds of units (ITU-T H.264, table 7-1)."""
 
-STAP_A, FU_A = 24, 28
-"""Kinds of payloads: several units in a packet, and a part of one."""
-
-START, END = 0x80, 0x40
-"""Bits of a part's second byte."""
-
-START_CODE: Final = b"\0\0\0\1"
-
 WINDOW: Final = 64
 """Packets that wait for one that is missing before it."""
-
-MOST_BYTES: Final = 16 << 20
-"""Bytes of an access unit: one that is larger is damaged."""
 
 MOST_AHEAD, MOST_BEHIND = 3000, 500
 """Packets: a sequence number further off is a stream that began anew, if a second one follows."""
@@ -128,7 +118,7 @@ class H264Packetizer:
         payloads = [
             part for group in self._groups(units(access_unit)) for part in self._payloads(group)
         ]
-        made = []
+        made: list[bytes] = []
         for payload in payloads:
             last = len(made) == len(payloads) - 1
             head = (last, self.payload_type, self._sequence, timestamp & 0xFFFFFFFF, self.ssrc)
@@ -169,88 +159,6 @@ class H264Packetizer:
                 yield bytes((first[0] & 0x60 | FU_A, second)) + first[at : at + room]
 
 
-class AccessUnit(NamedTuple):
-    """One encoded frame that came whole.
-
-    Attributes:
-        data: as in a file (annex B).
-        timestamp: ticks of 90 kHz.
-        lost: packets that were lost since the last one that came whole.
-        damaged: frames since then that did not come whole, as far as one saw something of them.
-        arrived: when its first packet did, as it was told; 0.0 where it was not.
-    """
-
-    data: bytes
-    timestamp: int
-    lost: int = 0
-    damaged: int = 0
-    arrived: float = 0.0
-
-
-class _Open:
-    """An access unit that packets are still to come for."""
-
-    def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
-        self.timestamp, self.whole, self.arrived = timestamp, whole, arrived
-        self.parts: list[bytes] = []
-        self.size = 0
-        self._kind = -1  # of the unit whose parts come
-        self._last_sequence = False
-
-    def add(self, payload: bytes) -> None:
-        """Take what a packet has; what cannot be makes it damaged."""
-        if self.whole:
-            self.size += len(payload) + len(START_CODE)
-            self.whole = self.size <= MOST_BYTES and self._added(payload)
-        if not self.whole:
-            self.parts.clear()
-
-    def ended(self) -> bool:
-        """Return whether nothing is missing."""
-        return self.whole and self._kind < 0 and bool(self.parts)
-
-    def _added(self, payload: bytes) -> bool:
-        if not payload:
-            return True  # keeps a way through a firewall open
-        kind = payload[0] & 0x1F
-        if payload[0] & 0x80:
-            return False
-        if kind == FU_A:
-            return self._part(payload)
-        if self._kind >= 0:
-            return False
-        if kind == STAP_A:
-            return self._several(payload)
-        self.parts += (START_CODE, payload)
-        return 1 <= kind < STAP_A
-
-    def _several(self, payload: bytes) -> bool:
-        place = 1
-        while place < len(payload):
-            end = place + 2 + int.from_bytes(payload[place : place + 2], "big")
-            unit = payload[place + 2 : end]
-            if end > len(payload) or not unit or not 1 <= unit[0] & 0x9F < STAP_A:
-                return False
-            self.parts += (START_CODE, unit)
-            place = end
-        return len(payload) > 1
-
-    def _part(self, payload: bytes) -> bool:
-        if len(payload) < 3:
-            return False
-        second = payload[1]
-        start, kind = bool(second & START), second & 0x1F
-        if start != (self._kind < 0) or (second & START and second & END):
-            return False
-        if not 1 <= kind < STAP_A or (not start and kind != self._kind):
-            return False
-        if start:
-            self.parts += (START_CODE, bytes((payload[0] & 0x60 | kind,)))
-        self.parts.append(payload[2:])
-        self._kind = -1 if second & END else kind
-        return True
-
-
 class H264Depacketizer:
     """Makes encoded frames of one stream's packets: whole ones, in order, each once.
 
@@ -278,9 +186,10 @@ class H264Depacketizer:
     def _begin(self) -> None:
         self._next: int | None = None  # with the wraps counted
         self._held: dict[int, tuple[RtpPacket, float]] = {}
-        self._open: _Open | None = None
+        self._open: OpenUnit | None = None
         self._sure = False  # that the next packet is the first one of a frame
         self._closed: int | None = None  # timestamp of the last frame that ended
+        self._begins = True  # until a frame is whole
         self._odd: int | None = None  # what would follow a sequence number that was far off
 
     def take(self, packet: RtpPacket, now: float = 0.0) -> list[AccessUnit]:
@@ -308,6 +217,15 @@ class H264Depacketizer:
             return []
         gone = (one for one in range(self._next, max(self._held)) if one not in self._held)
         return [one & 0xFFFF for one in gone]
+
+    def tail(self) -> int | None:
+        """Return the sequence number that a frame goes on with whose end did not come yet.
+
+        None: none is begun, or others are missing before that.
+        """
+        if self._open is None or not self._open.whole or self._held or self._next is None:
+            return None
+        return self._next & 0xFFFF
 
     def waits_since(self) -> float | None:
         """Return when the first packet came that waits for another; None: none does."""
@@ -363,7 +281,7 @@ class H264Depacketizer:
             yield from self._end()
         if self._open is None:
             sure = (self._sure or _begins(packet.payload)) and packet.timestamp != self._closed
-            self._open = _Open(packet.timestamp, sure, now)
+            self._open = OpenUnit(packet.timestamp, sure, now)
         self._open.add(packet.payload)
         self._sure = True
         if packet.marker:
@@ -379,10 +297,12 @@ class H264Depacketizer:
             return
         lost, damaged = self._told
         self._told = (self.lost, self.damaged)
-        data = b"".join(ended.parts)
-        yield AccessUnit(
-            data, ended.timestamp, self.lost - lost, self.damaged - damaged, ended.arrived
+        since, begins, self._begins = (
+            (self.lost - lost, self.damaged - damaged),
+            self._begins,
+            False,
         )
+        yield AccessUnit(b"".join(ended.parts), ended.timestamp, *since, ended.arrived, begins)
 
     def _damage_open(self) -> None:
         if self._open is not None:

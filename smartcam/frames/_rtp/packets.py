@@ -276,7 +276,9 @@ def is_rtcp(data: bytes) -> bool:
 
 
 def _sender_report(count: int, body: bytes) -> Iterable[Report]:
-    yield SenderReport(*_SENDER.unpack_from(body), _blocks(count, body[_SENDER.size :]))
+    ssrc, ntp, timestamp, packets, octets = _SENDER.unpack_from(body)
+    blocks = _blocks(count, body[_SENDER.size :])
+    yield SenderReport(ssrc, ntp, timestamp, packets, octets, blocks)
 
 
 def _receiver_report(count: int, body: bytes) -> Iterable[Report]:

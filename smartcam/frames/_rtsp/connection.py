@@ -241,7 +241,7 @@ class RtspConnection(asyncio.Protocol):
         return True
 
     def _take(self, packet: ChannelData) -> bool:
-        """Take RTCP; return whether it is from a client that still has a session, or just had one."""
+        """Take RTCP; return whether there were not too many without a session."""
         for session in self.sessions.values():
             delivery = session.delivery
             if isinstance(delivery, ChannelDelivery) and packet.channel == delivery.channels[1]:
