@@ -217,7 +217,8 @@ def _frame_order(call: ProgramCall) -> FrameOrder:
     encoding = FrameForm.checked(
         call.argument("encoding", str) or "raw", call.argument("quality", int), name
     )
-    return FrameOrder(call.program, call.owner.call, encoding, call.timeout)
+    rest = call.argument("rest", int, float) or 0.0
+    return FrameOrder(call.program, call.owner.call, encoding, call.timeout, max(0.0, rest))
 
 
 async def _frame(call: ProgramCall) -> Answer:

@@ -22,6 +22,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
     UnsupportedError,
 )
+from smartcam.fleet._frame_pace import FramePace
 from smartcam.fleet._frame_wire import MOST_FRAME, FrameForm, to_fields
 
 if TYPE_CHECKING:
@@ -78,12 +79,14 @@ class FrameOrder(NamedTuple):
         call: number of its call.
         encoding: how it is to come.
         timeout: seconds.
+        rest: seconds from one frame of a stream to the next at least.
     """
 
     program: str
     call: int
     encoding: FrameForm
     timeout: float
+    rest: float = 0.0
 
 
 @dataclass(eq=False)
@@ -94,6 +97,21 @@ class _FrameStream:
     reader: FrameReader
     idle: asyncio.TimerHandle | None = None
     busy: bool = False
+    pace: FramePace = field(default_factory=FramePace)
+
+    async def frame(self, order: FrameOrder) -> Frame:
+        """Return the next frame, as soon as there is one that is new enough.
+
+        Raises:
+            TimeoutError: none came in time.
+        """
+        loop, reader = asyncio.get_running_loop(), self.reader
+        since, until = self.pace.asked(loop.time(), reader.came, order.rest)
+        async with asyncio.timeout(min(order.timeout, HOLD)):
+            await reader.fresh(since, until)
+            frame = await anext(reader)
+        self.pace.took(reader.came, reader.statistics().offered)
+        return frame
 
     def rest(self, close: Callable[[], None]) -> None:
         """Nothing is asked for now: ``close`` is called if that stays so."""
@@ -257,8 +275,7 @@ class SharedFrames:
                 raise LocalProtocolError(f"{self.name}: two requests for the frames of one stream")
             viewer.wake()
             try:
-                async with asyncio.timeout(min(order.timeout, HOLD)):
-                    frame = await anext(viewer.reader)
+                frame = await viewer.frame(order)
                 async with asyncio.timeout(order.timeout):
                     sent, took = await self._encode(frame, order.encoding)
             except FrameTimeoutError:
@@ -274,6 +291,7 @@ class SharedFrames:
             finally:
                 if self._viewers.get(key) is viewer:
                     viewer.rest(lambda: self._leave(key, viewer))
+        viewer.pace.gave(asyncio.get_running_loop().time())
         account = viewer.reader.statistics()
         counts = {
             "stream": viewer.number,
