@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from smartcam.frames._h264 import H264Decoder, H264Encoder
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
+    from smartcam.frames._rate import RateControl, RateStatistics
     from smartcam.frames._reader import FrameReader, ReaderStatistics
     from smartcam.frames._source import FrameSource, SourceStatistics
     from smartcam.frames._stages import Rectifier, Undistorter
@@ -47,6 +48,8 @@ __all__ = [
     "H264Encoder",
     "Moment",
     "PixelFormat",
+    "RateControl",
+    "RateStatistics",
     "ReaderStatistics",
     "Rectifier",
     "SourceStatistics",
@@ -70,6 +73,7 @@ if not TYPE_CHECKING:
             "_h264": "H264Decoder H264Encoder",
             "_opening": "discover open",
             "_pixels": "PixelFormat find_format",
+            "_rate": "RateControl RateStatistics",
             "_reader": "FrameReader ReaderStatistics",
             "_source": "FrameSource SourceStatistics",
             "_stages": "Rectifier Undistorter",

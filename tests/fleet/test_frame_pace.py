@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 
 from hypothesis import given
@@ -54,7 +55,7 @@ def test_frame_has_hardly_waited_and_the_link_is_used(period: float, way: float)
     assert len(went) == 37
     for came, at in went:
         assert at - came <= max(LEAST, SHARE * way) + 1e-6
-    for (_, one), (_, other) in zip(went, went[1:], strict=False):
+    for (_, one), (_, other) in itertools.pairwise(went):
         assert other - one <= way + period + 1e-6
 
 
@@ -73,7 +74,6 @@ def test_rest_is_held_on_average(rest: float) -> None:
     took = (went[-1][1] - went[0][1]) / (len(went) - 1)
     assert abs(took - rest) <= 0.034 / 20
     assert all(at - came <= LEAST + 1e-6 for came, at in went)
-
 
 
 async def test_reader_waits_past_what_has_waited() -> None:
