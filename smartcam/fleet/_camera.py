@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
-    from smartcam.camera import FrameEncoding
+    from smartcam.camera import FrameEncoding, StreamEncoding
     from smartcam.fleet._frame_caller import FrameCaller
     from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._program import Program
@@ -687,14 +687,18 @@ class FleetCamera(Camera[ValueT]):
     async def frames(
         self,
         *,
-        encoding: FrameEncoding = "raw",
+        encoding: StreamEncoding = "raw",
         quality: int | None = None,
+        bitrate: float | None = None,
+        latency: float | None = None,
+        decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> AsyncGenerator[FrameReader]:
-        from smartcam.fleet._frame_caller import SharedFrameDriver
+        from smartcam.fleet._frame_shared_driver import SharedFrameDriver
+        from smartcam.fleet._frame_wish import StreamWish
         from smartcam.frames import FrameAddress, FrameSource
 
-        wanted = FrameForm.checked(encoding, quality, self.name)
+        wanted = StreamWish.checked(encoding, quality, bitrate, latency, self.name, decode=decode)
         driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, wanted)
         async with (
             FrameSource(driver, timeout=timeout, stall=None) as source,

@@ -218,7 +218,7 @@ class RateControl:
         least, best = self._qualities
         wanted, wanted_fps, why = self._wanted()
         quality = min(best, max(least, _quality(self._weight.value / wanted)))
-        grows = self._rise**seconds
+        grows = self._rise ** min(seconds, CALM)
         if wanted_fps < self._fps * (1 - DEAD):
             self._fps, self._rise = wanted_fps, RISE
         elif wanted_fps > self._fps:
