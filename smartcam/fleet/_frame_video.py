@@ -59,10 +59,12 @@ class SharedVideo:
     """
 
     def __init__(self, source: FrameSource, encoder: H264Encoder, name: str) -> None:
-        self._source, self._encoder = source, encoder
+        self._encoder = encoder
+        self._reader = source.reader(timeout=None)
         self._kept: collections.deque[VideoUnit] = collections.deque(maxlen=MOST_KEPT)
         self._stirred = asyncio.Event()
         self._over: tuple[Exception | None] | None = None
+        self._name = name
         self._last_key = -KEY_EVERY
         self._key_wanted = False
         self.viewers = 0
@@ -77,11 +79,14 @@ class SharedVideo:
 
     async def close(self) -> None:
         """Encode nothing more; who waits is told. Idempotent."""
-        self._task.cancel()
-        await asyncio.wait([self._task])
+        await asyncio.wait([self.end()])
 
     def end(self) -> asyncio.Task[None]:
-        """Begin to close; the task ends at the next turn."""
+        """Begin to close; return the task that ends then."""
+        if self._over is None:
+            self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
+        self._reader.close()
+        self._stirred.set()
         self._task.cancel()
         return self._task
 
@@ -123,17 +128,16 @@ class SharedVideo:
 
     async def _run(self) -> None:
         try:
-            async with self._source.reader(timeout=None) as reader:
-                async for frame in reader:
-                    account = reader.statistics()
-                    await self._encode(frame, account.offered, account.lost)
-            self._over = (None,)
+            async for frame in self._reader:
+                account = self._reader.statistics()
+                await self._encode(frame, account.offered, account.lost)
+            self._over = self._over or (None,)
         except asyncio.CancelledError:
-            self._over = (FrameSourceError(f"{self._source.name}: its video ended"),)
             raise
         except Exception as error:  # noqa: BLE001 - it is told to who looks
             self._over = (error,)
         finally:
+            self._reader.close()
             self._kept.clear()
             self._stirred.set()
 
