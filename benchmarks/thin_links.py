@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import smartcam
 import smartcam.frames
+from smartcam.fleet import FleetFrame
 from smartcam.frames._synthetic import read_stamp
 
 if TYPE_CHECKING:
@@ -134,12 +135,14 @@ def served(links: ThinLinks) -> Iterator[None]:
 
 def streamed(links: ThinLinks, camera: str, seconds: float, **options: Any) -> dict[str, Any]:
     """Return what came of a stream over the bus: see :func:`_look`."""
-    return links.said("b", *_me("look", camera, seconds, json.dumps(options)))
+    found: dict[str, Any] = links.said("b", *_me("look", camera, seconds, json.dumps(options)))
+    return found
 
 
 def one_on_request(links: ThinLinks, count: int) -> dict[str, Any]:
     """Return how long one frame on request takes, and its parts: see :func:`_request`."""
-    return links.said("b", *_me("request", count))
+    found: dict[str, Any] = links.said("b", *_me("request", count))
+    return found
 
 
 @contextlib.contextmanager
@@ -229,6 +232,7 @@ async def _request(count: str) -> dict[str, Any]:
             begun = time.perf_counter()
             frame = await camera.newest_frame(encoding="jpeg", quality=15)
             took.append(time.perf_counter() - begun)
+            assert isinstance(frame, FleetFrame)
             encoding.append(frame.encoding_time)
             size = len(frame.data)
             begun = time.perf_counter()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 from smartcam.exceptions import ConfigurationError
 
@@ -47,18 +47,6 @@ TOLD: Final = 1.25
 STEEP: Final = 0.7
 """Bytes of a JPEG go with its steps to this power, near enough: what is off is corrected after."""
 
-RateReason = Literal[
-    "",
-    "the best quality",
-    "bit rate",
-    "latency",
-    "bit rate, at the lowest quality",
-    "latency, at the lowest quality",
-    "bit rate: no frame may be smaller, nor fewer",
-    "latency: no frame may be smaller, nor fewer",
-]
-"""What quality and frame rate follow; "" before the first frame."""
-
 
 @dataclass(frozen=True, slots=True)
 class RateStatistics:
@@ -67,14 +55,16 @@ class RateStatistics:
     Attributes:
         quality: of JPEG, that frames are to have.
         fps: frames a second at most.
-        why: what these follow.
+        why: what these follow: "bit rate", "latency" or "the best quality"; "" before the first
+            frame. Behind it stands "at the lowest quality" where there are fewer frames, too, and
+            "no frame may be smaller, nor fewer" where that is not enough.
         bitrate: bits a second of late.
         latency: seconds from a frame's capture to its arrival, of late.
     """
 
     quality: int
     fps: float
-    why: RateReason
+    why: str
     bitrate: float
     latency: float
 
@@ -143,7 +133,7 @@ class RateControl:
         self._qualities, self._rates = quality, fps
         self._quality, self._fps = float(quality[0]), float(fps[1])
         self._rise = START
-        self._why: RateReason = ""
+        self._why: str = ""
         self._told_fps = self._fps
         self._went: float | None = None
         self._comes = 0.0  # frames a second that the source gives, as far as is known; 0: unknown
@@ -234,11 +224,11 @@ class RateControl:
         self._why = why
         self._tell()
 
-    def _wanted(self) -> tuple[float, float, RateReason]:
+    def _wanted(self) -> tuple[float, float, str]:
         """Return the bytes of a frame, frames a second, and why."""
         fewest, most = self._rates
         smallest = self._bytes(self._qualities[0])
-        found: list[tuple[float, float, Literal["bit rate", "latency"]]] = []
+        found: list[tuple[float, float, str]] = []
         if self._bitrate is not None:
             comes = min(most, max(fewest, self._comes or most))
             found.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
@@ -254,7 +244,7 @@ class RateControl:
         return size, min(most, fps), f"{name}, at the lowest quality"
 
     def _bytes(self, quality: float) -> float:
-        return self._weight.value / _steps(quality) ** STEEP
+        return self._weight.value / float(_steps(quality) ** STEEP)
 
     def _tell(self) -> None:
         back = self._fps == self._rates[1] != self._told_fps
@@ -270,7 +260,7 @@ def _steps(quality: float) -> float:
 
 def _quality(weight: float) -> float:
     """Return the quality whose steps, to the power that bytes go with, are ``weight``."""
-    steps = max(1e-3, weight) ** (1 / STEEP)
+    steps = float(max(1e-3, weight) ** (1 / STEEP))
     return 50 / steps if steps > 1 else 100 - 50 * steps
 
 
