@@ -219,8 +219,11 @@ class RateControl:
         elif wanted > has * (1 + DEAD) and self._fps >= self._rates[1]:
             slowly = _quality(self._weight.value / (has * grows))
             self._quality = max(self._quality, min(quality, slowly))
-        if self._quality >= best and why in {"bit rate", "latency"}:
-            why = "the best quality"
+        if why in {"bit rate", "latency"}:
+            if self._fps < self._rates[1]:  # on its way back
+                why = f"{why}, at the lowest quality"
+            elif self._quality >= best:
+                why = "the best quality"
         self._why = why
         self._tell()
 

@@ -9,6 +9,7 @@ import random
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -227,6 +228,19 @@ def test_quality_goes_first_then_the_frame_rate_and_back_in_reverse(
     for one, other in itertools.pairwise(link.sent):
         assert one.quality == other.quality or 30.0 in (one.fps, other.fps)
     assert len(caplog.messages) < 15
+
+
+@given(target=st.floats(0.2e6, 2e6))
+def test_what_is_said_is_what_is_done(target: float) -> None:
+    control = RateControl(bitrate=target)
+    link = Link(control, lambda _: 100e6, content=lambda at: 2e4 * (4.0 if 5 < at < 10 else 1.0))
+    for until in np.arange(0.1, 20.0, 0.1):
+        link.run(until)
+        said = control.statistics()
+        fewer = "lowest" in said.why or said.why.endswith("fewer")
+        assert fewer or said.fps == 30.0
+        if fewer:
+            assert said.quality == 10
 
 
 def test_latency_that_the_way_itself_has_does_not_stop_the_frames() -> None:
