@@ -18,6 +18,7 @@ from smartcam.fleet._frame_caller import StreamCounts, as_source_error
 from smartcam.fleet._frame_stream import HOLD
 from smartcam.fleet._frame_wire import VIDEO
 from smartcam.frames import FrameDriver
+from smartcam.frames._optional_imports import load
 
 if TYPE_CHECKING:
     from smartcam.fleet._frame_caller import FrameCaller
@@ -67,7 +68,10 @@ class SharedFrameDriver(FrameDriver):
         Raises:
             FrameSourceError: it cannot, or there is no agent.
             UnsupportedError: the camera has no frames.
+            MissingExtraError: what decodes H.264 is not installed here.
         """
+        if self._wish.form.name == VIDEO and self._wish.decode:
+            load("av")
         try:
             return await self._frames.about(self._wish)
         except (FrameSourceError, UnsupportedError, ConfigurationError):
@@ -76,11 +80,7 @@ class SharedFrameDriver(FrameDriver):
             raise as_source_error(self.name, exc) from exc
 
     async def start(self, sink: FrameSink) -> None:
-        """Ask for one frame after the other.
-
-        Raises:
-            MissingExtraError: what decodes H.264 is not installed.
-        """
+        """Ask for one frame after the other."""
         if self._wish.form.name == VIDEO:
             from smartcam.fleet._frame_units import VideoUnits
 
@@ -92,12 +92,14 @@ class SharedFrameDriver(FrameDriver):
     async def stop(self) -> None:
         """Ask no more."""
         task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
         video, self._video = self._video, None
-        if video is not None:
-            await video.close()
+        try:
+            if task is not None:
+                task.cancel()
+                await asyncio.wait([task])
+        finally:
+            if video is not None:
+                await video.close()
 
     async def close(self) -> None:
         """Ask no more."""
