@@ -11,9 +11,25 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    pass
+    from smartcam.depth._matcher import Disparity, StereoMatcher
+    from smartcam.depth._pair import read_camera_infos
+    from smartcam.depth._stereo import DepthFrame, StereoDepth, StereoStatistics
 
-__all__: list[str] = []
+__all__ = [
+    "DepthFrame",
+    "Disparity",
+    "StereoDepth",
+    "StereoMatcher",
+    "StereoStatistics",
+    "read_camera_infos",
+]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazy(__name__, {})
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_matcher": "Disparity StereoMatcher",
+            "_pair": "read_camera_infos",
+            "_stereo": "DepthFrame StereoDepth StereoStatistics",
+        },
+    )

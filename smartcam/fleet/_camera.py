@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._program import Program
     from smartcam.fleet._wire import BusMessage
-    from smartcam.frames import FrameReader
+    from smartcam.frames import FrameReader, FrameSource
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
@@ -694,17 +694,35 @@ class FleetCamera(Camera[ValueT]):
         decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> AsyncGenerator[FrameReader]:
+        source = self.frame_source(
+            encoding, quality, bitrate=bitrate, latency=latency, decode=decode, timeout=timeout
+        )
+        async with source, source.reader() as reader:
+            yield reader
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether the agent has said that the camera has frames."""
+        return bool(self._about.get("frames"))
+
+    def frame_source(
+        self,
+        encoding: StreamEncoding = "raw",
+        quality: int | None = None,
+        *,
+        bitrate: float | None = None,
+        latency: float | None = None,
+        decode: bool = True,
+        timeout: float | None = FRAME_TIMEOUT,
+    ) -> FrameSource:
+        """Return what :meth:`frames` reads, for several readers; not opened yet."""
         from smartcam.fleet._frame_shared_driver import SharedFrameDriver
         from smartcam.fleet._frame_wish import StreamWish
         from smartcam.frames import FrameAddress, FrameSource
 
         wanted = StreamWish.checked(encoding, quality, bitrate, latency, self.name, decode=decode)
         driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, wanted)
-        async with (
-            FrameSource(driver, timeout=timeout, stall=None) as source,
-            source.reader() as reader,
-        ):
-            yield reader
+        return FrameSource(driver, timeout=timeout, stall=None)
 
     async def newest_frame(
         self,

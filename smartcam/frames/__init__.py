@@ -28,6 +28,11 @@ if TYPE_CHECKING:
     from smartcam.frames._pixels import PixelFormat, find_format
     from smartcam.frames._rate import RateControl, RateStatistics
     from smartcam.frames._reader import FrameReader, ReaderStatistics
+    from smartcam.frames._rtp.feedback import RtpReceiver
+    from smartcam.frames._rtp.receiver import RtpStatistics
+    from smartcam.frames._rtp.sender import RtpSender, RtpSenderStatistics
+    from smartcam.frames._rtsp.server import RtspServer
+    from smartcam.frames._rtsp.streams import RtspStatistics
     from smartcam.frames._source import FrameSource, SourceStatistics
     from smartcam.frames._stages import Rectifier, Undistorter
 
@@ -52,6 +57,12 @@ __all__ = [
     "RateStatistics",
     "ReaderStatistics",
     "Rectifier",
+    "RtpReceiver",
+    "RtpSender",
+    "RtpSenderStatistics",
+    "RtpStatistics",
+    "RtspServer",
+    "RtspStatistics",
     "SourceStatistics",
     "StreamFormat",
     "Undistorter",
@@ -75,6 +86,11 @@ if not TYPE_CHECKING:
             "_pixels": "PixelFormat find_format",
             "_rate": "RateControl RateStatistics",
             "_reader": "FrameReader ReaderStatistics",
+            "_rtp.feedback": "RtpReceiver",
+            "_rtp.receiver": "RtpStatistics",
+            "_rtp.sender": "RtpSender RtpSenderStatistics",
+            "_rtsp.server": "RtspServer",
+            "_rtsp.streams": "RtspStatistics",
             "_source": "FrameSource SourceStatistics",
             "_stages": "Rectifier Undistorter",
         },
