@@ -11,9 +11,38 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    pass
+    from smartcam.depth._cloud import Cloud
+    from smartcam.depth._cloud_files import load_cloud, save_cloud
+    from smartcam.depth._filters import (
+        crop_box,
+        pass_through,
+        remove_radius_outliers,
+        remove_statistical_outliers,
+        voxel_grid,
+    )
+    from smartcam.depth._registration import Registration, register
 
-__all__: list[str] = []
+__all__ = [
+    "Cloud",
+    "Registration",
+    "crop_box",
+    "load_cloud",
+    "pass_through",
+    "register",
+    "remove_radius_outliers",
+    "remove_statistical_outliers",
+    "save_cloud",
+    "voxel_grid",
+]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazy(__name__, {})
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_cloud": "Cloud",
+            "_cloud_files": "load_cloud save_cloud",
+            "_filters": "crop_box pass_through remove_radius_outliers remove_statistical_outliers "
+            "voxel_grid",
+            "_registration": "Registration register",
+        },
+    )
