@@ -148,8 +148,11 @@ class Cloud:
 
     def taken(self, index: NDArray[Any]) -> Self:
         """Return some of the points, by a mask (N,) or by their places, in that order."""
-        columns = (self.points, self.colours, self.sigma)
-        return type(self)(*(None if one is None else one[index] for one in columns))  # type: ignore[arg-type]
+        return type(self)(
+            self.points[index],
+            None if self.colours is None else self.colours[index],
+            None if self.sigma is None else self.sigma[index],
+        )
 
 
 def _as(values: NDArray[Any]) -> NDArray[np.float32]:

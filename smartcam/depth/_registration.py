@@ -37,6 +37,10 @@ TURN_STEP: Final = 1e-5
 SHIFT_STEP: Final = 1e-4
 """Steps that count as none: radians, and of ``max_distance``."""
 
+NEAR: Final = 5.0
+"""Of ``max_distance``: what is farther from the target at the beginning takes no part, since
+small-gicp looks very long for the neighbours of what is far away."""
+
 RESTLESS: Final = 1e-3
 """Of ``max_distance``: what :data:`MORE_STEPS` move the points by, where the steps do not end."""
 
@@ -99,7 +103,7 @@ def register(
     """Return where a cloud lies in another.
 
     It finds the pose that is nearest to ``initial``, which should be off by less than
-    ``max_distance``. It holds Python's lock all the while, for tenths of a second with 100,000
+    ``max_distance``; what is off by five times as much takes no part. It holds Python's lock all the while, for tenths of a second with 100,000
     points: beside an event loop it belongs into a process.
 
     Args:
@@ -131,8 +135,12 @@ def register(
             )
         clouds.append(thin.points.astype(np.float64))
     points, goals = clouds
-    pose, ended = _aligned(points, goals, begin, METHODS[method], max_distance)
     tree = load("scipy.spatial").cKDTree(goals)
+    distances, _ = tree.query(begin.apply(points), distance_upper_bound=NEAR * max_distance)
+    near = points[np.isfinite(distances)]
+    pose, ended = begin, True
+    if len(near) >= NEIGHBOURS:
+        pose, ended = _aligned(near, goals, begin, METHODS[method], max_distance)
     match = _matched(points, tree, pose, max_distance)
     return _judged(method, pose, ended, match, len(points), goals, tree, min_overlap)
 
@@ -276,7 +284,7 @@ def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
 def _in_words(step: Array, arms: Array) -> str:
     """Return what a step about the centre of the matched points is that is left open."""
     turn, shift = step[:3], step[3:]
-    reach = float(np.sqrt((arms**2).sum(axis=1).mean()))
+    reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
     size = np.linalg.norm(turn) * reach
     main, word = (turn, "turn about") if size > np.linalg.norm(shift) else (shift, "shift along")
     axis = main / np.linalg.norm(main)
