@@ -28,7 +28,7 @@ class DepthCommands(JsonErrors, click.Group):
     """Its commands tell a wrong use as JSON, too."""
 
 
-class RangeType(click.ParamType):
+class RangeType(click.ParamType):  # type: ignore[type-arg] - not generic before click 8.3
     """``AXIS:LOW:HIGH`` in metres; a limit that is left out is none."""
 
     name = "AXIS:LOW:HIGH"
@@ -143,10 +143,11 @@ async def convert(
         voxel_grid,
     )
 
-    if Path(target).exists() and not force:
-        raise ConfigurationError(f"{target}: the file is there already; --force takes its place")
-
     def work() -> tuple[int, Cloud]:
+        if Path(target).exists() and not force:
+            raise ConfigurationError(
+                f"{target}: the file is there already; --force takes its place"
+            )
         cloud = load_cloud(source)
         before = len(cloud)
         for axis, low, high in ranges:

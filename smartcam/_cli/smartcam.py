@@ -14,8 +14,8 @@ import smartcam
 from smartcam._cli import demo, demo_fleet, demo_pick
 from smartcam._cli.calibrate import calibrate
 from smartcam._cli.decode import decode, from_hex
-from smartcam._cli.dissector import dissector
 from smartcam._cli.depth import depth
+from smartcam._cli.dissector import dissector
 from smartcam._cli.doctor import doctor
 from smartcam._cli.fleet import fleet
 from smartcam._cli.frames import frames

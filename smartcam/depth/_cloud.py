@@ -37,9 +37,9 @@ class Cloud:
         ConfigurationError: other shapes, no numbers, a point that is not finite, a sigma below 0.
     """
 
-    points: NDArray[np.float32]
-    colours: NDArray[np.uint8] | None = None
-    sigma: NDArray[np.float32] | None = None
+    points: NDArray[Any]
+    colours: NDArray[Any] | None = None
+    sigma: NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
         """Check, and take read-only views."""
@@ -170,9 +170,7 @@ def _shape(values: NDArray[Any], what: str, shape: tuple[int | None, ...]) -> No
         raise ConfigurationError(f"{what}: expected the shape ({wanted}), got {values.shape}")
 
 
-def _floats(
-    given: ArrayLike, what: str, shape: tuple[int | None, ...]
-) -> NDArray[np.float32]:
+def _floats(given: ArrayLike, what: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
     """Return a read-only view as float32, all finite; else ConfigurationError."""
     values = _array(given, what)
     if values.dtype.kind not in _NUMBERS:
@@ -182,7 +180,9 @@ def _floats(
         floats = np.ascontiguousarray(values, np.float32).view()
     if not np.isfinite(floats).all():
         wrong = int(np.count_nonzero(~np.isfinite(floats)))
-        raise ConfigurationError(f"{what}: expected finite float32 values, got {wrong} that are not")
+        raise ConfigurationError(
+            f"{what}: expected finite float32 values, got {wrong} that are not"
+        )
     floats.flags.writeable = False
     return floats
 

@@ -147,11 +147,13 @@ def _colours(
     found = np.stack([columns[name][there] for name in ("red", "green", "blue")], axis=1)
     if found.dtype.kind == "f":  # 0 to 1
         if found.size and not (found.min() >= 0 and found.max() <= 1):
-            raise BadTableError("colours of 0 to 1, or of 8 bits", f"{found.min()} to {found.max()}")
+            raise BadTableError(
+                "colours of 0 to 1, or of 8 bits", f"{found.min()} to {found.max()}"
+            )
         return np.rint(found * 255).astype(np.uint8)
     if found.dtype != np.uint8:
         raise BadTableError("colours of 0 to 1, or of 8 bits", f"{found.dtype}")
-    return found
+    return np.asarray(found, np.uint8)
 
 
 def _sigma(

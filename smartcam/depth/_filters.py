@@ -47,13 +47,11 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
     corners = [np.asarray(one, np.float64) for one in (low, high)]
     if any(one.shape != (3,) for one in corners) or not (corners[0] <= corners[1]).all():
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
-    inside = (cloud.points >= corners[0]) & (cloud.points <= corners[1])
-    return cloud.taken(inside.all(axis=1))
+    inside = np.all((cloud.points >= corners[0]) & (cloud.points <= corners[1]), axis=1)
+    return cloud.taken(np.asarray(inside))
 
 
-def remove_statistical_outliers(
-    cloud: Cloud, neighbours: int = 20, ratio: float = 2.0
-) -> Cloud:
+def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
     """Return the points that are about as near to others as most are.
 
     Each point's mean distance to its ``neighbours`` nearest is compared with the mean of all those
@@ -66,13 +64,14 @@ def remove_statistical_outliers(
     """
     _check_count(neighbours, "remove_statistical_outliers")
     if not ratio >= 0:
-        raise ConfigurationError(f"remove_statistical_outliers: ratio: expected 0 or more, got {ratio!r}")
+        raise ConfigurationError(
+            f"remove_statistical_outliers: ratio: expected 0 or more, got {ratio!r}"
+        )
     if not len(cloud):
         return cloud
     if len(cloud) <= neighbours:
         raise ConfigurationError(
-            f"remove_statistical_outliers: expected more than {neighbours} points, "
-            f"got {len(cloud)}"
+            f"remove_statistical_outliers: expected more than {neighbours} points, got {len(cloud)}"
         )
     tree = load("scipy.spatial").cKDTree(cloud.points)
     means = np.empty(len(cloud))
@@ -133,7 +132,9 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
     return Cloud(
         columns(cloud.points).astype(np.float32),
         None if colours is None else np.rint(columns(colours)).astype(np.uint8),
-        None if cloud.sigma is None else np.sqrt(means(cloud.sigma.astype(np.float64) ** 2)).astype(np.float32),
+        None
+        if cloud.sigma is None
+        else np.sqrt(means(cloud.sigma.astype(np.float64) ** 2)).astype(np.float32),
     )
 
 

@@ -11,15 +11,12 @@ import numpy as np
 
 from smartcam.calibration import Transform
 from smartcam.calibration._optional_imports import load
-from smartcam.depth._cloud import Cloud
 from smartcam.depth._filters import voxel_grid
 from smartcam.depth._surface import open_directions, planes_of, slopes
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from smartcam.depth._surface import Planes
 
     Array = NDArray[np.float64]
 
@@ -103,8 +100,9 @@ def register(
     """Return where a cloud lies in another.
 
     It finds the pose that is nearest to ``initial``, which should be off by less than
-    ``max_distance``; what is off by five times as much takes no part. It holds Python's lock all the while, for tenths of a second with 100,000
-    points: beside an event loop it belongs into a process.
+    ``max_distance``; what is off by five times as much takes no part. It holds Python's lock all
+    the while, for tenths of a second with 100,000 points: beside an event loop it belongs into a
+    process.
 
     Args:
         source: at least 20 points, as the target.

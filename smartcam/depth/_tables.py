@@ -43,7 +43,9 @@ def header_line(data: bytes, start: int) -> tuple[str, int]:
         raise BadTableError(f"a header of up to {MAX_HEADER} bytes", shown(data[start:]))
     line = data[start:end].removesuffix(b"\r")
     try:
-        return line.decode("ascii", "strict" if not line.startswith((b"comment", b"#")) else "replace"), end + 1
+        return line.decode(
+            "ascii", "strict" if not line.startswith((b"comment", b"#")) else "replace"
+        ), end + 1
     except UnicodeDecodeError:
         _fail("a header in ASCII", line)
 
@@ -100,8 +102,8 @@ def from_text(
                 lines.append(words)
             elif words:
                 _fail(f"{len(types)} numbers in line {done + len(lines) + 1}", b" ".join(words))
-        for column, words in zip(columns, zip(*lines, strict=True), strict=True):
-            column[done : done + len(lines)] = _numbers(words, column.dtype)
+        for column, written in zip(columns, zip(*lines, strict=True), strict=True):
+            column[done : done + len(lines)] = _numbers(written, column.dtype)
         done += len(lines)
     return columns
 

@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: the emulator's, which controls it, a camera's, the wizard's, frames, clouds.
+"""Pages and HTTP calls: an emulator, which is controlled, a camera, wizards, frames, clouds.
 
 ::
 

@@ -141,6 +141,7 @@ class CloudSite(Site):
             await self._newer.wait()
         if self._packing is None or self._packing[0] != self._number:
             loop = asyncio.get_running_loop()
+            assert self._cloud is not None  # it has a number
             made = loop.run_in_executor(self._threads, packed, self._cloud)
             made.add_done_callback(_seen)
             self._packing = (self._number, made)

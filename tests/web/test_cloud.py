@@ -194,14 +194,13 @@ async def test_who_is_one_too_many_or_no_websocket_is_refused() -> None:
 
 
 async def test_token_is_asked_for() -> None:
-    async with world(line(2), token=TOKEN) as one:
-        async with aiohttp.ClientSession() as stranger:
-            with pytest.raises(aiohttp.WSServerHandshakeError, match="401"):
-                await stranger.ws_connect(one.caller.url("/api/clouds"), protocols=[PROTOCOL])
-            url = one.caller.url("/api/clouds")
-            protocols = [PROTOCOL, f"bearer.{TOKEN}"]
-            async with stranger.ws_connect(url, protocols=protocols) as socket:
-                assert (await Looker(socket).cloud())[0]["points"] == 2
+    async with world(line(2), token=TOKEN) as one, aiohttp.ClientSession() as stranger:
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="401"):
+            await stranger.ws_connect(one.caller.url("/api/clouds"), protocols=[PROTOCOL])
+        url = one.caller.url("/api/clouds")
+        protocols = [PROTOCOL, f"bearer.{TOKEN}"]
+        async with stranger.ws_connect(url, protocols=protocols) as socket:
+            assert (await Looker(socket).cloud())[0]["points"] == 2
 
 
 async def test_site_that_stops_says_good_bye_and_starts_again() -> None:

@@ -185,7 +185,7 @@ async def test_colour_by_height_point_size_and_axes(page: Page) -> None:
         fine = where(await picture(page), RED)[2]
         await page.locator("#size").fill("12")
         assert where(await picture(page), RED)[2] > 1.1 * fine
-        at_origin = Cloud(SCENE.points - np.float32([0, 0, 1]), SCENE.colours)
+        at_origin = Cloud(SCENE.points - np.array([0, 0, 1]), SCENE.colours)
         site.show(at_origin)
         await page.locator("#number").filter(has_text="3").wait_for()
         await page.click("#reset")
