@@ -28,24 +28,22 @@ class DepthCommands(JsonErrors, click.Group):
     """Its commands tell a wrong use as JSON, too."""
 
 
-class RangeType(click.ParamType):  # type: ignore[type-arg] - not generic before click 8.3
-    """``AXIS:LOW:HIGH`` in metres; a limit that is left out is none."""
-
-    name = "AXIS:LOW:HIGH"
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, float, float]:
-        """Return axis, low and high."""
-        axis, _, limits = str(value).partition(":")
+def _ranges(
+    _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
+) -> list[tuple[str, float, float]]:
+    """Return axis, low and high of ``AXIS:LOW:HIGH``; a limit that is left out is none."""
+    found = []
+    for value in values:
+        axis, _, limits = value.partition(":")
         low, colon, high = limits.partition(":")
         try:
-            found = (float(low or "-inf"), float(high or "inf"))
+            ends = (float(low or "-inf"), float(high or "inf"))
         except ValueError:
-            found = (math.nan, math.nan)
-        if axis not in ("x", "y", "z") or not colon or not found[0] <= found[1]:
-            self.fail(f"expected AXIS:LOW:HIGH, such as z:0.2:1.5, got {value!r}", param, ctx)
-        return (axis, *found)
+            ends = (math.nan, math.nan)
+        if axis not in ("x", "y", "z") or not colon or not ends[0] <= ends[1]:
+            raise click.BadParameter(f"expected AXIS:LOW:HIGH, such as z:0.2:1.5, got {value!r}")
+        found.append((axis, *ends))
+    return found
 
 
 @click.group(
@@ -105,7 +103,8 @@ async def show(file: str, up: Up, web: PageOptions, options: Options) -> None:
 @click.option(
     "--pass",
     "ranges",
-    type=RangeType(),
+    metavar="AXIS:LOW:HIGH",
+    callback=_ranges,
     multiple=True,
     help="Keep the points of a range in metres, such as z:0.2:1.5, z:0.2: or z::1.5. May be given "
     "more than once.",

@@ -226,5 +226,4 @@ def _inverse(given: ArrayLike) -> NDArray[np.float64]:
             "matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0, "
             f"got {matrix.tolist()}"
         )
-    inverse: NDArray[np.float64] = np.linalg.inv(matrix.astype(np.float64))
-    return inverse
+    return np.asarray(np.linalg.inv(matrix.astype(np.float64)), np.float64)

@@ -144,13 +144,16 @@ def _colours(
 ) -> NDArray[np.uint8] | None:
     if not all(name in columns for name in ("red", "green", "blue")):
         return None
-    found = np.stack([columns[name][there] for name in ("red", "green", "blue")], axis=1)
+    found: NDArray[Any] = np.stack(
+        [columns[name][there] for name in ("red", "green", "blue")], axis=1
+    )
     if found.dtype.kind == "f":  # 0 to 1
         if found.size and not (found.min() >= 0 and found.max() <= 1):
             raise BadTableError(
                 "colours of 0 to 1, or of 8 bits", f"{found.min()} to {found.max()}"
             )
-        return np.rint(found * 255).astype(np.uint8)
+        levels: NDArray[np.uint8] = np.rint(found * 255).astype(np.uint8)
+        return levels
     if found.dtype != np.uint8:
         raise BadTableError("colours of 0 to 1, or of 8 bits", f"{found.dtype}")
     return np.asarray(found, np.uint8)

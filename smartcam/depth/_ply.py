@@ -52,7 +52,7 @@ ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": 
 
 
 @dataclass(slots=True)
-class _Element:
+class _PlyElement:
     """What a header says of rows of one kind."""
 
     name: str
@@ -86,13 +86,13 @@ def read(data: bytes) -> dict[str, NDArray[Any]]:
     return dict(zip(row.names or (), columns, strict=True))
 
 
-def _header(data: bytes) -> tuple[str, list[_Element], int]:
+def _header(data: bytes) -> tuple[str, list[_PlyElement], int]:
     """Return the bytes' order (empty for text), the elements, and where the rows begin."""
     line, place = header_line(data, 0) if data.startswith(b"ply") else ("", 0)
     if line.rstrip() != "ply":
         raise BadTableError("a PLY file, which begins with ply", shown(data[:60]))
     order: str | None = None
-    elements: list[_Element] = []
+    elements: list[_PlyElement] = []
     while True:
         line, place = header_line(data, place)
         match line.split():
@@ -103,7 +103,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             case ["format", name, "1.0"] if name in ORDERS and order is None:
                 order = ORDERS[name]
             case ["element", name, count] if len(elements) < MAX_FIELDS:
-                elements.append(_Element(name, count_of(count, "rows")))
+                elements.append(_PlyElement(name, count_of(count, "rows")))
             case ["property", "list", size, kind, _] if elements and {size, kind} <= TYPES.keys():
                 elements[-1].lists = True
             case ["property", kind, name] if elements and kind in TYPES:
@@ -115,14 +115,14 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
     return order, elements, place
 
 
-def _add(element: _Element, name: str, kind: str) -> None:
+def _add(element: _PlyElement, name: str, kind: str) -> None:
     names = [one for one, _ in element.properties]
     if name in names or len(names) >= MAX_FIELDS:
         raise BadTableError(f"up to {MAX_FIELDS} properties, each once", f"{shown(name)} again")
     element.properties.append((name, kind))
 
 
-def _vertex(elements: list[_Element]) -> tuple[list[_Element], _Element]:
+def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
     """Return what comes before the vertices, and them."""
     for place, one in enumerate(elements):
         if one.name == "vertex":

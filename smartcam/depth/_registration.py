@@ -18,6 +18,8 @@ from smartcam.exceptions import ConfigurationError, MissingExtraError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from smartcam.depth._cloud import Cloud
+
     Array = NDArray[np.float64]
 
 METHODS: Final = {"gicp": "GICP", "icp": "ICP", "plane": "PLANE_ICP"}
@@ -78,7 +80,7 @@ class Registration:
     undetermined: Array
 
 
-class _Match(NamedTuple):
+class _Neighbours(NamedTuple):
     """What lies beside what, in target coordinates less the target's centre."""
 
     moved: Array  # (M, 3) of the source
@@ -204,20 +206,20 @@ def _aligned(
     return Transform(begin.target, begin.source, rotation, translation), ended
 
 
-def _matched(points: Array, tree: Any, pose: Transform, reach: float) -> _Match:
+def _matched(points: Array, tree: Any, pose: Transform, reach: float) -> _Neighbours:
     turned = points @ pose.rotation.T
     moved = turned + pose.translation
     distances, nearest = tree.query(moved, distance_upper_bound=reach)
     near = np.isfinite(distances)
     index = nearest[near]
-    return _Match(moved[near], index, tree.data[index] - moved[near], turned[near])
+    return _Neighbours(moved[near], index, tree.data[index] - moved[near], turned[near])
 
 
 def _judged(
     method: str,
     pose: Transform,
     ended: bool,
-    match: _Match,
+    match: _Neighbours,
     count: int,
     goals: Array,
     tree: Any,

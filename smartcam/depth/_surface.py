@@ -24,7 +24,7 @@ cylinders and spheres leave open up to 11, since they are no planes; in a corner
 """
 
 
-class Planes(NamedTuple):
+class SurfacePlanes(NamedTuple):
     """The planes about points.
 
     Attributes:
@@ -37,21 +37,21 @@ class Planes(NamedTuple):
     along: Array
     tilts: Array
 
-    def taken(self, index: Any) -> Planes:
+    def taken(self, index: Any) -> SurfacePlanes:
         """Return some of them."""
-        return Planes(*(one[index] for one in self))
+        return SurfacePlanes(*(one[index] for one in self))
 
 
-def planes_of(points: Array, tree: Any, neighbours: int) -> Planes:
+def planes_of(points: Array, tree: Any, neighbours: int) -> SurfacePlanes:
     """Return the planes through each point's nearest, itself among them; ``tree``: of them all."""
     found = []
     for start in range(0, len(points), ROWS):
         _, index = tree.query(points[start : start + ROWS], k=neighbours)
         found.append(_fitted(points[index]))
-    return Planes(*(np.concatenate(one) for one in zip(*found, strict=True)))
+    return SurfacePlanes(*(np.concatenate(one) for one in zip(*found, strict=True)))
 
 
-def _fitted(groups: Array) -> Planes:
+def _fitted(groups: Array) -> SurfacePlanes:
     """Return planes through groups (N, K, 3) of points."""
     offsets = groups - groups.mean(axis=1, keepdims=True)
     spreads = np.einsum("nki,nkj->nij", offsets, offsets) / groups.shape[1]
@@ -60,7 +60,7 @@ def _fitted(groups: Array) -> Planes:
     # Source: Anderson, Asymptotic theory for principal component analysis (1963).
     apart = np.maximum((values[:, 1:] - values[:, :1]) ** 2, np.finfo(float).tiny)
     tilts = values[:, :1] * values[:, 1:] / (groups.shape[1] * apart)
-    return Planes(vectors[:, :, 0], vectors[:, :, 1:], np.clip(tilts, 0.0, 1.0))
+    return SurfacePlanes(vectors[:, :, 0], vectors[:, :, 1:], np.clip(tilts, 0.0, 1.0))
 
 
 def slopes(arms: Array, directions: Array) -> Array:
@@ -71,7 +71,7 @@ def slopes(arms: Array, directions: Array) -> Array:
     return np.concatenate([np.cross(arms, directions), directions], axis=1)
 
 
-def open_directions(arms: Array, planes: Planes) -> Array:
+def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     """Return the steps (K, 6), turn in radians and shift in metres, that planes leave open.
 
     ``arms`` (N, 3): of the points on the planes, from their centre, about which the steps turn.

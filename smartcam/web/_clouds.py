@@ -90,8 +90,8 @@ class CloudSite(Site):
             raise ConfigurationError(f"up: expected one of {', '.join(get_args(Up))}, got {up!r}")
         self.viewers: set[CloudViewer] = set()
         self._up = up
-        self._cloud: Cloud | None = None
-        self._number = 0
+        self._cloud: Cloud = Cloud(np.empty((0, 3)))
+        self._number = 0  # of the cloud; 0: there is none yet
         self._newer = asyncio.Event()
         self._threads: ThreadPoolExecutor | None = None
         self._packing: tuple[int, asyncio.Future[_Packed]] | None = None
@@ -141,7 +141,6 @@ class CloudSite(Site):
             await self._newer.wait()
         if self._packing is None or self._packing[0] != self._number:
             loop = asyncio.get_running_loop()
-            assert self._cloud is not None  # it has a number
             made = loop.run_in_executor(self._threads, packed, self._cloud)
             made.add_done_callback(_seen)
             self._packing = (self._number, made)
@@ -150,11 +149,10 @@ class CloudSite(Site):
 
     def state(self) -> dict[str, Any]:
         """Return what there is."""
-        cloud = self._cloud
         return {
             "number": self._number,
-            "points": None if cloud is None else len(cloud),
-            "colours": cloud is not None and cloud.colours is not None,
+            "points": len(self._cloud),
+            "colours": self._cloud.colours is not None,
             "up": self._up,
             "viewers": len(self.viewers),
         }

@@ -40,7 +40,8 @@ def room(rng: np.random.Generator, count: int) -> Array:
     """Return three walls, a hand's breadth from their corner, away from the origin."""
     points = 0.1 + 0.9 * rng.random((count, 3))
     points[np.arange(count), rng.integers(0, 3, count)] = 0
-    return points + np.array([1, 0, 2])
+    points += [1, 0, 2]
+    return points
 
 
 def edge(rng: np.random.Generator, count: int) -> Array:
@@ -56,7 +57,9 @@ def cylinder(rng: np.random.Generator, count: int) -> Array:
 
 def ball(rng: np.random.Generator, count: int) -> Array:
     points = rng.normal(size=(count, 3))
-    return 0.3 * points / np.linalg.norm(points, axis=1, keepdims=True) + np.array([0, 0, 2])
+    points *= 0.3 / np.linalg.norm(points, axis=1, keepdims=True)
+    points += [0, 0, 2]
+    return points
 
 
 def pair(shape: Shape, seed: int, noise: float = NOISE, count: int = 3000) -> tuple[Cloud, Cloud]:
