@@ -101,6 +101,7 @@ def test_show_ends_after_its_seconds(ply: str) -> None:
     assert (told["file"], told["points"]) == (ply, 903)
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_show_serves_until_it_is_interrupted(ply: str) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra web")
