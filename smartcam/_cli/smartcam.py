@@ -14,6 +14,7 @@ import smartcam
 from smartcam._cli import demo, demo_fleet, demo_pick
 from smartcam._cli.calibrate import calibrate
 from smartcam._cli.decode import decode, from_hex
+from smartcam._cli.depth import depth
 from smartcam._cli.dissector import dissector
 from smartcam._cli.doctor import doctor
 from smartcam._cli.fleet import fleet
@@ -60,7 +61,7 @@ EPILOG = (
 TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
     "A fleet": ("serve", "fleet"),
-    "Pictures": ("frames",),
+    "Pictures": ("frames", "depth"),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
     "Recordings": ("record", "replay", "pcap", "dissector"),
@@ -306,7 +307,7 @@ async def demo_command(pick: bool, shared: bool, picture: str, seed: int, option
 
 for _one in (
     *(live, probe, doctor, image, decode, calibrate, sheet),
-    *(record, replay, pcap, dissector, serve, fleet, frames),
+    *(record, replay, pcap, dissector, serve, fleet, frames, depth),
 ):
     command.add_command(_one)
 

@@ -1,0 +1,171 @@
+"""``smartcam depth``: clouds of points, shown and converted."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.page import PageOptions, page_options
+from smartcam._cli.running import JsonErrors
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.depth import Cloud
+    from smartcam.web._clouds import Up
+
+UP = ("x", "y", "z", "-x", "-y", "-z")
+"""What may point upwards on the page."""
+
+
+class DepthCommands(JsonErrors, click.Group):
+    """Its commands tell a wrong use as JSON, too."""
+
+
+def _ranges(
+    _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
+) -> list[tuple[str, float, float]]:
+    """Return axis, low and high of ``AXIS:LOW:HIGH``; a limit that is left out is none."""
+    found = []
+    for value in values:
+        axis, _, limits = value.partition(":")
+        low, colon, high = limits.partition(":")
+        try:
+            ends = (float(low or "-inf"), float(high or "inf"))
+        except ValueError:
+            ends = (math.nan, math.nan)
+        if axis not in ("x", "y", "z") or not colon or not ends[0] <= ends[1]:
+            raise click.BadParameter(f"expected AXIS:LOW:HIGH, such as z:0.2:1.5, got {value!r}")
+        found.append((axis, *ends))
+    return found
+
+
+@click.group(
+    cls=DepthCommands,
+    help="Clouds of points, as .ply and .pcd files: shown on a page, filtered, converted. Needs "
+    'the extra "depth".',
+)
+def depth() -> None:
+    """Have the commands of depth."""
+
+
+# ---------------------------------------------------------------------- show
+
+
+@depth.command(
+    help="Serve a page that shows a cloud until Ctrl-C: turn it with mouse or finger, zoom with "
+    "wheel or two fingers. The page's address goes to stdout. Above a million points it is thinned "
+    'for the page, which says so. Needs the extra "web".'
+)
+@click.argument("file")
+@click.option(
+    "--up",
+    type=click.Choice(UP),
+    default="z",
+    show_default=True,
+    help="The axis that points up; -y in the frame of a level camera.",
+)
+@page_options("", always=True)
+@option("--seconds")
+@runs(*OUTPUT)
+async def show(file: str, up: Up, web: PageOptions, options: Options) -> None:
+    from smartcam.depth import load_cloud
+    from smartcam.web import CloudSite
+
+    cloud = await asyncio.to_thread(load_cloud, file)
+    async with CloudSite(cloud, up=up, **web.place) as site:
+        options.show(
+            {"page": site.url, "file": file, "points": len(cloud)},
+            f"page: {site.url}\n  {file}: {len(cloud):,} points",
+        )
+        try:
+            async with asyncio.timeout(options.seconds):
+                await asyncio.Event().wait()
+        except TimeoutError:
+            pass  # --seconds are over
+
+
+# ---------------------------------------------------------------------- convert
+
+
+@depth.command(
+    help="Write a cloud as another file, .ply or .pcd. What is filtered out goes in this order: "
+    "ranges, outliers, then one point for each voxel."
+)
+@click.argument("source")
+@click.argument("target")
+@click.option(
+    "--pass",
+    "ranges",
+    metavar="AXIS:LOW:HIGH",
+    callback=_ranges,
+    multiple=True,
+    help="Keep the points of a range in metres, such as z:0.2:1.5, z:0.2: or z::1.5. May be given "
+    "more than once.",
+)
+@click.option(
+    "--outliers",
+    is_flag=True,
+    help="Leave out the points whose 20 nearest are farther away than most points' are: above the "
+    "mean by two standard deviations.",
+)
+@click.option(
+    "--voxel",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="METRES",
+    help="One point for each cube of this size.",
+)
+@click.option("--text", is_flag=True, help="Numbers as text in place of bytes.")
+@click.option("--force", is_flag=True, help="Take the place of a file that is there.")
+@runs(*OUTPUT)
+async def convert(
+    source: str,
+    target: str,
+    ranges: Sequence[tuple[str, float, float]],
+    outliers: bool,
+    voxel: float | None,
+    text: bool,
+    force: bool,
+    options: Options,
+) -> None:
+    from smartcam.depth import (
+        load_cloud,
+        pass_through,
+        remove_statistical_outliers,
+        save_cloud,
+        voxel_grid,
+    )
+
+    def work() -> tuple[int, Cloud]:
+        if Path(target).exists() and not force:
+            raise ConfigurationError(
+                f"{target}: the file is there already; --force takes its place"
+            )
+        cloud = load_cloud(source)
+        before = len(cloud)
+        for axis, low, high in ranges:
+            cloud = pass_through(cloud, axis, low, high)
+        if outliers:
+            cloud = remove_statistical_outliers(cloud)
+        if voxel is not None:
+            cloud = voxel_grid(cloud, voxel)
+        save_cloud(target, cloud, text=text)
+        return before, cloud
+
+    before, cloud = await asyncio.to_thread(work)
+    options.show(
+        {
+            "file": target,
+            "points": len(cloud),
+            "of": before,
+            "colours": cloud.colours is not None,
+            "sigma": cloud.sigma is not None,
+        },
+        f"{target}: {len(cloud):,} of {before:,} points",
+    )

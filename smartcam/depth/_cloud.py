@@ -1,0 +1,229 @@
+"""A cloud: points in metres, with colours and with what each is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from smartcam.calibration import Transform
+
+_NUMBERS = "fiu"
+"""Kinds of numpy's numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points in metres.
+
+    The arrays are read-only. What is float32 (or uint8) already is not copied: who gave it must
+    not write into it any longer.
+
+    Attributes:
+        points: (N, 3) float32, metres, all finite.
+        colours: (N, 3) uint8, red, green, blue; None without.
+        sigma: (N,) float32, metres, standard deviations along the ray on which each point was
+            seen; None where nobody said.
+
+    Raises:
+        ConfigurationError: other shapes, no numbers, a point that is not finite, a sigma below 0.
+    """
+
+    points: NDArray[Any]
+    colours: NDArray[Any] | None = None
+    sigma: NDArray[Any] | None = None
+
+    def __post_init__(self) -> None:
+        """Check, and take read-only views."""
+        points = _floats(self.points, "points", (None, 3))
+        object.__setattr__(self, "points", points)
+        count = len(points)
+        if self.colours is not None:
+            colours = _bytes(self.colours, "colours", (count, 3))
+            object.__setattr__(self, "colours", colours)
+        if self.sigma is not None:
+            sigma = _floats(self.sigma, "sigma", (count,))
+            if count and sigma.min() < 0:
+                raise ConfigurationError(f"sigma: expected 0 or more, got {sigma.min():g}")
+            object.__setattr__(self, "sigma", sigma)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Be the same in another process: read-only, too."""
+        return type(self), (self.points, self.colours, self.sigma)
+
+    def __len__(self) -> int:
+        """How many points there are."""
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        """Say how many there are, and with what."""
+        more = [name for name in ("colours", "sigma") if getattr(self, name) is not None]
+        return f"<Cloud of {len(self):,} points{''.join(f', {name}' for name in more)}>"
+
+    @classmethod
+    def from_depth(
+        cls,
+        depth: ArrayLike,
+        matrix: ArrayLike,
+        colours: ArrayLike | None = None,
+        sigma: ArrayLike | None = None,
+    ) -> Self:
+        """Return the points of a depth picture, row by row, in the camera's frame.
+
+        Args:
+            depth: (H, W) metres along the optical axis; 0 is none, and gives no point.
+            matrix: (3, 3), of a camera without distortion, in pixels; the centre of the first
+                pixel is (0, 0).
+            colours: (H, W, 3) uint8, red, green, blue; or (H, W) uint8, grey.
+            sigma: (H, W) metres, of the depth along the optical axis. A point's is that along its
+                ray, which is longer off the axis.
+
+        Raises:
+            ConfigurationError: other shapes, a depth that is below 0 or not finite, no matrix of
+                a camera, or depth, colours and sigma are not of one size.
+        """
+        metres = _floats(depth, "depth", (None, None))
+        if metres.size and metres.min() < 0:
+            raise ConfigurationError(
+                f"depth: expected metres, 0 for none; got {metres.min():g} at its lowest"
+            )
+        inverse = _inverse(matrix)
+        rows, columns = np.nonzero(metres)
+        along = metres[rows, columns].astype(np.float64)
+        pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
+        rays = pixels @ inverse.T  # whose z is 1
+        picked = spread = None
+        if colours is not None:
+            picture = _picture(colours, metres.shape)
+            picked = picture[rows, columns]
+        if sigma is not None:
+            lengths = np.linalg.norm(rays, axis=1)
+            spread = _floats(sigma, "sigma", metres.shape)[rows, columns] * lengths
+        return cls(_as(rays * along[:, None]), picked, None if spread is None else _as(spread))
+
+    @classmethod
+    def joined(cls, clouds: Iterable[Cloud]) -> Self:
+        """Return clouds of one frame as one, in their order.
+
+        Raises:
+            ConfigurationError: some have colours, or sigma, and others have none.
+        """
+        parts = list(clouds)
+        columns: dict[str, NDArray[Any] | None] = {}
+        for name in ("colours", "sigma"):
+            found = [part for one in parts if (part := getattr(one, name)) is not None]
+            if found and len(found) < len(parts):
+                raise ConfigurationError(
+                    f"joined: expected all clouds with {name} or none, "
+                    f"got {len(found)} of {len(parts)}"
+                )
+            columns[name] = np.concatenate(found) if found else None
+        points = [np.empty((0, 3), np.float32), *(one.points for one in parts)]
+        return cls(np.concatenate(points), **columns)
+
+    def transformed(self, pose: Transform) -> Self:
+        """Return it in the frame that a rigid motion leads to.
+
+        ``pose`` is a :class:`~smartcam.calibration.Transform`: ``T_robot_camera`` takes a cloud of
+        the camera to the robot. Sigma stays: the points lie along other axes, as far off as before.
+
+        Raises:
+            ConfigurationError: no rigid motion, or it leads out of float32's range.
+        """
+        motion = getattr(pose, "rigid", None)
+        if motion is None:
+            raise ConfigurationError(
+                f"transformed: expected a Transform, got {type(pose).__name__}"
+            )
+        moved = motion.apply(self.points.astype(np.float64))
+        return type(self)(_as(moved), self.colours, self.sigma)
+
+    def taken(self, index: NDArray[Any]) -> Self:
+        """Return some of the points, by a mask (N,) or by their places, in that order."""
+        return type(self)(
+            self.points[index],
+            None if self.colours is None else self.colours[index],
+            None if self.sigma is None else self.sigma[index],
+        )
+
+
+def _as(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Return as float32; what is too large is infinite then, which a cloud refuses."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
+def _shape(values: NDArray[Any], what: str, shape: tuple[int | None, ...]) -> None:
+    fits = len(values.shape) == len(shape) and all(
+        want is None or got == want for got, want in zip(values.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = ", ".join("any" if one is None else str(one) for one in shape)
+        raise ConfigurationError(f"{what}: expected the shape ({wanted}), got {values.shape}")
+
+
+def _floats(given: ArrayLike, what: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+    """Return a read-only view as float32, all finite; else ConfigurationError."""
+    values = _array(given, what)
+    if values.dtype.kind not in _NUMBERS:
+        raise ConfigurationError(f"{what}: expected numbers, got {values.dtype}")
+    _shape(values, what, shape)
+    with np.errstate(over="ignore"):
+        floats = np.ascontiguousarray(values, np.float32).view()
+    if not np.isfinite(floats).all():
+        wrong = int(np.count_nonzero(~np.isfinite(floats)))
+        raise ConfigurationError(
+            f"{what}: expected finite float32 values, got {wrong} that are not"
+        )
+    floats.flags.writeable = False
+    return floats
+
+
+def _bytes(given: ArrayLike, what: str, shape: tuple[int | None, ...]) -> NDArray[np.uint8]:
+    values = _array(given, what)
+    if values.dtype != np.uint8:
+        raise ConfigurationError(f"{what}: expected uint8, got {values.dtype}")
+    _shape(values, what, shape)
+    view = np.ascontiguousarray(values).view()
+    view.flags.writeable = False
+    return view
+
+
+def _array(given: ArrayLike, what: str) -> NDArray[Any]:
+    try:
+        return np.asarray(given)
+    except (TypeError, ValueError) as exc:
+        raise ConfigurationError(f"{what}: expected an array, got {type(given).__name__}") from exc
+
+
+def _picture(given: ArrayLike, size: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return colours (H, W, 3) of colours or grey."""
+    values = _array(given, "colours")
+    if values.ndim == 2:
+        grey = _bytes(values, "colours", size)
+        return np.broadcast_to(grey[..., None], (*size, 3))
+    return _bytes(values, "colours", (*size, 3))
+
+
+def _inverse(given: ArrayLike) -> NDArray[np.float64]:
+    """Return what makes rays with z = 1 of pixels."""
+    matrix = _array(given, "matrix")
+    _shape(matrix, "matrix", (3, 3))
+    if matrix.dtype.kind not in _NUMBERS or not np.isfinite(matrix).all():
+        raise ConfigurationError(f"matrix: expected finite numbers, got {matrix.tolist()}")
+    low = np.array([[False] * 3, [True, False, False], [True, True, False]])
+    upper = not matrix[low].any() and matrix[2, 2] == 1
+    if not upper or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise ConfigurationError(
+            "matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0, "
+            f"got {matrix.tolist()}"
+        )
+    return np.asarray(np.linalg.inv(matrix.astype(np.float64)), np.float64)

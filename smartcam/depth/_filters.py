@@ -1,0 +1,174 @@
+"""What is left of a cloud: by place, by how many neighbours, by one point a voxel."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+from smartcam.depth._cloud import Cloud
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+AXES: Final = "xyz"
+
+ROWS: Final = 1 << 17
+"""Points whose neighbours are looked for at a time: what they need is memory."""
+
+MOST_NEIGHBOURS: Final = 1000
+
+
+def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = math.inf) -> Cloud:
+    """Return the points with ``low <= coordinate <= high``, in metres.
+
+    Raises:
+        ConfigurationError: the axis is none of x, y, z, or the range is none.
+    """
+    if axis not in AXES or len(axis) != 1:
+        raise ConfigurationError(f"pass_through: expected x, y or z, got {axis!r}")
+    if not low <= high:
+        raise ConfigurationError(f"pass_through: expected low <= high, got {low!r} and {high!r}")
+    along = cloud.points[:, AXES.index(axis)]
+    return cloud.taken((along >= np.float64(low)) & (along <= np.float64(high)))
+
+
+def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud:
+    """Return the points in a box along the axes between two corners (3,), metres, both included.
+
+    Raises:
+        ConfigurationError: the corners are not (3,), or one is not below the other.
+    """
+    corners = [np.asarray(one, np.float64) for one in (low, high)]
+    if any(one.shape != (3,) for one in corners) or not (corners[0] <= corners[1]).all():
+        raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
+    inside = np.all((cloud.points >= corners[0]) & (cloud.points <= corners[1]), axis=1)
+    return cloud.taken(np.asarray(inside))
+
+
+def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
+    """Return the points that are about as near to others as most are.
+
+    Each point's mean distance to its ``neighbours`` nearest is compared with the mean of all those
+    distances: it stays up to ``ratio`` standard deviations above. A cloud without points stays.
+
+    Raises:
+        ConfigurationError: ``neighbours`` is not 1 to 1000, or not below the number of points; or
+            the ratio is below 0.
+        MissingExtraError: SciPy is not installed.
+    """
+    _check_count(neighbours, "remove_statistical_outliers")
+    if not ratio >= 0:
+        raise ConfigurationError(
+            f"remove_statistical_outliers: ratio: expected 0 or more, got {ratio!r}"
+        )
+    if not len(cloud):
+        return cloud
+    if len(cloud) <= neighbours:
+        raise ConfigurationError(
+            f"remove_statistical_outliers: expected more than {neighbours} points, got {len(cloud)}"
+        )
+    tree = load("scipy.spatial").cKDTree(cloud.points)
+    means = np.empty(len(cloud))
+    for part in _parts(len(cloud)):
+        # The nearest is the point itself, or one at the same place, which is as good.
+        distances, _ = tree.query(cloud.points[part], k=neighbours + 1)
+        means[part] = distances[:, 1:].mean(axis=1)
+    return cloud.taken(means <= means.mean() + ratio * means.std(ddof=1 if len(means) > 1 else 0))
+
+
+def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> Cloud:
+    """Return the points with so many others, or more, within a radius in metres.
+
+    Raises:
+        ConfigurationError: the radius is not above 0, or ``neighbours`` is not 1 to 1000.
+        MissingExtraError: SciPy is not installed.
+    """
+    _check_count(neighbours, "remove_radius_outliers")
+    _check_length(radius, "remove_radius_outliers: radius")
+    if len(cloud) <= neighbours:
+        return cloud.taken(np.zeros(len(cloud), bool))
+    tree = load("scipy.spatial").cKDTree(cloud.points)
+    kept = np.empty(len(cloud), bool)
+    for part in _parts(len(cloud)):
+        # The farthest of them is within the radius, or not: no list of all that are.
+        distances, _ = tree.query(cloud.points[part], k=[neighbours + 1])
+        kept[part] = distances[:, 0] <= radius
+    return cloud.taken(kept)
+
+
+def voxel_grid(cloud: Cloud, size: float) -> Cloud:
+    """Return one point a voxel: the mean of the points in it, with their mean colour.
+
+    Voxels are cubes of ``size`` metres, with a corner at the origin: the same place is the same
+    voxel in every cloud. They come by x, then y, then z. Their sigma is the root mean square of
+    the points': depth errs alike in neighbours, so that a mean of them is hardly better.
+
+    Raises:
+        ConfigurationError: the size is not above 0, or so small that the voxels cannot be counted.
+    """
+    _check_length(size, "voxel_grid: size")
+    if not len(cloud):
+        return cloud
+    keys = _voxels(cloud, size)
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+    counts = np.diff(np.append(first, len(keys)))
+
+    def means(values: NDArray[Any]) -> NDArray[np.float64]:
+        sums: NDArray[np.float64] = np.add.reduceat(values[order].astype(np.float64), first)
+        return sums / counts
+
+    def columns(values: NDArray[Any]) -> NDArray[np.float64]:
+        return np.stack([means(one) for one in values.T], axis=1)
+
+    colours = cloud.colours
+    return Cloud(
+        columns(cloud.points).astype(np.float32),
+        None if colours is None else np.rint(columns(colours)).astype(np.uint8),
+        None
+        if cloud.sigma is None
+        else np.sqrt(means(cloud.sigma.astype(np.float64) ** 2)).astype(np.float32),
+    )
+
+
+def _voxels(cloud: Cloud, size: float) -> NDArray[np.int64]:
+    """Return the number of each point's voxel, one number for one voxel."""
+    low = np.floor(cloud.points.min(axis=0).astype(np.float64) / size)
+    high = np.floor(cloud.points.max(axis=0).astype(np.float64) / size)
+    spans = high - low + 1
+    if not np.prod(spans) < 2**62 or np.abs([low, high]).max() > 2**52:
+        extent = np.ptp(cloud.points, axis=0).tolist()
+        raise ConfigurationError(
+            f"voxel_grid: expected voxels of which there are fewer than 2**62, got {size:g} m in a "
+            f"cloud of {extent} m"
+        )
+    numbers = np.zeros(len(cloud), np.int64)
+    for axis, span in enumerate(spans.astype(np.int64)):
+        numbers *= span
+        column = cloud.points[:, axis].astype(np.float64)
+        numbers += (np.floor(column / size) - low[axis]).astype(np.int64)
+    return numbers
+
+
+def _parts(count: int) -> Iterator[slice]:
+    for start in range(0, count, ROWS):
+        yield slice(start, min(start + ROWS, count))
+
+
+def _check_count(value: int, what: str) -> None:
+    if not isinstance(value, int) or not 1 <= value <= MOST_NEIGHBOURS:
+        raise ConfigurationError(
+            f"{what}: neighbours: expected 1 to {MOST_NEIGHBOURS}, got {value!r}"
+        )
+
+
+def _check_length(value: float, what: str) -> None:
+    if not 0 < value < math.inf:
+        raise ConfigurationError(f"{what}: expected metres above 0, got {value!r}")

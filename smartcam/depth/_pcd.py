@@ -1,0 +1,230 @@
+"""PCD files, version 0.7: what PCL and others write, and our own.
+
+Source: the Point Cloud Library's document of the PCD file format; for the compression, Marc
+Lehmann's LibLZF 3.6.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.depth._tables import (
+    MAX_FIELDS,
+    BadTableError,
+    check_row,
+    count_of,
+    from_bytes,
+    from_text,
+    header_line,
+    shown,
+    to_bytes,
+    to_text,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.depth._cloud import Cloud
+
+TYPES: Final = {
+    **{("I", size): f"<i{size}" for size in (1, 2, 4, 8)},
+    **{("U", size): f"<u{size}" for size in (1, 2, 4, 8)},
+    **{("F", size): f"<f{size}" for size in (4, 8)},
+}
+"""numpy's of a TYPE and a SIZE."""
+
+COLOURS: Final = ("rgb", "rgba")
+"""Fields of 4 bytes that are a colour, blue in the lowest byte; as a float its bits are meant."""
+
+PADDING: Final = "_"
+"""Name of what nobody reads; it may come more than once."""
+
+
+@dataclass(frozen=True, slots=True)
+class _PcdHeader:
+    names: Sequence[str]
+    types: Sequence[str]  # numpy's
+    counts: Sequence[int]  # numbers of each
+    points: int
+    data: str  # ascii, binary, binary_compressed
+    start: int  # where the rows begin
+
+
+def read(data: bytes) -> dict[str, NDArray[Any]]:
+    """Return the columns of a file's points; else BadTableError."""
+    head = _header(data)
+    columns = READERS[head.data](data, head)
+    for name in COLOURS:
+        if name in columns and columns[name].dtype.itemsize == 4:
+            packed = columns[name].view(np.uint32)
+            for shift, part in ((16, "red"), (8, "green"), (0, "blue")):
+                columns[part] = (packed >> shift & 0xFF).astype(np.uint8)
+            break
+    return columns
+
+
+def _header(data: bytes) -> _PcdHeader:
+    lines: dict[str, list[str]] = {}
+    place = 0
+    while "DATA" not in lines:
+        line, place = header_line(data, place)
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if words[0] not in KNOWN or words[0] in lines:
+            raise BadTableError(f"a PCD file's {', '.join(KNOWN)}, each once", shown(line))
+        lines[words[0]] = words[1:]
+    if lines.get("VERSION") not in (["0.7"], [".7"]):
+        raise BadTableError("VERSION 0.7", shown(" ".join(lines.get("VERSION", ["none"]))))
+    names = lines.get("FIELDS", [])
+    sizes, kinds, counts = (
+        lines.get(name, default)
+        for name, default in (("SIZE", []), ("TYPE", []), ("COUNT", ["1"] * len(names)))
+    )
+    if not 0 < len(names) <= MAX_FIELDS or {len(sizes), len(kinds), len(counts)} != {len(names)}:
+        raise BadTableError(
+            f"up to {MAX_FIELDS} FIELDS, with SIZE, TYPE and COUNT of each",
+            f"{len(names)}, {len(sizes)}, {len(kinds)} and {len(counts)}",
+        )
+    named = [name for name in names if name != PADDING]
+    if len(set(named)) < len(named):
+        raise BadTableError("each of the FIELDS once", shown(" ".join(names)))
+    types = []
+    for kind, size in zip(kinds, sizes, strict=True):
+        found = TYPES.get((kind, count_of(size, "bytes")))
+        if found is None:
+            raise BadTableError("I or U of 1, 2, 4 or 8, or F of 4 or 8 bytes", shown(kind + size))
+        types.append(found)
+    width, height, points = (_one(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
+    if width * height != points:
+        raise BadTableError("WIDTH times HEIGHT POINTS", f"{width}, {height} and {points}")
+    if lines["DATA"] not in [[one] for one in READERS]:
+        raise BadTableError(f"DATA {', '.join(READERS)}", shown(" ".join(lines["DATA"])))
+    many = [count_of(one, "numbers") for one in counts]
+    if max(many) > MAX_FIELDS or min(many) < 1:
+        raise BadTableError(f"COUNT from 1 to {MAX_FIELDS}", f"{min(many)} to {max(many)}")
+    return _PcdHeader(names, types, many, points, lines["DATA"][0], place)
+
+
+def _one(lines: Mapping[str, list[str]], name: str) -> int:
+    words = lines.get(name, [])
+    if len(words) != 1:
+        raise BadTableError(f"{name} and a number", shown(" ".join(words)))
+    return count_of(words[0], name.lower())
+
+
+def _row(head: _PcdHeader) -> np.dtype[Any]:
+    """Return the rows' type, whose fields are numbered: the names may come twice."""
+    fields = zip(head.types, head.counts, strict=True)
+    row = np.dtype([(str(place), kind, (count,)) for place, (kind, count) in enumerate(fields)])
+    check_row(row)
+    return row
+
+
+def _binary(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
+    rows = from_bytes(data, head.start, head.points, _row(head))
+    return {
+        name: rows[str(place)][:, 0].copy()
+        for place, (name, count) in enumerate(zip(head.names, head.counts, strict=True))
+        if count == 1 and name != PADDING
+    }
+
+
+def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
+    """Return columns that come one after the other, and compressed."""
+    size = head.points * _row(head).itemsize
+    if len(data) < head.start + 8:
+        raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
+    packed, whole = struct.unpack_from("<II", data, head.start)
+    if whole != size or packed > len(data) - head.start - 8:
+        raise BadTableError(
+            f"up to {len(data) - head.start - 8} bytes that unpack to {size}",
+            f"{packed} that unpack to {whole}",
+        )
+    columns, place = {}, 0
+    body = unpacked(data[head.start + 8 : head.start + 8 + packed], size)
+    for name, kind, count in zip(head.names, head.types, head.counts, strict=True):
+        many = count * head.points
+        if count == 1 and name != PADDING:
+            columns[name] = np.frombuffer(body, kind, many, place).copy()
+        place += many * np.dtype(kind).itemsize
+    return columns
+
+
+def unpacked(data: bytes, size: int) -> bytes:
+    """Return what LZF packed, which must be of a size; else BadTableError."""
+    out, place, end = bytearray(), 0, len(data)
+    while place < end and len(out) <= size:
+        control, place = data[place], place + 1
+        if control < 32:  # so many bytes and one as they are
+            out += data[place : place + control + 1]
+            place += control + 1
+            continue
+        length = control >> 5
+        if length == 7 and place < end:  # a longer one
+            length, place = length + data[place], place + 1
+        if place >= end:
+            break
+        back, place = ((control & 31) << 8 | data[place]) + 1, place + 1
+        begin = len(out) - back
+        if begin < 0:
+            raise BadTableError("a place in what is unpacked", f"{-begin} bytes before it")
+        length += 2
+        part = out[begin : begin + length]  # which may reach into what it makes
+        out += (part * (length // len(part) + 1))[:length]
+    if len(out) != size or place != end:
+        raise BadTableError(f"{end} bytes that unpack to {size}", f"{place} to {len(out)}")
+    return bytes(out)
+
+
+def _text(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
+    types, names = [], []
+    for name, kind, count in zip(head.names, head.types, head.counts, strict=True):
+        types += [np.dtype(kind)] * count
+        names += [name if count == 1 else PADDING] * count
+    columns = from_text(data, head.start, 0, head.points, types)
+    pairs = zip(names, columns, strict=True)
+    return {name: column for name, column in pairs if name != PADDING}
+
+
+READERS: Final = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}
+"""By DATA."""
+
+KNOWN: Final = (
+    *("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT"),
+    *("WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"),
+)
+
+
+def write(cloud: Cloud, text: bool) -> bytes:
+    """Return a cloud as a file, as PCL has them: colours as a float's bits, in text as a number."""
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.T, strict=True))
+    if cloud.colours is not None:
+        red, green, blue = cloud.colours.T.astype(np.uint32)
+        packed = red << 16 | green << 8 | blue
+        columns["rgb"] = packed if text else packed.view(np.float32)
+    if cloud.sigma is not None:
+        columns["sigma"] = cloud.sigma
+    row = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    kinds = ["F" if column.dtype.kind == "f" else "U" for column in columns.values()]
+    head = "\n".join(
+        [
+            "VERSION 0.7",
+            f"FIELDS {' '.join(columns)}",
+            f"SIZE {' '.join(['4'] * len(columns))}",
+            f"TYPE {' '.join(kinds)}",
+            f"COUNT {' '.join(['1'] * len(columns))}",
+            f"WIDTH {len(cloud)}",
+            "HEIGHT 1",
+            "VIEWPOINT 0 0 0 1 0 0 0",
+            f"POINTS {len(cloud)}",
+            f"DATA {'ascii' if text else 'binary'}\n",
+        ]
+    ).encode("ascii")
+    return head + (to_text(columns.values()) if text else to_bytes(columns, row))

@@ -1,0 +1,156 @@
+"""PLY files: the vertices of what others write, and our own.
+
+Source: Greg Turk, The PLY Polygon File Format (1994).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.depth._tables import (
+    MAX_FIELDS,
+    BadTableError,
+    check_row,
+    count_of,
+    from_bytes,
+    from_text,
+    header_line,
+    shown,
+    to_bytes,
+    to_text,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.depth._cloud import Cloud
+
+TYPES: Final = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+"""The document's names, and those that others write."""
+
+ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(slots=True)
+class _PlyElement:
+    """What a header says of rows of one kind."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]] = field(default_factory=list)  # name and numpy's type
+    lists: bool = False  # whether its rows are of any length
+
+    def row(self, order: str) -> np.dtype[Any]:
+        """Return the rows' type."""
+        if self.lists or not self.properties:
+            raise BadTableError(
+                f"rows of numbers for {self.name}", "lists" if self.lists else "none"
+            )
+        row = np.dtype([(name, (order or "<") + kind) for name, kind in self.properties])
+        check_row(row)
+        return row
+
+
+def read(data: bytes) -> dict[str, NDArray[Any]]:
+    """Return the columns of a file's vertices; else BadTableError."""
+    order, elements, start = _header(data)
+    before, vertex = _vertex(elements)
+    row = vertex.row(order)
+    if order:
+        for one in before:
+            start += one.count * one.row(order).itemsize if one.count else 0
+        rows = from_bytes(data, start, vertex.count, row)
+        return {name: rows[name].astype(kind) for name, kind in vertex.properties}
+    types = [np.dtype(kind) for _, kind in vertex.properties]
+    columns = from_text(data, start, sum(one.count for one in before), vertex.count, types)
+    return dict(zip(row.names or (), columns, strict=True))
+
+
+def _header(data: bytes) -> tuple[str, list[_PlyElement], int]:
+    """Return the bytes' order (empty for text), the elements, and where the rows begin."""
+    line, place = header_line(data, 0) if data.startswith(b"ply") else ("", 0)
+    if line.rstrip() != "ply":
+        raise BadTableError("a PLY file, which begins with ply", shown(data[:60]))
+    order: str | None = None
+    elements: list[_PlyElement] = []
+    while True:
+        line, place = header_line(data, place)
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["end_header"]:
+                break
+            case ["format", name, "1.0"] if name in ORDERS and order is None:
+                order = ORDERS[name]
+            case ["element", name, count] if len(elements) < MAX_FIELDS:
+                elements.append(_PlyElement(name, count_of(count, "rows")))
+            case ["property", "list", size, kind, _] if elements and {size, kind} <= TYPES.keys():
+                elements[-1].lists = True
+            case ["property", kind, name] if elements and kind in TYPES:
+                _add(elements[-1], name, TYPES[kind])
+            case _:
+                raise BadTableError("a line of a PLY header", shown(line))
+    if order is None:
+        raise BadTableError(f"a format of {', '.join(ORDERS)}", "none")
+    return order, elements, place
+
+
+def _add(element: _PlyElement, name: str, kind: str) -> None:
+    names = [one for one, _ in element.properties]
+    if name in names or len(names) >= MAX_FIELDS:
+        raise BadTableError(f"up to {MAX_FIELDS} properties, each once", f"{shown(name)} again")
+    element.properties.append((name, kind))
+
+
+def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
+    """Return what comes before the vertices, and them."""
+    for place, one in enumerate(elements):
+        if one.name == "vertex":
+            return elements[:place], one
+    found = ", ".join(shown(one.name) for one in elements) or "none"
+    raise BadTableError("an element vertex", found)
+
+
+def write(cloud: Cloud, text: bool) -> bytes:
+    """Return a cloud as a file."""
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.T, strict=True))
+    names = dict.fromkeys("xyz", "float")
+    if cloud.colours is not None:
+        columns |= dict(zip(("red", "green", "blue"), cloud.colours.T, strict=True))
+        names |= dict.fromkeys(("red", "green", "blue"), "uchar")
+    if cloud.sigma is not None:
+        columns["sigma"] = cloud.sigma
+        names["sigma"] = "float"
+    head = "\n".join(
+        [
+            "ply",
+            f"format {'ascii' if text else 'binary_little_endian'} 1.0",
+            f"element vertex {len(cloud)}",
+            *(f"property {kind} {name}" for name, kind in names.items()),
+            "end_header\n",
+        ]
+    ).encode("ascii")
+    if text:
+        return head + to_text(columns.values())
+    row = np.dtype([(name, "<" + TYPES[kind]) for name, kind in names.items()])
+    return head + to_bytes(columns, row)

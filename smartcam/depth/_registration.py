@@ -1,0 +1,293 @@
+"""Where one cloud lies in another: ICP by small-gicp, with what it is worth."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration import Transform
+from smartcam.calibration._optional_imports import load
+from smartcam.depth._filters import voxel_grid
+from smartcam.depth._surface import open_directions, planes_of, slopes
+from smartcam.exceptions import ConfigurationError, MissingExtraError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.depth._cloud import Cloud
+
+    Array = NDArray[np.float64]
+
+METHODS: Final = {"gicp": "GICP", "icp": "ICP", "plane": "PLANE_ICP"}
+"""What small-gicp calls each."""
+
+NEIGHBOURS: Final = 20
+"""Points to which the plane about each is fitted."""
+
+MOST_STEPS: Final = 60
+MORE_STEPS: Final = 10
+"""What they may move a cloud after the others; they may well go to and fro between neighbours."""
+
+TURN_STEP: Final = 1e-5
+SHIFT_STEP: Final = 1e-4
+"""Steps that count as none: radians, and of ``max_distance``."""
+
+NEAR: Final = 5.0
+"""Of ``max_distance``: what is farther from the target at the beginning takes no part, since
+small-gicp looks very long for the neighbours of what is far away."""
+
+RESTLESS: Final = 1e-3
+"""Of ``max_distance``: what :data:`MORE_STEPS` move the points by, where the steps do not end."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Registration:
+    """Where the source lies in the target.
+
+    Look at ``converged`` before the pose is used: ``reason`` says what speaks against it.
+
+    Attributes:
+        pose: :class:`~smartcam.calibration.Transform`, from source to target.
+        converged: the steps ended, enough of the source lies on the target, and every direction
+            is determined.
+        reason: why not, in words; empty if converged.
+        rms: metres, of the matched points' distances to the target: from its planes, or to its
+            points for ``icp``.
+        overlap: part of the source's points with a target point within ``max_distance``, 0 to 1.
+        matched: how many they are.
+        information: (6, 6), for a small turn in radians about the target's axes, of the source as
+            it was turned, and then a shift in metres: the sum of squares of how the matched
+            points' distances from the target's planes change with it. Without a unit of noise:
+            divide by a distance's variance.
+        covariance: (6, 6), of the same; None for ``icp``, whose model knows no surfaces, and where
+            a direction is not determined.
+        undetermined: (K, 6) such steps that the surfaces leave open; they move the source's points
+            by a metre in the mean.
+    """
+
+    pose: Transform
+    converged: bool
+    reason: str
+    rms: float
+    overlap: float
+    matched: int
+    information: Array
+    covariance: Array | None
+    undetermined: Array
+
+
+class _Neighbours(NamedTuple):
+    """What lies beside what, in target coordinates less the target's centre."""
+
+    moved: Array  # (M, 3) of the source
+    nearest: NDArray[np.intp]  # (M,) which one of the target
+    offsets: Array  # (M, 3) from one to the other
+    arms: Array  # (M, 3) of the source, turned, from its origin
+
+
+def register(
+    source: Cloud,
+    target: Cloud,
+    *,
+    method: Literal["gicp", "icp", "plane"] = "gicp",
+    voxel: float | None = None,
+    max_distance: float = 0.05,
+    initial: Transform | None = None,
+    min_overlap: float = 0.3,
+) -> Registration:
+    """Return where a cloud lies in another.
+
+    It finds the pose that is nearest to ``initial``, which should be off by less than
+    ``max_distance``; what is off by five times as much takes no part. It holds Python's lock all
+    the while, for tenths of a second with 100,000 points: beside an event loop it belongs into a
+    process.
+
+    Args:
+        source: at least 20 points, as the target.
+        target: has the points that the source's are moved to.
+        method: ``gicp`` from surface to surface, ``plane`` from point to surface, ``icp`` from
+            point to point.
+        voxel: metres; both clouds are thinned to it first. None: they stay as they are.
+        max_distance: metres, up to which a point has something to do with another.
+        initial: ``T_target_source`` to begin with, whose frames' names the pose gets; None: the
+            clouds lie almost as they should, in frames ``target`` and ``source``.
+        min_overlap: part of the source that must lie on the target.
+
+    Raises:
+        ConfigurationError: no such method, lengths that are not above 0, fewer than 20 points.
+        MissingExtraError: the extra ``depth`` is not installed.
+    """
+    _check(method, max_distance, min_overlap)
+    begin = Transform("target", "source", np.eye(3), np.zeros(3)) if initial is None else initial
+    if not isinstance(begin, Transform):
+        raise ConfigurationError(f"initial: expected a Transform, got {type(begin).__name__}")
+    clouds = []
+    for name, cloud in (("source", source), ("target", target)):
+        thin = cloud if voxel is None else voxel_grid(cloud, voxel)
+        if len(thin) < NEIGHBOURS:
+            raise ConfigurationError(
+                f"register: {name}: expected {NEIGHBOURS} points or more"
+                f"{'' if voxel is None else f', thinned to {voxel:g} m'}, got {len(thin)}"
+            )
+        clouds.append(thin.points.astype(np.float64))
+    points, goals = clouds
+    tree = load("scipy.spatial").cKDTree(goals)
+    distances, _ = tree.query(begin.apply(points), distance_upper_bound=NEAR * max_distance)
+    near = points[np.isfinite(distances)]
+    pose, ended = begin, True
+    if len(near) >= NEIGHBOURS:
+        pose, ended = _aligned(near, goals, begin, METHODS[method], max_distance)
+    match = _matched(points, tree, pose, max_distance)
+    return _judged(method, pose, ended, match, len(points), goals, tree, min_overlap)
+
+
+def _check(method: str, max_distance: float, min_overlap: float) -> None:
+    if method not in METHODS:
+        raise ConfigurationError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    if not 0 < max_distance < math.inf:
+        raise ConfigurationError(f"max_distance: expected metres above 0, got {max_distance!r}")
+    if not 0 <= min_overlap <= 1:
+        raise ConfigurationError(f"min_overlap: expected 0 to 1, got {min_overlap!r}")
+
+
+def _small_gicp() -> Any:
+    try:
+        return importlib.import_module("small_gicp")
+    except ImportError as exc:
+        raise MissingExtraError(
+            'registration needs small-gicp: pip install "smartcam[depth]"', extra="depth"
+        ) from exc
+
+
+def _aligned(
+    points: Array, goals: Array, begin: Transform, kind: str, reach: float
+) -> tuple[Transform, bool]:
+    """Return the pose, and whether the steps ended; each cloud is moved to its centre for it."""
+    gicp = _small_gicp()
+    here, there = points.mean(axis=0), goals.mean(axis=0)
+    clouds = [gicp.PointCloud(points - here), gicp.PointCloud(goals - there)]
+    for cloud in clouds:
+        gicp.estimate_normals_covariances(cloud, None, NEIGHBOURS)
+    tree = gicp.KdTree(clouds[1])
+
+    def stepped(motion: Array, most: int) -> Any:
+        return gicp.align(
+            clouds[1],
+            clouds[0],
+            tree,
+            motion,
+            registration_type=kind,
+            max_correspondence_distance=reach,
+            max_iterations=most,
+            rotation_epsilon=TURN_STEP,
+            translation_epsilon=SHIFT_STEP * reach,
+        )
+
+    motion = np.eye(4)
+    motion[:3, :3] = begin.rotation
+    motion[:3, 3] = begin.rotation @ here + begin.translation - there
+    found = stepped(motion, MOST_STEPS)
+    motion, ended = np.asarray(found.T_target_source, np.float64), bool(found.converged)
+    if np.isfinite(motion).all() and not ended:
+        before = motion
+        motion = np.asarray(stepped(before, MORE_STEPS).T_target_source, np.float64)
+        change = (points - here) @ (motion - before)[:3, :3].T + (motion - before)[:3, 3]
+        ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < RESTLESS * reach)
+    if not np.isfinite(motion).all():
+        return begin, False
+    # Many small turns one after the other are no rotation to the last digits.
+    left, _, right = np.linalg.svd(motion[:3, :3])
+    rotation = left @ right
+    translation = motion[:3, 3] - rotation @ here + there
+    return Transform(begin.target, begin.source, rotation, translation), ended
+
+
+def _matched(points: Array, tree: Any, pose: Transform, reach: float) -> _Neighbours:
+    turned = points @ pose.rotation.T
+    moved = turned + pose.translation
+    distances, nearest = tree.query(moved, distance_upper_bound=reach)
+    near = np.isfinite(distances)
+    index = nearest[near]
+    return _Neighbours(moved[near], index, tree.data[index] - moved[near], turned[near])
+
+
+def _judged(
+    method: str,
+    pose: Transform,
+    ended: bool,
+    match: _Neighbours,
+    count: int,
+    goals: Array,
+    tree: Any,
+    min_overlap: float,
+) -> Registration:
+    matched = len(match.nearest)
+    reasons = []
+    if not ended:
+        reasons.append(f"the steps did not end within {MOST_STEPS}")
+    if matched / count < min_overlap or matched < NEIGHBOURS:
+        reasons.append(
+            f"{matched} of {count} points of the source lie on the target, "
+            f"{matched / count:.0%}; expected {min_overlap:.0%}"
+        )
+    rms, information, covariance, left_open = math.nan, np.zeros((6, 6)), None, np.eye(6)
+    if matched >= NEIGHBOURS:
+        planes = planes_of(goals, tree, NEIGHBOURS).taken(match.nearest)
+        centre = match.moved.mean(axis=0)
+        steps = open_directions(match.moved - centre, planes)
+        reasons += [_in_words(one, match.moved - centre) for one in steps]
+        left_open = steps.copy()
+        left_open[:, 3:] += np.cross(steps[:, :3], pose.translation - centre)
+        rows = slopes(match.arms, planes.normals)
+        information = rows.T @ rows
+        across = (match.offsets * planes.normals).sum(axis=1)
+        off = np.linalg.norm(match.offsets, axis=1) if method == "icp" else across
+        rms = float(np.sqrt((off**2).mean()))
+        if method != "icp" and not len(steps):
+            covariance = _covariance(rows, across, match.nearest)
+    for one in (information, covariance, left_open):
+        if one is not None:
+            one.flags.writeable = False
+    return Registration(
+        pose=pose,
+        converged=not reasons,
+        reason="; ".join(reasons),
+        rms=rms,
+        overlap=matched / count,
+        matched=matched,
+        information=information,
+        covariance=covariance,
+        undetermined=left_open,
+    )
+
+
+def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
+    """Return the covariance of a fit to planes, by what is left over.
+
+    What lies beside the same point of the target errs with it, and is added before it is squared.
+    """
+    # Source: White, A heteroskedasticity-consistent covariance matrix estimator (1980), over
+    # groups as Liang and Zeger have it (1986).
+    places = np.unique(nearest, return_inverse=True)[1].reshape(-1)
+    groups = np.zeros((int(places.max()) + 1, 6))
+    np.add.at(groups, places, rows * across[:, None])
+    inverse = np.linalg.inv(rows.T @ rows)
+    spread = len(groups) / max(len(groups) - 6, 1)
+    covariance: Array = spread * inverse @ (groups.T @ groups) @ inverse
+    return covariance
+
+
+def _in_words(step: Array, arms: Array) -> str:
+    """Return what a step about the centre of the matched points is that is left open."""
+    turn, shift = step[:3], step[3:]
+    reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
+    size = np.linalg.norm(turn) * reach
+    main, word = (turn, "turn about") if size > np.linalg.norm(shift) else (shift, "shift along")
+    axis = main / np.linalg.norm(main)
+    axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
+    named = ", ".join(f"{value + 0.0:.2f}" for value in np.round(axis, 2))
+    return f"the surfaces do not determine a {word} ({named})"

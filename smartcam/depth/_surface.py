@@ -1,0 +1,95 @@
+"""The plane about each point of a cloud, and what planes that are known so well determine."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+ROWS: Final = 1 << 15
+"""Points at a time; each has its neighbours in memory."""
+
+SIGNIFICANT: Final = 12.0
+"""By how much a direction's information must exceed what the noise of the normals makes alone.
+
+Along what planes, edges and corridors leave open it is 0.8 to 1.4, whatever the noise; along what
+cylinders and spheres leave open up to 11, since they are no planes; in a corner 29 and more.
+"""
+
+
+class SurfacePlanes(NamedTuple):
+    """The planes about points.
+
+    Attributes:
+        normals: (N, 3), of length 1.
+        along: (N, 3, 2), two directions in each plane.
+        tilts: (N, 2), variances of the normal's turn towards each of them, radians squared.
+    """
+
+    normals: Array
+    along: Array
+    tilts: Array
+
+    def taken(self, index: Any) -> SurfacePlanes:
+        """Return some of them."""
+        return SurfacePlanes(*(one[index] for one in self))
+
+
+def planes_of(points: Array, tree: Any, neighbours: int) -> SurfacePlanes:
+    """Return the planes through each point's nearest, itself among them; ``tree``: of them all."""
+    found = []
+    for start in range(0, len(points), ROWS):
+        _, index = tree.query(points[start : start + ROWS], k=neighbours)
+        found.append(_fitted(points[index]))
+    return SurfacePlanes(*(np.concatenate(one) for one in zip(*found, strict=True)))
+
+
+def _fitted(groups: Array) -> SurfacePlanes:
+    """Return planes through groups (N, K, 3) of points."""
+    offsets = groups - groups.mean(axis=1, keepdims=True)
+    spreads = np.einsum("nki,nkj->nij", offsets, offsets) / groups.shape[1]
+    values, vectors = np.linalg.eigh(spreads)
+    # An eigenvector turns towards another by noise of variance l0 l1 / (K (l1 - l0)^2).
+    # Source: Anderson, Asymptotic theory for principal component analysis (1963).
+    apart = np.maximum((values[:, 1:] - values[:, :1]) ** 2, np.finfo(float).tiny)
+    tilts = values[:, :1] * values[:, 1:] / (groups.shape[1] * apart)
+    return SurfacePlanes(vectors[:, :, 0], vectors[:, :, 1:], np.clip(tilts, 0.0, 1.0))
+
+
+def slopes(arms: Array, directions: Array) -> Array:
+    """Return how shifts along directions (N, 3) follow from steps (N, 6), turn before shift.
+
+    ``arms`` (N, 3): from the point about which is turned.
+    """
+    return np.concatenate([np.cross(arms, directions), directions], axis=1)
+
+
+def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
+    """Return the steps (K, 6), turn in radians and shift in metres, that planes leave open.
+
+    ``arms`` (N, 3): of the points on the planes, from their centre, about which the steps turn.
+    Each moves the points by one metre in the mean.
+    """
+    reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
+    scaled = arms / reach
+    rows = slopes(scaled, planes.normals)
+    information = rows.T @ rows
+    noise = np.zeros((6, 6))
+    for axis in range(2):
+        part = slopes(scaled, planes.along[:, :, axis]) * np.sqrt(planes.tilts[:, axis, None])
+        noise += part.T @ part
+    # What rounds float32 is noise, too: a flat cloud without any has no tilts.
+    noise += 1e-7 * np.trace(information) * np.eye(6)
+    ratios, steps = load("scipy.linalg").eigh(information, noise)
+    basis, _ = np.linalg.qr(steps[:, ratios < SIGNIFICANT])
+    # Any mixture of open steps is open: turns are told first, and shifts as what has no turn.
+    apart, _, _ = np.linalg.svd(basis.T[:, :3])
+    found: Array = (apart.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)
+    return found

@@ -1,0 +1,144 @@
+"""Rows of numbers in files: as bytes and as text."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+MAX_HEADER: Final = 1 << 16
+"""Bytes."""
+
+MAX_FIELDS: Final = 256
+
+MAX_ROW: Final = 1 << 12
+"""Bytes of a row."""
+
+LINES: Final = 1 << 14
+"""Of text at a time; each number is an object in memory for a while."""
+
+
+class BadTableError(Exception):
+    """Bytes are not what they should be; who knows the file's name says so to its user."""
+
+    def __init__(self, expected: str, came: str) -> None:
+        super().__init__(f"expected {expected}, got {came}")
+
+
+def shown(data: bytes | str) -> str:
+    """Return what came, for an error; not more than a line of it."""
+    text = data.decode("ascii", "backslashreplace") if isinstance(data, bytes) else data
+    return repr(text if len(text) <= 60 else f"{text[:60]}...")
+
+
+def header_line(data: bytes, start: int) -> tuple[str, int]:
+    """Return a header's line and where the next one begins; it ends in LF, or CR LF."""
+    end = data.find(b"\n", start, MAX_HEADER)
+    if end < 0:
+        raise BadTableError(f"a header of up to {MAX_HEADER} bytes", shown(data[start:]))
+    line = data[start:end].removesuffix(b"\r")
+    try:
+        return line.decode(
+            "ascii", "strict" if not line.startswith((b"comment", b"#")) else "replace"
+        ), end + 1
+    except UnicodeDecodeError:
+        _fail("a header in ASCII", line)
+
+
+def count_of(text: str, what: str) -> int:
+    """Return a count; else BadTableError."""
+    if not (text.isascii() and text.isdigit() and len(text) <= 15):
+        _fail(f"a number of {what}", text)
+    return int(text)
+
+
+def _fail(expected: str, came: bytes | str) -> NoReturn:
+    raise BadTableError(expected, shown(came)) from None
+
+
+def check_row(row: np.dtype[Any]) -> None:
+    """Check that rows are not too long, since each is in memory."""
+    if row.itemsize > MAX_ROW:
+        raise BadTableError(f"rows of up to {MAX_ROW} bytes", f"{row.itemsize}")
+
+
+def from_bytes(data: bytes, start: int, count: int, row: np.dtype[Any]) -> NDArray[Any]:
+    """Return so many rows from a place on; what comes behind them is not looked at."""
+    there = len(data) - start
+    if count * row.itemsize > there:
+        raise BadTableError(
+            f"{count} rows of {row.itemsize} bytes, {count * row.itemsize} in all", f"{there}"
+        )
+    return np.frombuffer(data, row, count, start)
+
+
+def from_text(
+    data: bytes, start: int, skipped: int, count: int, types: Sequence[np.dtype[Any]]
+) -> tuple[NDArray[Any], ...]:
+    """Return columns of so many lines of numbers, after some that are skipped.
+
+    Numbers of whole types must be whole, and fit.
+    """
+    if 2 * len(types) * count > len(data) - start + 1:
+        raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
+    columns = tuple(np.empty(count, one) for one in types)
+    done, place, left = 0, start, skipped
+    while done < count:
+        lines: list[list[bytes]] = []
+        while len(lines) < min(LINES, count - done):
+            if place >= len(data):
+                raise BadTableError(f"{count} lines of numbers", f"{done + len(lines)}")
+            end = data.find(b"\n", place)
+            end = len(data) if end < 0 else end
+            words, place = data[place:end].split(), end + 1
+            if left:
+                left -= 1
+            elif len(words) == len(types):
+                lines.append(words)
+            elif words:
+                _fail(f"{len(types)} numbers in line {done + len(lines) + 1}", b" ".join(words))
+        for column, written in zip(columns, zip(*lines, strict=True), strict=True):
+            column[done : done + len(lines)] = _numbers(written, column.dtype)
+        done += len(lines)
+    return columns
+
+
+def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return a column's numbers."""
+    try:
+        if kind.kind == "f":
+            values = np.array([float(word) for word in words], np.float64)
+            with np.errstate(over="ignore"):
+                return values.astype(kind)
+        whole = [int(word) for word in words if len(word) <= 20]
+    except ValueError as exc:
+        raise BadTableError("numbers", shown(str(exc))) from None
+    limits = np.iinfo(kind)
+    if len(whole) < len(words) or not limits.min <= min(whole) <= max(whole) <= limits.max:
+        raise BadTableError(f"numbers from {limits.min} to {limits.max}", "others")
+    return np.array(whole, kind)
+
+
+def to_text(columns: Iterable[NDArray[Any]]) -> bytes:
+    """Return columns as lines; floats so that float32 is the same when it is read."""
+    words = [
+        [f"{value:.9g}" for value in column.tolist()]
+        if column.dtype.kind == "f"
+        else [str(value) for value in column.tolist()]
+        for column in columns
+    ]
+    return "".join(f"{' '.join(row)}\n" for row in zip(*words, strict=True)).encode("ascii")
+
+
+def to_bytes(columns: Mapping[str, NDArray[Any]], row: np.dtype[Any]) -> bytes:
+    """Return columns as rows of bytes."""
+    count = len(next(iter(columns.values())))
+    rows = np.empty(count, row)
+    for name, column in columns.items():
+        rows[name] = column
+    return rows.tobytes()

@@ -1,0 +1,320 @@
+"""The site of clouds: the newest one, to whoever looks.
+
+Each who looks has a WebSocket, with one cloud on the way at a time: the next one, the newest then,
+goes when the page says that it has shown the last. A cloud crosses as it lies in memory, in parts,
+so that the loop goes on meanwhile. A large one is thinned for the page, which says so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from smartcam.depth import Cloud, voxel_grid
+from smartcam.exceptions import ConfigurationError
+from smartcam.web._errors import RefusedError, shown
+from smartcam.web._routes import CallRequest, Calls
+from smartcam.web._site import API, FAREWELL, Site
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+_log = logging.getLogger("smartcam.web")
+
+MOST_POINTS: Final = 1_000_000
+"""Of what crosses; a cloud of more is thinned."""
+
+MAX_VIEWERS: Final = 8
+"""At a time; each may have a cloud of 15 MB on the way."""
+
+PROTOCOL: Final = "smartcam.cloud"
+"""Of the WebSockets."""
+
+PART: Final = 1 << 16
+"""Bytes of a message: what is written at a time."""
+
+LONGEST_WORD: Final = 64
+"""Bytes of what a page may say: that it wants the next one."""
+
+SLOW: Final = 60.0
+"""Seconds within which a page must have taken a cloud and shown it."""
+
+Up: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+class _Packed(NamedTuple):
+    """A cloud as it crosses."""
+
+    about: dict[str, Any]
+    body: bytes  # float32 x, y, z of all points, then uint8 red, green, blue of all, if there are
+
+
+class CloudSite(Site):
+    """A page that shows a cloud, to be turned, and HTTP calls.
+
+    ::
+
+        async with CloudSite(cloud) as site:
+            site.url            # http://127.0.0.1:PORT/
+            site.show(newer)    # from now on
+
+    Args:
+        cloud: that is shown first; None: the page waits for one.
+        up: the axis that points up when the page is opened; ``-y`` is up for a camera that stands
+            level.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry, as :class:`~smartcam.web.FramesSite` has it.
+
+    Raises:
+        ConfigurationError: the token cannot be used, it is no cloud, or no such axis.
+    """
+
+    def __init__(
+        self,
+        cloud: Cloud | None = None,
+        *,
+        up: Up = "z",
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        super().__init__(CALLS, "cloud", host=host, port=port, token=token)
+        if up not in get_args(Up):
+            raise ConfigurationError(f"up: expected one of {', '.join(get_args(Up))}, got {up!r}")
+        self.viewers: set[CloudViewer] = set()
+        self._up = up
+        self._cloud: Cloud = Cloud(np.empty((0, 3)))
+        self._number = 0  # of the cloud; 0: there is none yet
+        self._newer = asyncio.Event()
+        self._threads: ThreadPoolExecutor | None = None
+        self._packing: tuple[int, asyncio.Future[_Packed]] | None = None
+        if cloud is not None:
+            self.show(cloud)
+
+    def show(self, cloud: Cloud) -> None:
+        """Show a cloud in place of the last one, from the event loop's thread.
+
+        Whoever looks gets it as soon as the last one is shown; one that is replaced before is
+        skipped. It is thinned and packed in a thread.
+
+        Raises:
+            ConfigurationError: it is no cloud.
+        """
+        if not isinstance(cloud, Cloud):
+            raise ConfigurationError(f"show: expected a Cloud, got {type(cloud).__name__}")
+        self._cloud = cloud
+        self._number += 1
+        self._newer.set()
+        self._newer = asyncio.Event()
+
+    async def start(self) -> None:
+        """Open the port."""
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(1, thread_name_prefix="smartcam.web.cloud")
+        await super().start()
+
+    async def stop(self) -> None:
+        """Close the port; nobody looks any longer."""
+        for one in self.viewers:
+            one.end()
+        try:
+            await super().stop()
+        finally:
+            threads, self._threads = self._threads, None
+            self._packing = None
+            if threads is not None:
+                await asyncio.to_thread(threads.shutdown)
+
+    async def newer(self, number: int) -> tuple[int, _Packed]:
+        """Return the newest cloud after one of a number, packed once for all, and its number.
+
+        Cancellation: safe; others who wait for it get it.
+        """
+        while self._number <= number:
+            await self._newer.wait()
+        if self._packing is None or self._packing[0] != self._number:
+            loop = asyncio.get_running_loop()
+            made = loop.run_in_executor(self._threads, packed, self._cloud)
+            made.add_done_callback(_seen)
+            self._packing = (self._number, made)
+        found, job = self._packing
+        return found, await asyncio.shield(job)
+
+    def state(self) -> dict[str, Any]:
+        """Return what there is."""
+        return {
+            "number": self._number,
+            "points": len(self._cloud),
+            "colours": self._cloud.colours is not None,
+            "up": self._up,
+            "viewers": len(self.viewers),
+        }
+
+
+def _seen(made: asyncio.Future[_Packed]) -> None:
+    if not made.cancelled():
+        made.exception()  # who asked may be gone, and then nobody else asks
+
+
+def packed(cloud: Cloud) -> _Packed:
+    """Return a cloud as it crosses, thinned where it is large; it belongs into a thread.
+
+    What makes it impossible crosses in its place.
+    """
+    try:
+        return _packed(cloud)
+    except (MemoryError, ConfigurationError) as exc:
+        return _Packed({"failure": str(exc) or type(exc).__name__, "bytes": 0}, b"")
+
+
+def _packed(cloud: Cloud) -> _Packed:
+    thin, size = thinned(cloud, MOST_POINTS)
+    columns = [thin.points.astype("<f4", copy=False).tobytes()]
+    if thin.colours is not None:
+        columns.append(thin.colours.tobytes())
+    body = b"".join(columns)
+    low, high = (
+        (thin.points.min(axis=0).tolist(), thin.points.max(axis=0).tolist())
+        if len(thin)
+        else ([0.0] * 3, [0.0] * 3)
+    )
+    about = {
+        "points": len(thin),
+        "of": len(cloud),
+        "voxel": size,
+        "colours": thin.colours is not None,
+        "low": low,
+        "high": high,
+        "bytes": len(body),
+    }
+    return _Packed(about, body)
+
+
+def thinned(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
+    """Return a cloud of at most so many points, and the voxels' size in metres if it is thinned."""
+    if len(cloud) <= most:
+        return cloud, None
+    reach = float(np.ptp(cloud.points.astype(np.float64), axis=0).max())
+    # Not below what float32 tells apart, so far from the origin.
+    size = max(reach / 1024, 1e-6 * float(np.abs(cloud.points).max()), 1e-9)
+    while len(thin := voxel_grid(cloud, size)) > most:
+        size *= max(1.05, (len(thin) / most) ** 0.5)  # surfaces have as many as 1 / size**2
+    return thin, size
+
+
+class CloudViewer:
+    """One who looks."""
+
+    def __init__(self, site: CloudSite) -> None:
+        self._site = site
+        self._socket = web.WebSocketResponse(
+            protocols=(PROTOCOL,),
+            max_msg_size=LONGEST_WORD,
+            timeout=FAREWELL,
+            compress=False,
+            heartbeat=SLOW,  # one that vanished while nothing was to be sent gives its place back
+        )
+        self._shown = asyncio.Event()
+        self._ending = asyncio.Event()
+
+    def end(self) -> None:
+        """Have it end."""
+        self._ending.set()
+
+    async def serve(self, request: web.Request) -> web.WebSocketResponse:
+        """Show clouds until the page goes, is too slow, or :meth:`end` is called.
+
+        Cancellation: ends it.
+        """
+        self._site.viewers.add(self)
+        try:
+            await self._socket.prepare(request)
+            await self._first(self._listen(), self._show(), self._ending.wait())
+            async with asyncio.timeout(2 * FAREWELL):
+                await self._socket.close(code=WSCloseCode.GOING_AWAY)
+        except TimeoutError:
+            _log.info("= %s: a page that takes no cloud was disconnected", request.remote)
+            if request.transport is not None:
+                request.transport.abort()
+        except ConnectionError:
+            pass  # the page is gone
+        finally:
+            self._site.viewers.discard(self)
+        return self._socket
+
+    @staticmethod
+    async def _first(*jobs: Coroutine[Any, Any, object]) -> None:
+        """Run jobs until one is over, and raise what it raised."""
+        tasks = [asyncio.create_task(job) for job in jobs]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        for task in done:
+            if not task.cancelled():
+                task.result()
+
+    async def _listen(self) -> None:
+        """Hear that clouds were shown, until the page goes or says something else."""
+        while True:
+            message = await self._socket.receive()
+            if message.type is not WSMsgType.TEXT or message.data != "next":
+                return
+            self._shown.set()
+
+    async def _show(self) -> None:
+        """Send the newest, and wait until it is shown; TimeoutError: it is not."""
+        number = 0
+        while True:
+            number, cloud = await self._site.newer(number)
+            self._shown.clear()
+            async with asyncio.timeout(SLOW):
+                await self._socket.send_str(json.dumps({"number": number, **cloud.about}))
+                for start in range(0, len(cloud.body), PART):
+                    await self._socket.send_bytes(cloud.body[start : start + PART])
+                    await asyncio.sleep(0)
+                await self._shown.wait()
+
+
+# ---------------------------------------------------------------------- what calls do
+
+CALLS: Calls[CloudSite] = Calls()
+"""All calls."""
+
+
+@CALLS.add("GET", API)
+def _calls(_site: CloudSite, _call: CallRequest) -> object:
+    """These calls."""
+    return {"calls": CALLS.as_json()}
+
+
+@CALLS.add("GET", f"{API}/cloud")
+def _cloud(site: CloudSite, _call: CallRequest) -> object:
+    """What there is: the newest cloud's number and points, and which axis is up."""
+    return site.state()
+
+
+@CALLS.add(
+    "GET",
+    f"{API}/clouds",
+    about="A WebSocket: the newest cloud after each `next` that one says. JSON, which says how "
+    "many bytes follow; then these in parts: x, y, z as float32, red, green, blue as uint8.",
+)
+async def _clouds(site: CloudSite, call: CallRequest) -> web.StreamResponse:
+    headers = call.request.headers
+    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", PROTOCOL).split(",")]
+    if headers.get("Upgrade", "").lower() != "websocket" or PROTOCOL not in offered:
+        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
+    if len(site.viewers) >= MAX_VIEWERS:
+        raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
+    return await CloudViewer(site).serve(call.request)
