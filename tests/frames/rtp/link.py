@@ -68,7 +68,7 @@ def run(*arguments: str) -> None:
 @contextlib.contextmanager
 def thin_link(rate: str) -> Iterator[Link]:
     """Give a link whose ends send at a rate, such as ``20mbit``; skip where none can be made."""
-    fcntl = pytest.importorskip("fcntl")
+    fcntl = pytest.importorskip("fcntl", reason="there are no namespaces here")
     for tool in ("ip", "tc"):
         if shutil.which(tool) is None:
             pytest.skip(f"there is no {tool}, which namespaces are made with")

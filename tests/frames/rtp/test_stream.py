@@ -20,6 +20,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
 )
 from smartcam.frames import Codecs, Moment, RtpSender
+from smartcam.frames._h264 import entry_point
 from smartcam.frames._rtp import driver as receiving
 from smartcam.frames._rtp.h264 import H264Packetizer
 from smartcam.frames._rtp.packets import (
@@ -189,6 +190,35 @@ async def test_a_frame_s_end_is_asked_for_before_the_next_frame_comes() -> None:
                 assert await asked() == RtpPacket.parse(second[-1]).sequence
                 give(second[-1])
                 assert read_stamp((await anext(reader)).grey()) == (2, 2000)
+
+
+async def test_a_key_frame_in_the_midst_of_a_refresh_is_shown_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(receiving, "WAITING", 100)
+    port, packetizer = two_ports(), H264Packetizer()
+    async with Codecs(threads=1) as codecs:
+        encoder, sent = codecs.h264_encoder(keyint=30), []
+        for number in range(40):
+            if number == 35:
+                encoder.begin_anew()
+            sent.append(bytes((await encoder.encode(frame_of(stamped(number), "Mono8"))).data))
+    (refresh,) = (number for number in range(1, 35) if entry_point(sent[number])[1])
+    async with (
+        frames.open(f"rtp://{HOST}:{port}?{SIZE}&repair=0", timeout=LIMIT) as source,
+        source.reader() as reader,
+    ):
+        await until(lambda: source.statistics().streaming)
+        with socket.socket(type=socket.SOCK_DGRAM) as sender:
+            for number, one in enumerate(sent):
+                for data in packetizer.packets(one, 3000 * number):
+                    if number != refresh - 1:
+                        sender.sendto(data, (HOST, port))
+                if number in (0, refresh - 2, 35):
+                    async with asyncio.timeout(LIMIT):
+                        while number_of(await anext(reader)) != number:
+                            pass
+        assert (seen(source).overflows, seen(source).lost) == (0, 1)
 
 
 @pytest.mark.parametrize("back", [True, False], ids=["with key frames", "by refresh alone"])
