@@ -11,9 +11,28 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    pass
+    from smartcam.depth._cleaning import SpatialFilter, TemporalFilter, fill_holes
+    from smartcam.depth._colours import ColourRange, ColourRegion, find_regions
+    from smartcam.depth._regions import RegionDepth, equalize_depth, region_depth
 
-__all__: list[str] = []
+__all__: list[str] = [
+    "ColourRange",
+    "ColourRegion",
+    "RegionDepth",
+    "SpatialFilter",
+    "TemporalFilter",
+    "equalize_depth",
+    "fill_holes",
+    "find_regions",
+    "region_depth",
+]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazy(__name__, {})
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_cleaning": "SpatialFilter TemporalFilter fill_holes",
+            "_colours": "ColourRange ColourRegion find_regions",
+            "_regions": "RegionDepth equalize_depth region_depth",
+        },
+    )
