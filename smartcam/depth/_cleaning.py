@@ -239,10 +239,8 @@ def _extreme(metres: NDArray[np.float32], how: HoleFill) -> NDArray[np.float32]:
     """Return the least or largest depth of each pixel and its neighbours, 0 where none has one."""
     if how == "farthest":
         return _widened(metres, np.maximum)
-    # the least of what is there is the largest of what is turned round; 0 stays the least
-    turned = np.divide(1.0, metres, out=np.zeros_like(metres), where=metres > 0)
-    chosen = _widened(turned, np.maximum)
-    return np.divide(1.0, chosen, out=np.zeros_like(chosen), where=chosen > 0)
+    least = _widened(np.where(metres > 0, metres, np.float32(np.inf)), np.minimum)
+    return np.where(np.isinf(least), np.float32(0.0), least)
 
 
 def _dilated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
