@@ -208,6 +208,7 @@ def find_regions(
     ratio: tuple[float, float] = (1, math.inf),
     fullness: float = 0.0,
     whole: bool = False,
+    most: int = 1000,
 ) -> list[ColourRegion]:
     """Return the connected regions of a mask, the largest first; pixels touch at corners, too.
 
@@ -217,6 +218,7 @@ def find_regions(
         ratio: least and largest ratio of the longer to the shorter side.
         fullness: least part of its rectangle that a region fills, 0 to 1.
         whole: whether one that touches the picture's rim is not wanted: it may be cut off.
+        most: so many of them, the largest.
 
     Raises:
         ConfigurationError: a range that holds nothing.
@@ -248,6 +250,8 @@ def find_regions(
         one = _region(labels, label, np.s_[top : top + height, left : left + width])
         if ratio[0] <= one.ratio <= ratio[1] and one.fullness >= fullness:
             found.append(one)
+        if len(found) == most:
+            break
     return found
 
 

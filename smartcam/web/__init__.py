@@ -17,16 +17,18 @@ from smartcam._lazy import lazy
 from smartcam.exceptions import MissingExtraError
 
 if TYPE_CHECKING:
+    from smartcam.web._colours import ColourSite
     from smartcam.web._emulator import EmulatorSite
     from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
     from smartcam.web._wizard import WizardSite
 
-__all__ = ["EmulatorSite", "FramesSite", "LiveSite", "WizardSite"]
+__all__ = ["ColourSite", "EmulatorSite", "FramesSite", "LiveSite", "WizardSite"]
 
 _resolve = lazy(
     __name__,
     {
+        "_colours": "ColourSite",
         "_emulator": "EmulatorSite",
         "_frames": "FramesSite",
         "_live": "LiveSite",
