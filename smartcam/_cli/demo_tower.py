@@ -132,7 +132,8 @@ async def tower(
     )
     compared: list[Compared] = []
     for layer in range(1, layers + 1):
-        compared += await asyncio.to_thread(_put_one, table, colours, layer, say)
+        seen = await asyncio.to_thread(_look, table, colours)
+        compared += _put_one(table, seen, layer, say)
         doing = PERSON.get(layer)
         if doing is not None:
             getattr(table, doing)()
@@ -141,10 +142,21 @@ async def tower(
     _judge(compared, table, say)
 
 
-def _put_one(
-    table: TowerTable, colours: ColourRange, layer: int, say: Steps
-) -> list[Compared]:
-    """Have the robot put one block on top; return what it found beside the truth."""
+class Seen(NamedTuple):
+    """What the robot has found out before it moves a block."""
+
+    blocks: list[Found]  # that lie on the table
+    reached: list[Found]  # those of them that it can grip
+    block: Found  # the one that it takes
+    top: Found  # of the tower
+
+
+def _look(table: TowerTable, colours: ColourRange) -> Seen:
+    """Look at the table, at the nearest block within reach, and at the tower.
+
+    Raises:
+        FrameFormatError: there is no such block, or no tower.
+    """
     overview = table.look(OVERVIEW)
     depth = SpatialFilter(delta=EDGE)(overview.depth[0])
     blocks = loose_blocks(overview, depth, colours)
@@ -157,7 +169,16 @@ def _put_one(
         )
     rough = min(reached, key=lambda one: math.hypot(one.x, one.y))
     block = measured_block(table, rough, colours)
-    top = measured_top(table, *tower_place(overview, depth))
+    return Seen(blocks, reached, block, measured_top(table, *tower_place(overview, depth)))
+
+
+def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Compared]:
+    """Put the block on top; return what was found beside the truth.
+
+    Raises:
+        FrameFormatError: the gripper took nothing.
+    """
+    block, top = seen.block, seen.top
     true_top = table.tower()[-1]
     grip = table.pick(block.x, block.y, block.angle)
     rows = [
@@ -165,13 +186,14 @@ def _put_one(
         _compared("tower's top", top, true_top),
     ]
     say.step(
-        f"Layer {layer}: {len(blocks)} black blocks lie on the table, {len(reached)} within reach. "
-        "The nearest of these, and the tower's top, in the robot's frame:",
+        f"Layer {layer}: {len(seen.blocks)} black blocks lie on the table, {len(seen.reached)} "
+        "within reach. The nearest of these, and the tower's top:",
         layer=layer,
-        seen=len(blocks),
-        reached=len(reached),
+        seen=len(seen.blocks),
+        reached=len(seen.reached),
     )
-    say.detail(_text(rows), compared=[row._asdict() | {"found": row.found._asdict()} for row in rows])
+    told = [row._asdict() | {"found": row.found._asdict()} for row in rows]
+    say.detail(_text(rows), compared=told)
     if table.held is None:
         raise FrameFormatError(
             f"{ARM}: the gripper closed {1e3 * grip.off:.1f} mm beside the block, on nothing",
@@ -189,16 +211,14 @@ def _put_one(
 # ---------------------------------------------------------------------- what the camera tells
 
 
-def loose_blocks(
-    sight: Sight, depth: NDArray[np.float32], colours: ColourRange
-) -> list[Found]:
+def loose_blocks(sight: Sight, depth: NDArray[np.float32], colours: ColourRange) -> list[Found]:
     """Return the blocks of a colour that lie on the table, as seen from far above.
 
     Raises:
         FrameFormatError: there is none; it says what there is instead.
     """
     lying: list[Found] = []
-    for one in _regions(sight, colours, depth):
+    for one in _regions(sight, colours):
         height = sight.camera[2] - region_depth(depth, one.mask).median
         if abs(height - BLOCK[2]) < EDGE:  # and not on the tower
             lying.append(_pose(sight, one, height))
@@ -261,9 +281,7 @@ def measured_top(table: TowerTable, x: float, y: float) -> Found:
     return _pose(sight, top, sight.camera[2] - told.median)._replace(sigma=told.sigma)
 
 
-def _regions(
-    sight: Sight, colours: ColourRange, depth: NDArray[np.float32] | None = None
-) -> list[ColourRegion]:
+def _regions(sight: Sight, colours: ColourRange) -> list[ColourRegion]:
     """Return what may be a block by its colour, area and sides."""
     return find_regions(
         colours.mask(sight.rgb), area=_area(sight), ratio=RATIO, fullness=FULLNESS, whole=True
@@ -351,9 +369,10 @@ def _judge(compared: list[Compared], table: TowerTable, say: Steps) -> None:
     within = all(
         error <= most for row in compared for error, most in zip(row.errors, TOLERANCE, strict=True)
     )
-    most = f"{1e3 * TOLERANCE[0]:g} mm, {math.degrees(TOLERANCE[1]):g} degrees"
+    most = f"{1e3 * TOLERANCE[0]:g} mm, {math.degrees(TOLERANCE[1]):g} degree"
+    stack = table.tower()
     say.step(
-        f"The tower has {len(table.tower())} layers, {1e3 * table.tower()[-1].top:.1f} mm. At worst "
+        f"The tower has {len(stack)} layers, {1e3 * stack[-1].top:.1f} mm. At worst "
         f"{1e3 * beside:.2f} mm beside, {math.degrees(turned):.2f} degrees turned, "
         f"{1e3 * higher:.2f} mm of height: {'all' if within else 'not all'} within {most}, "
         f"{1e3 * TOLERANCE[2]:g} mm",

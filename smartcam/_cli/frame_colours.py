@@ -34,7 +34,7 @@ LINGER: Final = 3.0
     "--range",
     "begin",
     metavar="JSON",
-    help='What the page begins with, as it is copied there, such as \'{"value": [0, 60]}\'.',
+    help="What the page begins with, as it is copied there, such as '{\"value\": [0, 60]}'.",
 )
 @page_options("", always=True)
 @option("--seconds")

@@ -46,7 +46,11 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
     if not (scale > 0 and math.isfinite(scale)):
         raise ConfigurationError(f"depth: scale: expected metres a step above 0, got {scale!r}")
     given = np.asarray(depth)
-    if given.ndim != 2 or not given.size or not (given.dtype == np.uint16 or given.dtype.kind == "f"):
+    if (
+        given.ndim != 2
+        or not given.size
+        or not (given.dtype == np.uint16 or given.dtype.kind == "f")
+    ):
         raise FrameFormatError(
             f"depth: expected (H, W) of uint16 or float, got {given.shape} of {given.dtype}"
         )
@@ -58,10 +62,10 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
 
 
 class SpatialFilter:
-    """Smooths a depth map and keeps its edges: a recursive exponential average along rows, then
-    along columns, each forth and back.
+    """Smooths a depth map and keeps its edges.
 
-    A pixel takes ``1 - alpha`` of its difference to the one before, which was smoothed already,
+    It is a recursive exponential average along rows, then along columns, each forth and back. A
+    pixel takes ``1 - alpha`` of its difference to the one before, which was smoothed already,
     unless that differs by ``delta`` or more, or is a hole. There the average begins anew. Holes
     stay holes.
 
@@ -218,7 +222,9 @@ def fill_holes(
         FrameFormatError: no map of depth.
     """
     if how not in get_args(HoleFill):
-        raise ConfigurationError(f"fill_holes: how: expected one of {get_args(HoleFill)}, got {how!r}")
+        raise ConfigurationError(
+            f"fill_holes: how: expected one of {get_args(HoleFill)}, got {how!r}"
+        )
     if not 1 <= reach <= MOST_PASSES:
         raise ConfigurationError(f"fill_holes: reach: expected 1 to {MOST_PASSES}, got {reach!r}")
     filled = as_metres(depth, scale)

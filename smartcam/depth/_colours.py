@@ -129,16 +129,15 @@ def hsv(picture: Frame | NDArray[Any]) -> NDArray[np.uint8]:
     given = np.asarray(picture)
     if given.dtype != np.uint8 or given.ndim != 3 or given.shape[2] != 3 or not given.size:
         raise FrameFormatError(
-            f"{source or 'colours'}: expected (H, W, 3) of uint8, got {given.shape} of {given.dtype}",
+            f"{source or 'colours'}: expected (H, W, 3) of uint8, got {given.shape} of "
+            f"{given.dtype}",
             source=source,
         )
     cv2 = load("cv2")
     return np.asarray(cv2.cvtColor(given, cv2.COLOR_RGB2HSV))
 
 
-def around_hsv(
-    picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: int
-) -> ColourRange:
+def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: int) -> ColourRange:
     """Return the range of the colours around a pixel of an HSV picture."""
     height, width = picture.shape[:2]
     if not (0 <= x < width and 0 <= y < height):
@@ -227,7 +226,9 @@ def find_regions(
     """
     for name, (low, high) in (("area", area), ("ratio", ratio), ("fullness", (fullness, 1))):
         if not 0 <= low <= high:
-            raise ConfigurationError(f"find_regions: {name}: expected (from, to), got {low}, {high}")
+            raise ConfigurationError(
+                f"find_regions: {name}: expected (from, to), got {low}, {high}"
+            )
     given = np.asarray(mask)
     if given.dtype != bool or given.ndim != 2 or not given.size:
         raise FrameFormatError(
@@ -241,9 +242,7 @@ def find_regions(
     for label in sorted(wanted.tolist(), key=lambda one: -int(rows[one, cv2.CC_STAT_AREA])):
         left, top, width, height = (int(one) for one in rows[label, :4])
         cut = (
-            min(left, top) == 0
-            or left + width == given.shape[1]
-            or top + height == given.shape[0]
+            min(left, top) == 0 or left + width == given.shape[1] or top + height == given.shape[0]
         )
         if whole and cut:
             continue
@@ -259,7 +258,7 @@ def _region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> Colou
     cv2 = load("cv2")
     pixels = labels[box] == label
     ys, xs = np.nonzero(pixels)
-    points = np.column_stack((xs, ys)) + (box[1].start, box[0].start)
+    points = np.column_stack((xs + box[1].start, ys + box[0].start))
     middle = points.mean(axis=0)
     x, y = (points - middle).T
     turned = 0.5 * math.atan2(2 * float(np.mean(x * y)), float(np.mean(x * x) - np.mean(y * y)))

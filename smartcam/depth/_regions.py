@@ -170,7 +170,7 @@ def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
 
 
 def _polygon(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return which pixels' middles lie in a polygon: a ray to the left meets its sides odd times."""
+    """Return which pixels' middles lie in a polygon: a ray from there meets its sides odd times."""
     columns = np.arange(shape[1], dtype=float)
     rows = np.arange(shape[0], dtype=float)[:, None]
     inside = np.zeros(shape, bool)

@@ -125,11 +125,13 @@ class TowerTable:
     def look(self, camera: tuple[float, float, float], maps: int = 1) -> Sight:
         """Return a picture and so many depth maps, as seen from about a place (metres)."""
         true = np.add(camera, self._beside)
-        depth, colour = _Rays((float(true[0]), float(true[1]), float(true[2]))).draw(self.blocks)
-        seen = _pixels(colour)
+        rays = _Rays((float(true[0]), float(true[1]), float(true[2])))
+        for block in self.blocks:
+            rays.draw(block)
+        seen = rays.picture()
         seen += GREY_SIGMA * self.random.standard_normal(seen.shape, np.float32)
         rgb = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
-        return Sight(camera, rgb, self._measured(depth, maps))
+        return Sight(camera, rgb, self._measured(rays.depth, maps) if maps else [])
 
     def tower(self) -> list[WoodenBlock]:
         """Return the blocks of the tower, the lowest first: of the highest stack."""
@@ -198,10 +200,12 @@ def _apart(one: WoodenBlock, other: WoodenBlock) -> float:
 
 def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean of the rays of each pixel."""
-    height, width = fine.shape[0] // FINE, fine.shape[1] // FINE
-    shape = (height, FINE, width, FINE, *fine.shape[2:])
-    mean: NDArray[np.float32] = fine.reshape(shape).mean(axis=(1, 3))
-    return mean
+    places = [(row, column) for row in range(FINE) for column in range(FINE)]
+    total = fine[::FINE, ::FINE].copy()
+    for row, column in places[1:]:
+        total += fine[row::FINE, column::FINE]
+    total /= len(places)
+    return total
 
 
 def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -209,9 +213,7 @@ def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     found = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis)) > JUMP
-        first, second = (
-            (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
-        )
+        first, second = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
         found[first] |= step
         found[second] |= step
     return found
@@ -240,19 +242,15 @@ class _Rays:
         self.colour: NDArray[np.float32] = np.empty((height, width, 3), np.float32)
         self.colour[:] = COLOURS["table"]
 
-    def draw(
-        self, blocks: list[WoodenBlock]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return where each ray ends, metres ahead, and its colour."""
-        for block in blocks:
-            self._draw(block)
-        x, y, _ = self._camera
-        light = 1.0 + 0.5 * (x - 0.4 - self._down * self.depth)
-        light -= 0.7 * (y - self._across * self.depth)
-        self.colour *= light[..., None]
-        return self.depth, self.colour
+    def picture(self) -> NDArray[np.float32]:
+        """Return what the light makes of the colours, (H, W, 3)."""
+        seen = _pixels(self.colour)
+        x, y, z = self._camera
+        light = 1.0 + 0.5 * (x - 0.4 - self._down[::FINE] * z)
+        seen *= (light - 0.7 * (y - self._across[::FINE] * z))[..., None]
+        return seen
 
-    def _draw(self, block: WoodenBlock) -> None:
+    def draw(self, block: WoodenBlock) -> None:
         """Draw a block where it is nearer than what is there: three slabs, seen from its frame."""
         box = self._box_of(block)
         across, down = self._across[box[1]], self._down[box[0]]
@@ -301,8 +299,10 @@ class _Rays:
 
 
 def laid(seed: int, supply: int = 5) -> TowerTable:
-    """Return a table: a tower of two wooden blocks, ``supply`` black ones that a robot at (0, 0)
-    reaches and one that is too far for it, black things that are no blocks, and wooden blocks.
+    """Return a table with a tower of two wooden blocks and things that lie about.
+
+    ``supply``: black blocks that a robot at (0, 0) reaches. One more is too far for it, two black
+    things are no blocks, and three blocks are wooden.
     """
     table = TowerTable(seed)
     random = table.random
@@ -318,9 +318,7 @@ def laid(seed: int, supply: int = 5) -> TowerTable:
     return table
 
 
-def _anywhere(
-    table: TowerTable, colour: str, size: tuple[float, float, float]
-) -> WoodenBlock:
+def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) -> WoodenBlock:
     """Return a thing that lies where there is room for a gripper, and within a robot's reach."""
     for _ in range(100_000):
         x, y = table.random.uniform(0.17, 0.46), table.random.uniform(-0.26, 0.26)

@@ -1,5 +1,4 @@
-"""``smartcam demo --tower``: black blocks are found by colour, the tower by depth; or it is said why
-not."""
+"""``smartcam demo --tower``: blocks are found by colour, the tower by depth, or not."""
 
 from __future__ import annotations
 
@@ -87,7 +86,7 @@ async def test_wrong_colour_finds_no_block_and_says_what_there_is(
 async def test_missing_block_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     table = laid(2, 1)
     table.blocks = [one for one in table.blocks if one.colour != "black" or one.size != BLOCK]
-    with pytest.raises(FrameFormatError, match="got [12] regions of it") as caught:
+    with pytest.raises(FrameFormatError, match=r"got [12] regions of it") as caught:
         await tower(Options(as_json=True), 2, table=table)  # a square and a stick are black, too
     assert caught.value.source == demo_tower.ARM
     too_far = laid(2, 0)
@@ -197,7 +196,7 @@ def test_demo_with_tower_is_a_command_and_the_same_each_time() -> None:
     first, second = (run("demo", "--tower", "--seed", "4").done().out for _ in range(2))
     assert first == second
     assert "The tower has 7 layers, 105.0 mm" in first
-    assert "all within 2 mm, 1 degrees, 1 mm" in first
+    assert "all within 2 mm, 1 degree, 1 mm" in first
 
 
 def test_demos_are_run_one_at_a_time() -> None:

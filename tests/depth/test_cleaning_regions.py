@@ -59,7 +59,9 @@ def test_polygon_has_the_pixels_whose_middles_are_inside() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("smoothed", "holes", "most"), [(0, 0.05, 0.1), (1, 0, 0.1), (2, 0.05, 0.3)])
+@pytest.mark.parametrize(
+    ("smoothed", "holes", "most"), [(0, 0.05, 0.1), (1, 0, 0.1), (2, 0.05, 0.3)]
+)
 def test_sigma_is_what_the_median_scatters_by(smoothed: int, holes: float, most: float) -> None:
     random = np.random.default_rng(2)
     smooth = SpatialFilter(0.5, 1.0, max(1, smoothed))

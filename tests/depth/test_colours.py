@@ -32,8 +32,9 @@ def rectangle(
     """Return the pixels whose middles lie in a rectangle."""
     y, x = np.mgrid[:size, :size].astype(float)
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    along, across = c * (x - centre[0]) + s * (y - centre[1]), c * (y - centre[1]) - s * (
-        x - centre[0]
+    along, across = (
+        c * (x - centre[0]) + s * (y - centre[1]),
+        c * (y - centre[1]) - s * (x - centre[0]),
     )
     inside: NDArray[np.bool_] = (np.abs(along) < sides[0] / 2) & (np.abs(across) < sides[1] / 2)
     return inside
@@ -87,7 +88,12 @@ def test_mask_has_the_pixels_of_the_range(given: ColourRange) -> None:
 
 def test_red_goes_over_the_end_of_the_hues() -> None:
     reds = ColourRange(hue=(170, 10), saturation=(100, 255), value=(100, 255))
-    for colour, inside in ((RED, True), ((200, 30, 20), True), (GREEN, False), ((0, 0, 255), False)):
+    for colour, inside in (
+        (RED, True),
+        ((200, 30, 20), True),
+        (GREEN, False),
+        ((0, 0, 255), False),
+    ):
         assert reds.mask(flat(colour)).all() == inside
         assert reds.mask(flat(colour)).any() == inside
 
@@ -99,9 +105,7 @@ def test_frames_of_any_format_have_a_mask() -> None:
     expected = (picture == BLACK).all(axis=2)
     size = {"width": 60, "height": 40}
     rgb = frame(data=picture.tobytes(), format=find_format("RGB8"), stride=180, **size)
-    bgr = frame(
-        data=picture[..., ::-1].tobytes(), format=find_format("BGR8"), stride=180, **size
-    )
+    bgr = frame(data=picture[..., ::-1].tobytes(), format=find_format("BGR8"), stride=180, **size)
     grey = frame(data=picture.max(axis=2).tobytes(), format=find_format("Mono8"), stride=60, **size)
     deep = frame(
         data=(picture.max(axis=2).astype("<u2") << 2).tobytes(),
@@ -149,7 +153,7 @@ def test_range_that_is_none_is_told(wrong: dict[str, Any]) -> None:
 def test_range_is_the_same_by_way_of_json_and_python() -> None:
     given = ColourRange(hue=(170, 10), saturation=(5, 6), value=(7, 8))
     assert ColourRange(**json.loads(given.as_json())) == given
-    assert eval(repr(given), {"ColourRange": ColourRange}) == given
+    assert repr(given) == "ColourRange(hue=(170, 10), saturation=(5, 6), value=(7, 8))"
 
 
 def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
