@@ -20,6 +20,7 @@ from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import ColourSite
 from smartcam.web import _colours as colours_module
 from smartcam.web._colours import CALLS, KEPT, MAX_KEPT, MAX_LOOKS
+from tests import ROOT
 from tests.cli.commandline import run
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.processes import Process
@@ -261,6 +262,16 @@ def test_quality_that_is_none_is_told() -> None:
     _, source = scripted()
     with pytest.raises(ConfigurationError, match="quality: expected 1 to 100, got 0"):
         ColourSite(source, quality=0)
+
+
+def test_document_has_every_call_and_bound() -> None:
+    page = (ROOT / "docs" / "tower.md").read_text(encoding="utf-8")
+    for call in CALLS:
+        sample = f"`{call.sample}`" if call.sample else ""
+        assert f"| {call.method} | `{call.path}` | {call.about} | {sample} |" in page
+    assert KEPT == 2
+    assert f"two pictures are kept for each of the last {MAX_KEPT}" in page
+    assert f"At most {MAX_LOOKS} may wait" in page
 
 
 # ---------------------------------------------------------------------- the command
