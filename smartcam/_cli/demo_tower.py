@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from smartcam._cli.options import Options
     from smartcam.depth import ColourRegion
-    from smartcam.depth._simulation import Sight, TowerTable, WoodenBlock
+    from smartcam.depth._simulation import TableSight, TowerTable, WoodenBlock
 
 LAYERS: Final = 5
 """Blocks that the robot puts onto the tower."""
@@ -75,7 +75,7 @@ ARM: Final = "camera at the hand"
 """Whose pictures errors are about."""
 
 
-class Found(NamedTuple):
+class BlockPose(NamedTuple):
     """Where something lies, in the robot's frame: metres and radians."""
 
     x: float
@@ -89,7 +89,7 @@ class Compared(NamedTuple):
     """Something found, beside the truth: metres and radians."""
 
     what: str
-    found: Found
+    found: BlockPose
     beside: float
     turned: float
     higher: float
@@ -145,10 +145,10 @@ async def tower(
 class Seen(NamedTuple):
     """What the robot has found out before it moves a block."""
 
-    blocks: list[Found]  # that lie on the table
-    reached: list[Found]  # those of them that it can grip
-    block: Found  # the one that it takes
-    top: Found  # of the tower
+    blocks: list[BlockPose]  # that lie on the table
+    reached: list[BlockPose]  # those of them that it can grip
+    block: BlockPose  # the one that it takes
+    top: BlockPose  # of the tower
 
 
 def _look(table: TowerTable, colours: ColourRange) -> Seen:
@@ -211,13 +211,15 @@ def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Comp
 # ---------------------------------------------------------------------- what the camera tells
 
 
-def loose_blocks(sight: Sight, depth: NDArray[np.float32], colours: ColourRange) -> list[Found]:
+def loose_blocks(
+    sight: TableSight, depth: NDArray[np.float32], colours: ColourRange
+) -> list[BlockPose]:
     """Return the blocks of a colour that lie on the table, as seen from far above.
 
     Raises:
         FrameFormatError: there is none; it says what there is instead.
     """
-    lying: list[Found] = []
+    lying: list[BlockPose] = []
     for one in _regions(sight, colours):
         height = sight.camera[2] - region_depth(depth, one.mask).median
         if abs(height - BLOCK[2]) < EDGE:  # and not on the tower
@@ -227,7 +229,7 @@ def loose_blocks(sight: Sight, depth: NDArray[np.float32], colours: ColourRange)
     return lying
 
 
-def measured_block(table: TowerTable, rough: Found, colours: ColourRange) -> Found:
+def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) -> BlockPose:
     """Go above a block and return its pose; from there its sides are hardly seen.
 
     Raises:
@@ -248,7 +250,7 @@ def measured_block(table: TowerTable, rough: Found, colours: ColourRange) -> Fou
     return block
 
 
-def tower_place(sight: Sight, depth: NDArray[np.float32]) -> tuple[float, float]:
+def tower_place(sight: TableSight, depth: NDArray[np.float32]) -> tuple[float, float]:
     """Return where something is higher than one block, x and y in metres.
 
     Raises:
@@ -259,7 +261,7 @@ def tower_place(sight: Sight, depth: NDArray[np.float32]) -> tuple[float, float]
     return to_robot(sight.camera, *region.centre, height)
 
 
-def measured_top(table: TowerTable, x: float, y: float) -> Found:
+def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
     """Go above the tower and return the pose and the height of its top.
 
     Raises:
@@ -281,21 +283,21 @@ def measured_top(table: TowerTable, x: float, y: float) -> Found:
     return _pose(sight, top, sight.camera[2] - told.median)._replace(sigma=told.sigma)
 
 
-def _regions(sight: Sight, colours: ColourRange) -> list[ColourRegion]:
+def _regions(sight: TableSight, colours: ColourRange) -> list[ColourRegion]:
     """Return what may be a block by its colour, area and sides."""
     return find_regions(
         colours.mask(sight.rgb), area=_area(sight), ratio=RATIO, fullness=FULLNESS, whole=True
     )
 
 
-def _area(sight: Sight) -> tuple[float, float]:
+def _area(sight: TableSight) -> tuple[float, float]:
     """Return the least and largest area of a block on the table, pixels."""
     scale = FOCAL / (sight.camera[2] - BLOCK[2])
     least, most = (part * BLOCK[0] * BLOCK[1] * scale**2 for part in AREA)
     return least, most
 
 
-def _high(sight: Sight, depth: NDArray[np.float32]) -> list[ColourRegion]:
+def _high(sight: TableSight, depth: NDArray[np.float32]) -> list[ColourRegion]:
     """Return the regions that are higher than one block, the largest first."""
     mask = (depth > 0) & (sight.camera[2] - depth > BLOCK[2] + EDGE)
     found = find_regions(mask, area=(_area(sight)[0], math.inf))
@@ -317,13 +319,13 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return inner
 
 
-def _pose(sight: Sight, region: ColourRegion, height: float) -> Found:
+def _pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
     x, y = to_robot(sight.camera, *region.centre, height)
     way = AXES @ (math.cos(region.orientation), math.sin(region.orientation), 0.0)
-    return Found(x, y, math.remainder(math.atan2(way[1], way[0]), math.pi), height)
+    return BlockPose(x, y, math.remainder(math.atan2(way[1], way[0]), math.pi), height)
 
 
-def _nothing(sight: Sight, colours: ColourRange) -> FrameFormatError:
+def _nothing(sight: TableSight, colours: ColourRange) -> FrameFormatError:
     """Return an error that says what there is of a colour, where no block is."""
     least, most = _area(sight)
     found = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
@@ -342,7 +344,7 @@ def _shape(region: ColourRegion) -> str:
 # ---------------------------------------------------------------------- beside the truth
 
 
-def _compared(what: str, found: Found, true: WoodenBlock) -> Compared:
+def _compared(what: str, found: BlockPose, true: WoodenBlock) -> Compared:
     beside = math.hypot(found.x - true.x, found.y - true.y)
     turned = math.remainder(found.angle - true.angle, math.pi)
     return Compared(what, found, beside, turned, found.height - true.top)

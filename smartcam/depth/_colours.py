@@ -82,12 +82,11 @@ class ColourRange:
             found = self._between(picture, low, high)
         else:
             found = self._between(picture, low, MOST["hue"]) | self._between(picture, 0, high)
-        return found.view(bool)
+        return found > 0
 
     def _between(self, picture: NDArray[np.uint8], low: int, high: int) -> NDArray[np.uint8]:
         lows, highs = zip((low, high), self.saturation, self.value, strict=True)
-        found = np.asarray(load("cv2").inRange(picture, lows, highs))
-        return np.minimum(found, 1)
+        return np.asarray(load("cv2").inRange(picture, lows, highs))
 
     @classmethod
     def around(

@@ -150,9 +150,9 @@ def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
     if region is None:
         return np.ones(shape, bool)
     try:
-        given = np.asarray(region)
+        given: NDArray[Any] = np.asarray(region)
     except ValueError:
-        given = np.empty(0)
+        given = np.zeros(0)
     if given.dtype == bool and given.shape == shape:
         return given
     if given.dtype.kind in "iuf" and np.isfinite(given).all():

@@ -79,7 +79,7 @@ class WoodenBlock:
         return self.z + self.size[2]
 
 
-class Sight(NamedTuple):
+class TableSight(NamedTuple):
     """What the camera sees from a place."""
 
     camera: tuple[float, float, float]  # where it is, metres
@@ -122,16 +122,16 @@ class TowerTable:
         self.held: WoodenBlock | None = None
         self._beside = self.random.normal(0, CAMERA_SIGMA, 3)
 
-    def look(self, camera: tuple[float, float, float], maps: int = 1) -> Sight:
+    def look(self, camera: tuple[float, float, float], maps: int = 1) -> TableSight:
         """Return a picture and so many depth maps, as seen from about a place (metres)."""
         true = np.add(camera, self._beside)
-        rays = _Rays((float(true[0]), float(true[1]), float(true[2])))
+        rays = _TableRays((float(true[0]), float(true[1]), float(true[2])))
         for block in self.blocks:
             rays.draw(block)
         seen = rays.picture()
         seen += GREY_SIGMA * self.random.standard_normal(seen.shape, np.float32)
         rgb = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
-        return Sight(camera, rgb, self._measured(rays.depth, maps) if maps else [])
+        return TableSight(camera, rgb, self._measured(rays.depth, maps) if maps else [])
 
     def tower(self) -> list[WoodenBlock]:
         """Return the blocks of the tower, the lowest first: of the highest stack."""
@@ -228,7 +228,7 @@ def _hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     return found
 
 
-class _Rays:
+class _TableRays:
     """The rays of a camera; where they end has a depth and a colour."""
 
     def __init__(self, camera: tuple[float, float, float]) -> None:

@@ -162,10 +162,12 @@ class ColourSite(Site):
         """Have a thread do something with a frame.
 
         Raises:
-            RefusedError: its bytes are wrong, or something is not installed.
+            RefusedError: its bytes are wrong, or the site is stopped.
 
         Cancellation: safe; a thread that has begun goes on to the end.
         """
+        if self._threads is None:
+            raise RefusedError(503, "a site that ends", "one that runs")
         try:
             return await asyncio.get_running_loop().run_in_executor(self._threads, what, *args)
         except FrameSourceError as exc:
@@ -208,7 +210,7 @@ class ColourSite(Site):
             "jpeg": len(picture),
         }
         head = json.dumps(said).encode()
-        return len(head).to_bytes(4, "little") + head + picture + png.tobytes()
+        return b"".join((len(head).to_bytes(4, "little"), head, picture, png.tobytes()))
 
     @contextlib.contextmanager
     def _one_more(self) -> Iterator[None]:

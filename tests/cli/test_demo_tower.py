@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smartcam._cli import demo_tower
-from smartcam._cli.demo_tower import MISSED, Found, measured_block, tower
+from smartcam._cli.demo_tower import MISSED, BlockPose, measured_block, tower
 from smartcam._cli.options import Options
 from smartcam.depth import ColourRange
 from smartcam.depth._simulation import (
@@ -105,7 +105,7 @@ async def test_missing_tower_is_said(capsys: pytest.CaptureFixture[str]) -> None
 def test_block_that_moved_between_two_looks_is_not_picked_elsewhere() -> None:
     table = TowerTable(1)
     table.blocks.append(WoodenBlock(0.33, 0.0, 0.3, colour="black"))
-    rough = Found(0.30, 0.0, 0.3, BLOCK[2])
+    rough = BlockPose(0.30, 0.0, 0.3, BLOCK[2])
     with pytest.raises(FrameFormatError, match=r"one 30 mm beside it: something has moved"):
         measured_block(table, rough, demo_tower.BLACK)
     table.blocks.clear()
@@ -166,7 +166,7 @@ def test_simulated_block_is_where_its_corners_are_seen() -> None:
         for x in (-BLOCK[0] / 2, BLOCK[0] / 2)
         for y in (-BLOCK[1] / 2, BLOCK[1] / 2)
     ]
-    seen = [to_robot(camera, x, y, 0.045) for x, y in zip(columns, rows, strict=True)]
+    seen = [to_robot(camera, float(x), float(y), 0.045) for x, y in zip(columns, rows, strict=True)]
     for corner in corners:  # a pixel is 0.8 mm, and the camera is not quite where it is said to be
         assert min(math.dist(corner, one) for one in seen) < 2e-3
 

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from smartcam.depth import SpatialFilter, TemporalFilter, fill_holes
-from smartcam.depth._cleaning import as_metres
+from smartcam.depth._cleaning import _widened, as_metres
+from smartcam.depth._simulation import FINE, TowerTable, WoodenBlock, _jumps, _TableRays
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 NEAR, FAR, SIGMA = 0.45, 0.50, 0.002
@@ -184,6 +185,48 @@ def test_numbers_out_of_range_are_told() -> None:
     for persistence in (-1, 255):
         with pytest.raises(ConfigurationError, match="persistence: expected 0 to 254"):
             TemporalFilter(persistence=persistence)
+
+
+# ---------------------------------------------------------------------- a rendered scene
+
+
+def crossings(depth: Map, level: float) -> Map:
+    """Return in which column each row goes below a level, from the left, nan where a hole does."""
+    below = (depth > 0) & (depth < level)
+    first = below.argmax(axis=1)
+    before = depth[np.arange(len(depth)), first - 1]
+    return np.where((before > 0) & below.any(axis=1), first.astype(float), np.nan)
+
+
+def test_rendered_scene_gets_nearer_to_its_truth_and_keeps_its_edges() -> None:
+    table = TowerTable(1)
+    table._beside[:] = 0  # the camera is where it is said to be
+    table.blocks.append(WoodenBlock(0.4, 0.0, 0.5, size=(0.12, 0.06, 0.04)))
+    camera = (0.4, 0.0, 0.5)
+    rays = _TableRays(camera)
+    rays.draw(table.blocks[0])
+    truth = rays.depth[FINE // 2 :: FINE, FINE // 2 :: FINE]
+    average, smooth = TemporalFilter(delta=0.008), SpatialFilter(delta=0.008)
+    maps = table.look(camera, 5).depth
+    for one in maps:
+        steady = average(one)
+    clean = smooth(steady)
+    raw = as_metres(maps[-1])
+    errors = [rms(one[there], truth[there]) for one in (raw, steady, clean) for there in [one > 0]]
+    flat = ~_widened(_widened(_jumps(truth), np.logical_or), np.logical_or)
+    inner = [rms(np.where(flat, one, 0), truth) for one in (raw, steady, clean)]
+    assert errors[0] > errors[1] > errors[2]
+    assert inner[1] < 0.7 * inner[0]
+    assert inner[2] < 0.25 * inner[0]
+    assert np.count_nonzero(clean) >= np.count_nonzero(raw)
+    # where the right side of the block is: there the second camera sees the table, too
+    level = (camera[2] + truth.min()) / 2
+    rows = truth[:, ::-1].min(axis=1) < level
+    wanted = crossings(truth[rows, ::-1], level)
+    found = crossings(clean[rows, ::-1], level)
+    off = np.abs(found - wanted)
+    assert np.count_nonzero(np.isfinite(off)) > 50
+    assert np.nanpercentile(off, 95) <= 1
 
 
 # ---------------------------------------------------------------------- in time

@@ -244,7 +244,7 @@ def test_wrong_limits_and_masks_are_told() -> None:
     mask = np.ones((4, 4), bool)
     for wrong in ({"area": (5, 2)}, {"ratio": (-1, 2)}, {"fullness": 1.5}):
         with pytest.raises(ConfigurationError, match=r"expected \(from, to\)"):
-            find_regions(mask, **wrong)  # type: ignore[arg-type]
+            find_regions(mask, **wrong)
     for bad in (mask.astype(np.uint8), np.ones(4, bool), np.ones((0, 3), bool)):
         with pytest.raises(FrameFormatError, match="expected a mask"):
             find_regions(bad)  # type: ignore[arg-type]

@@ -31,7 +31,8 @@ async function call(path, body) {
 
 // ---------------------------------------------------------------------- pictures
 
-// Show an answer of /api/look; newest: it is no picture of before with another range.
+// Show an answer of /api/look, and tell whether it was shown. newest: it is no picture of before
+// with another range.
 async function show(response, newest) {
   const data = await response.arrayBuffer();
   const came = performance.now();
@@ -42,7 +43,8 @@ async function show(response, newest) {
     createImageBitmap(new Blob([new Uint8Array(data, begin, about.jpeg)], { type: "image/jpeg" })),
     createImageBitmap(new Blob([new Uint8Array(data, begin + about.jpeg)], { type: "image/png" })),
   ]);
-  if (newest || !shown || about.sequence >= shown.sequence) {
+  const wanted = newest || !shown || about.sequence >= shown.sequence;
+  if (wanted) {
     paint($("picture"), picture);
     frame(paint($("mask"), mask), about);
     shown = { ...about, came };
@@ -53,6 +55,7 @@ async function show(response, newest) {
   picture.close();
   mask.close();
   age();
+  return wanted;
 }
 
 function paint(canvas, bitmap) {
@@ -117,7 +120,9 @@ async function mask() {
   if (masking) return;
   masking = true;
   try {
-    while (shown && JSON.stringify(shown.range) !== asked()) await show(await look(true), false);
+    while (shown && JSON.stringify(shown.range) !== asked()) {
+      if (!(await show(await look(true), false))) break;
+    }
   } catch (error) {
     if (!(error instanceof Refused)) say(unreachable());
   } finally {
