@@ -36,6 +36,9 @@ CAMERA_SIGMA: Final = 2e-4
 GRIP: Final = 5e-3
 """Metres; how far beside a block the gripper still takes it."""
 
+ROOM: Final = 0.01
+"""Metres between things on the table at least, for a gripper and for the eye."""
+
 GREY_SIGMA: Final = 3.0
 """Noise of a picture's levels."""
 
@@ -319,11 +322,21 @@ def laid(seed: int, supply: int = 5) -> TowerTable:
 
 
 def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) -> WoodenBlock:
-    """Return a thing that lies where there is room for a gripper, and within a robot's reach."""
+    """Return a thing that lies where there is room for a gripper, and within a robot's reach.
+
+    Nor does it lie where the tower, when it is high, hides it from a camera above the middle.
+    """
+    tower = table.blocks[0]
     for _ in range(100_000):
         x, y = table.random.uniform(0.17, 0.46), table.random.uniform(-0.26, 0.26)
-        apart = min(math.hypot(x - one.x, y - one.y) for one in table.blocks)
-        if apart > 0.09 and 0.2 < math.hypot(x, y) < 0.47:
+        apart = min(
+            math.hypot(x - one.x, y - one.y)
+            - math.hypot(*size[:2]) / 2
+            - math.hypot(*one.size[:2]) / 2
+            for one in table.blocks
+        )
+        beside = math.hypot(x - tower.x, y - tower.y)
+        if apart > ROOM and beside > 0.13 and 0.2 < math.hypot(x, y) < 0.47:
             angle = table.random.uniform(-math.pi / 2, math.pi / 2)
             return WoodenBlock(x, y, angle, colour=colour, size=size)
     raise ValueError("the table is full")
