@@ -28,6 +28,8 @@ BENCHMARKS = {
     "stereo": "squares of OpenCV's pairs that were left out; boards against dots",
     "hand_eye": "error of a camera on a robot over the bound, and of recorded poses left out",
     "frames": "a frame to its readers and to a JPEG, and the delay of the loop",
+    "pictures": "bytes of a picture at the same PSNR, and the CPU time of codecs",
+    "transports": "pictures from stamp to stamp: bus, RTP, on request, GStreamer, rospy",
     "scaling": "cost of a message over 10^3 to 10^6 of them",
 }
 """Modules of this package with a ``run(plan)``, and what they measure."""

@@ -2,7 +2,8 @@
 
 Frames are handed on without a copy, so the yardstick of one reader is the same driver whose frames
 go straight into an ``asyncio.Queue`` of one. JPEGs are encoded by the codecs' threads, beside
-simplejpeg called alone with the same picture and quality. The CPU time is the process', with all of
+simplejpeg called alone with the same picture and quality, and in a bare thread: what the way there
+and back costs, which is what the loop is kept free with. The CPU time is the process', with all of
 its threads.
 
 The loop's delay is of the wall clock: the longest time by which a timer of 1 ms came too late while
@@ -14,6 +15,8 @@ from __future__ import annotations
 
 import asyncio
 import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +27,7 @@ from smartcam import frames
 from smartcam.frames._synthetic import SyntheticDriver, stripes
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Callable, Iterator
 
     from benchmarks.measure import Cost, Plan
 
@@ -93,7 +96,12 @@ async def _compared(plan: Plan) -> AsyncIterator[Comparison]:
         yield Comparison("frames", f"a frame to {name}, over a bare queue", found[name], bare)
     pictures = plan.operations(PICTURES, least=3)
     found = await take_turns_awaiting(
-        plan, {"codecs": lambda: _jpegs(pictures), "simplejpeg": lambda: _alone(pictures)}
+        plan,
+        {
+            "codecs": lambda: _jpegs(pictures),
+            "simplejpeg": lambda: _alone(pictures),
+            "in a thread": lambda: _in_a_thread(pictures),
+        },
     )
     yield Comparison(
         "frames",
@@ -102,6 +110,12 @@ async def _compared(plan: Plan) -> AsyncIterator[Comparison]:
         found["simplejpeg"],
         "ratio",
         Goal("at most", 1.1),
+    )
+    yield Comparison(
+        "frames",
+        "the same over simplejpeg in a bare thread of the loop's",
+        found["codecs"],
+        found["in a thread"],
     )
     seconds = 0.2 if plan.quick else SECONDS
     delays, idle = [], []
@@ -161,11 +175,28 @@ async def _jpegs(count: int) -> Cost:
         return cpu_microseconds(begin, count)
 
 
-async def _alone(count: int) -> Cost:
+def _bare() -> Callable[[], bytes]:
+    """Return what makes the same JPEG without us."""
     picture = np.ascontiguousarray(_frame().array())[..., None]
+    return partial(simplejpeg.encode_jpeg, picture, quality=85, colorspace="GRAY")
+
+
+async def _in_a_thread(count: int) -> Cost:
+    encode = _bare()
+    with ThreadPoolExecutor(1) as pool:
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(pool, encode)
+        begin = time.process_time()
+        for _ in range(count):
+            await loop.run_in_executor(pool, encode)
+        return cpu_microseconds(begin, count)
+
+
+async def _alone(count: int) -> Cost:
+    encode = _bare()
     begin = time.process_time()
     for _ in range(count):
-        simplejpeg.encode_jpeg(picture, quality=85, colorspace="GRAY")
+        encode()
     return cpu_microseconds(begin, count)
 
 

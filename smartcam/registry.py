@@ -221,6 +221,7 @@ FRAMES = Registry(
         "gige": "smartcam.frames._gige.driver:GigEDriver",
         "http": "smartcam.frames._video:VideoDriver",
         "insight": "smartcam.frames._insight:InSightDriver",
+        "rtp": "smartcam.frames._rtp.driver:RtpDriver",
         "rtsp": "smartcam.frames._video:VideoDriver",
         "synthetic": "smartcam.frames._synthetic:SyntheticDriver",
         "v4l2": "smartcam.frames._v4l2.driver:V4L2Driver",

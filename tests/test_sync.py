@@ -196,6 +196,7 @@ def test_subscription_that_nobody_holds_is_gone(camera: SyncCamera[Any]) -> None
     assert camera.statistics().subscribers == []
 
 
+@pytest.mark.long
 def test_many_threads_share_a_camera(camera: SyncCamera[Any]) -> None:
     with ThreadPoolExecutor(8) as pool:
         results = [*pool.map(lambda _: camera.trigger(timeout=PATIENCE), range(40))]

@@ -14,7 +14,7 @@ from smartcam._cli.calibrate_files import OWN, OwnContext, WithFiles, compare, d
 from smartcam._cli.calibrate_lens import lens as calibrate_lens
 from smartcam._cli.calibrate_lens import read_target
 from smartcam._cli.calibrate_terminal import drive, listing_text
-from smartcam._cli.frames import is_source, opened
+from smartcam._cli.frame_sources import is_source, opened
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import numpy as np
 
-from smartcam._cli.frames import is_source, opened
+from smartcam._cli.frame_sources import is_source, opened
 from smartcam._cli.options import OUTPUT, Options, naming, option, runs
 from smartcam._cli.texts import table_text
 from smartcam.exceptions import CalibrationError, ConfigurationError, FrameTimeoutError

@@ -13,18 +13,16 @@ import click
 from smartcam._cli.frame_colours import colours
 from smartcam._cli.frame_files import SUFFIXES, Encoding, numbered
 from smartcam._cli.frame_measure import measure, measured_text
+from smartcam._cli.frame_sources import TIMEOUT, opened
+from smartcam._cli.frames_serve import serve, show
 from smartcam._cli.options import OUTPUT, Options, option, runs
-from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import JsonErrors, first
-from smartcam.backoff import Backoff
+from smartcam._cli.running import JsonErrors
 from smartcam.exceptions import (
     ConfigurationError,
-    FrameFormatError,
     FrameSourceError,
     SmartCamError,
 )
 from smartcam.frames import FrameDriver, discover
-from smartcam.frames import open as open_frames
 from smartcam.frames._reader import FRAME_TIMEOUT
 from smartcam.models import jsonable
 from smartcam.registry import FRAMES
@@ -33,17 +31,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from smartcam.frames import FoundSource, Frame, FrameSource
-    from smartcam.web import FramesSite
-
-MOST_SHOWN = 4
-"""Sources side by side on a page."""
 
 MOST_GRABBED = 100_000
 """Files of one command."""
-
-TIMEOUT = (
-    "Bound of the wait for a frame, and of a device that streams and gives none.  [default: 5]"
-)
 
 
 class FrameCommands(JsonErrors, click.Group):
@@ -61,18 +51,8 @@ def frames() -> None:
     """Have the commands of frames."""
 
 
-def is_source(text: str) -> bool:
-    """Tell whether a text is the URL of a source, and no file or folder."""
-    return "://" in text
-
-
-def opened(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
-    """Return an unopened source; one without a frame for ``--timeout`` counts as stuck.
-
-    Raises ConfigurationError: the URL is wrong.
-    """
-    seconds = options.step(FRAME_TIMEOUT)
-    return open_frames(url, timeout=seconds, stall=seconds, linger=linger)
+frames.add_command(serve)
+frames.add_command(show)
 
 
 # ---------------------------------------------------------------------- list
@@ -281,74 +261,6 @@ def _write(file: str, data: bytes) -> None:
         Path(file).write_bytes(data)
     except OSError as exc:
         raise ConfigurationError(f"{file}: cannot be written: {exc.strerror}") from exc
-
-
-# ---------------------------------------------------------------------- show
-
-
-@frames.command(
-    help=f"Serve a page of one source, or of up to {MOST_SHOWN} side by side, until Ctrl-C: the "
-    "newest frame of each, its age, rates, what was skipped and lost. The page's address goes to "
-    "stdout. A device streams while somebody looks; one that is not there is awaited, and the page "
-    'says so. Needs the extras "web" and "frames".'
-)
-@click.argument("urls", metavar="URL...", nargs=-1, required=True)
-@click.option(
-    "--quality",
-    type=click.IntRange(1, 100),
-    default=80,
-    show_default=True,
-    help="Of the JPEGs that the page gets; those of a camera that sends some stay as they are.",
-)
-@page_options("", always=True)
-@option("--seconds")
-@option("--timeout", help=TIMEOUT)
-@runs(*OUTPUT)
-async def show(urls: tuple[str, ...], quality: int, web: PageOptions, options: Options) -> None:
-    if len(urls) > MOST_SHOWN:
-        raise click.UsageError(f"expected {MOST_SHOWN} URLs at most, got {len(urls)}")
-    from smartcam.web import FramesSite
-
-    sources = [opened(url, options) for url in urls]
-    site = FramesSite(sources, quality=quality, **web.place)
-    tried = [asyncio.Event() for _ in sources]
-    jobs = [
-        _have_open(site, place, *each)
-        for place, each in enumerate(zip(sources, tried, strict=True))
-    ]
-    await first([_serve(site, tried, options), *jobs], options.seconds)
-
-
-async def _serve(site: FramesSite, tried: Sequence[asyncio.Event], options: Options) -> None:
-    """Serve the page, once each source was tried."""
-    for one in tried:
-        await one.wait()
-    async with site:
-        options.show({"page": site.url}, f"page: {site.url}")
-        await asyncio.Event().wait()
-
-
-async def _have_open(
-    site: FramesSite, place: int, source: FrameSource, tried: asyncio.Event
-) -> None:
-    """Open a source until it is there, and have it open until this is cancelled.
-
-    Raises FrameFormatError, ConfigurationError: it will never be what was asked for.
-    """
-    for delay in Backoff().delays():
-        try:
-            async with source:
-                site.failures.pop(place, None)
-                tried.set()
-                await asyncio.Event().wait()
-        except FrameFormatError:
-            raise
-        except FrameSourceError as exc:
-            if site.failures.get(place) != str(exc):
-                click.echo(f"note: {exc}; it is awaited", err=True)
-            site.failures[place] = str(exc)
-        tried.set()
-        await asyncio.sleep(delay)
 
 
 # ---------------------------------------------------------------------- measure

@@ -272,6 +272,7 @@ async def _hello(call: ProgramCall) -> Answer:
         **host.about(),
         **host.state(),
         "program": call.owner.program,
+        "frames": host.frames.make is not None,
         "results": host.results.following,
         "states": host.states.following,
     }, []

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._program import Program
     from smartcam.fleet._wire import BusMessage
-    from smartcam.frames import FrameReader
+    from smartcam.frames import FrameReader, FrameSource
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
@@ -691,16 +691,31 @@ class FleetCamera(Camera[ValueT]):
         quality: int | None = None,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> AsyncGenerator[FrameReader]:
+        async with (
+            self.frame_source(encoding, quality, timeout=timeout) as source,
+            source.reader() as reader,
+        ):
+            yield reader
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether the agent has said that the camera has frames."""
+        return bool(self._about.get("frames"))
+
+    def frame_source(
+        self,
+        encoding: FrameEncoding = "raw",
+        quality: int | None = None,
+        *,
+        timeout: float | None = FRAME_TIMEOUT,
+    ) -> FrameSource:
+        """Return what :meth:`frames` reads, for several readers; not opened yet."""
         from smartcam.fleet._frame_caller import SharedFrameDriver
         from smartcam.frames import FrameAddress, FrameSource
 
         wanted = FrameForm.checked(encoding, quality, self.name)
         driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, wanted)
-        async with (
-            FrameSource(driver, timeout=timeout, stall=None) as source,
-            source.reader() as reader,
-        ):
-            yield reader
+        return FrameSource(driver, timeout=timeout, stall=None)
 
     async def newest_frame(
         self,

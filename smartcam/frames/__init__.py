@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
     from smartcam.frames._reader import FrameReader, ReaderStatistics
+    from smartcam.frames._rtp.feedback import RtpReceiver
+    from smartcam.frames._rtp.receiver import RtpStatistics
+    from smartcam.frames._rtp.sender import RtpSender, RtpSenderStatistics
+    from smartcam.frames._rtsp.server import RtspServer
+    from smartcam.frames._rtsp.streams import RtspStatistics
     from smartcam.frames._source import FrameSource, SourceStatistics
     from smartcam.frames._stages import Rectifier, Undistorter
 
@@ -49,6 +54,12 @@ __all__ = [
     "PixelFormat",
     "ReaderStatistics",
     "Rectifier",
+    "RtpReceiver",
+    "RtpSender",
+    "RtpSenderStatistics",
+    "RtpStatistics",
+    "RtspServer",
+    "RtspStatistics",
     "SourceStatistics",
     "StreamFormat",
     "Undistorter",
@@ -71,6 +82,11 @@ if not TYPE_CHECKING:
             "_opening": "discover open",
             "_pixels": "PixelFormat find_format",
             "_reader": "FrameReader ReaderStatistics",
+            "_rtp.feedback": "RtpReceiver",
+            "_rtp.receiver": "RtpStatistics",
+            "_rtp.sender": "RtpSender RtpSenderStatistics",
+            "_rtsp.server": "RtspServer",
+            "_rtsp.streams": "RtspStatistics",
             "_source": "FrameSource SourceStatistics",
             "_stages": "Rectifier Undistorter",
         },

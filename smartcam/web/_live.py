@@ -9,7 +9,9 @@ from pydantic import Field
 
 from smartcam.exceptions import SmartCamError
 from smartcam.web._errors import RefusedError
+from smartcam.web._live_frames import LiveFrames
 from smartcam.web._live_view import LiveView
+from smartcam.web._pictures import FILES
 from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API, Site
 from smartcam.web._streams import PERIOD, News
@@ -45,6 +47,7 @@ class LiveSite(Site):
 
     Attributes:
         view: what it shows.
+        frames: of the camera, where it has some.
         control: as given.
 
     Raises:
@@ -60,19 +63,27 @@ class LiveSite(Site):
         port: int = 0,
         token: str | None = None,
     ) -> None:
-        super().__init__(CALLS, "live", host=host, port=port, token=token)
+        super().__init__(CALLS, "live", host=host, port=port, token=token, files=FILES)
         self.control: bool = control
         self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)))
+        self.frames: LiveFrames = LiveFrames(lambda: self.view.camera)
 
     async def start(self) -> None:
         """Open the port, and follow the camera."""
         await super().start()
         self.view.start()
+        self.frames.start()
 
     async def stop(self) -> None:
         """Close the port, and leave the camera alone."""
+        await self.frames.stop()
         await self.view.stop()
         await super().stop()
+
+    def state(self) -> dict[str, Any]:
+        """Return how the camera is, and what the page may do, as JSON."""
+        has_frames = self.frames.pictures is not None
+        return {**self.view.state(), "control": self.control, "frames": has_frames}
 
 
 class LiveReader:
@@ -89,7 +100,7 @@ class LiveReader:
     def look(self) -> Iterator[News]:
         """Yield what changed since the last look; the first one tells everything."""
         view = self._view
-        yield from self._changed("camera", {**view.state(), "control": self._site.control})
+        yield from self._changed("camera", self._site.state())
         yield from self._results()
         picture = 0 if view.picture is None else view.picture.serial
         yield from self._changed("picture", {"serial": picture})
@@ -157,7 +168,7 @@ def _calls(_site: LiveSite, _call: CallRequest) -> object:
 @CALLS.add("GET", f"{API}/camera")
 def _camera(site: LiveSite, _call: CallRequest) -> object:
     """How the camera is, and what was counted."""
-    return {**site.view.state(), "control": site.control, "account": site.view.account()}
+    return {**site.state(), "account": site.view.account()}
 
 
 @CALLS.add("GET", f"{API}/results")
@@ -181,6 +192,18 @@ def _want_picture(site: LiveSite, _call: CallRequest) -> object:
     """Ask the camera for its picture anew, once a second at most; the events tell of it."""
     site.view.want_picture()
     return site.view.state()
+
+
+@CALLS.add(
+    "GET",
+    f"{API}/frames",
+    about="A WebSocket of a camera with frames, as [here](frames.md#calls): one after each `next`.",
+)
+async def _frames(site: LiveSite, call: CallRequest) -> web.StreamResponse:
+    pictures = site.frames.pictures
+    if pictures is None:
+        raise RefusedError(404, "a camera without frames", "one of a fleet, with frames: URL there")
+    return await pictures.view(0, call.request)
 
 
 @CALLS.add(

@@ -48,6 +48,7 @@ class Site(Server):
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css.
             Pages may use ``base.css`` and ``base.js``, too.
         host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
+        files: of others that the page uses beside these.
 
     Attributes:
         host: as given.
@@ -66,6 +67,7 @@ class Site(Server):
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
+        files: tuple[str, ...] = (),
     ) -> None:
         if token is not None:
             checked_token(token)
@@ -76,6 +78,7 @@ class Site(Server):
         self.streams: Streams = Streams()
         self._calls = calls
         self._page = page
+        self._files = ("base.css", "base.js", f"{page}.css", f"{page}.js", *files)
         self._port = port
         self._open: _Open | None = None
 
@@ -153,7 +156,7 @@ class Site(Server):
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))
         application.router.add_get("/", _file(f"{self._page}.html"))
-        for name in ("base.css", "base.js", f"{self._page}.css", f"{self._page}.js"):
+        for name in self._files:
             application.router.add_get(f"/{name}", _file(name))
         return application
 

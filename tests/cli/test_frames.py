@@ -448,7 +448,9 @@ def test_show_awaits_a_source_that_is_not_there(shelf: Puts) -> None:
 
 def test_show_of_a_format_that_is_not_there_ends(shelf: Puts) -> None:
     shelf(fails=FrameFormatError("shelf: it has no YUYV"))
-    run("frames", "show", "synthetic://", "shelf://").failed(5, "shelf: it has no YUYV")
+    run("frames", "show", "shelf://").failed(5, "shelf: it has no YUYV")
+    done = run("frames", "show", "synthetic://", "shelf://", "--seconds", "0.05")
+    assert (done.code, done.err) == (0, "note: shelf: it has no YUYV; it is awaited\n")
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,7 @@ def shown(*words: str, **env: str) -> str:
     return b"".join(parts).decode()
 
 
+@pytest.mark.long
 def test_doctor_has_colours_on_a_terminal_and_words_everywhere() -> None:
     with ThreadedCamera(active=21) as emulator:
         colourful = shown("doctor", emulator.url)
@@ -65,6 +66,7 @@ def test_error_is_red_on_a_terminal_and_plain_as_json() -> None:
     assert "\x1b" not in shown("status", "bvs://127.0.0.1:1", "--json")
 
 
+@pytest.mark.long
 def test_watch_counts_while_it_waits_and_leaves_result_lines_whole() -> None:
     words = ("--application", "9", "--interpret-as", "n: int32", "--seconds", "2.5")
     with ThreadedCamera() as emulator:
@@ -84,6 +86,7 @@ def test_watch_says_for_how_long_nothing_came() -> None:
     assert "0 results, nothing for 2 s\r" in text
 
 
+@pytest.mark.long
 def test_watch_shows_no_counting_line_on_a_dumb_terminal() -> None:
     with ThreadedCamera(active=21, running=True) as emulator:
         assert shown("watch", emulator.url, "--seconds", "1.5", TERM="dumb") == ""

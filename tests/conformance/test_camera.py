@@ -159,6 +159,7 @@ def test_judge_quirk_is_found_out(setting: tuple[str, Any, str, str], judged: Ju
     assert got == (pytest.approx(slowed(value), abs=slowed(slack)) if slack else value)
 
 
+@pytest.mark.long
 @at_any_pace
 def test_judge_b16_with_every_deviation_pins_them_in_the_url() -> None:
     quirks = {"no_id": True, "code": True, "big_endian_number": True}

@@ -76,6 +76,7 @@ def run_pytest(folder: Path, *arguments: str) -> Ended:
     return Ended(done.returncode, done.stdout + done.stderr)
 
 
+@pytest.mark.long
 def test_suite_in_somebodys_own_tests(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(OWN, encoding="utf-8")
     few = "triggers or sends_whole_messages or unknown_messages"

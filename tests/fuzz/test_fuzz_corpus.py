@@ -55,7 +55,13 @@ def run_corpus(target: Target) -> None:
         run(target, data, name)
 
 
-@each_target
+@pytest.mark.parametrize(
+    "target",
+    [  # scenarios take as long as all others
+        pytest.param(one, id=one.name, marks=[pytest.mark.long] if one.name == "scenario" else [])
+        for one in TARGETS.values()
+    ],
+)
 def test_corpus_gives_no_finding(target: Target) -> None:
     assert target.reached()
     run_corpus(target)

@@ -337,6 +337,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="descriptors are bounded elsewhere only")
 @pytest.mark.real_time
 async def test_half_requests_do_not_take_the_process_its_descriptors() -> None:

@@ -24,10 +24,10 @@ from smartcam.web import _serialize as serialize
 from smartcam.web import _streams as streams
 from smartcam.web._emulator import CALLS
 from smartcam.web._frames import CALLS as FRAMES_CALLS
-from smartcam.web._frames import MAX_VIEWERS
 from smartcam.web._live import CALLS as LIVE_CALLS
 from smartcam.web._live import MAX_NEWS
 from smartcam.web._live_view import FAIL_WORDS, MAX_RESULTS, NOT_WORDS, PASS_WORDS
+from smartcam.web._pictures import MAX_VIEWERS
 from smartcam.web._wizard import CALLS as WIZARD_CALLS
 from tests import ROOT
 from tests.web.sitekit import TOKEN

@@ -18,9 +18,10 @@ import pytest
 from smartcam.exceptions import ConfigurationError, FrameFormatError, MissingExtraError
 from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import FramesSite
-from smartcam.web import _frames as frames_module
-from smartcam.web._frames import CALLS, MAX_VIEWERS, PROTOCOL, Press
+from smartcam.web import _pictures as pictures_module
+from smartcam.web._frames import CALLS
 from smartcam.web._jpeg import TABLES, is_whole_jpeg, jpeg, picture
+from smartcam.web._pictures import MAX_VIEWERS, PROTOCOL, Press
 from smartcam.web._streams import SLOW
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
 from tests.web.sitekit import TOKEN, Caller, Raw, until
@@ -152,7 +153,7 @@ async def test_looker_that_shows_nothing_more_is_disconnected() -> None:
         await all_of.driver.streams()
         all_of.driver.give(plain(1))
         await looker.picture()
-        message = await looker.socket.receive()  # takes no time of ours, but frames_module.SLOW
+        message = await looker.socket.receive()  # takes no time of ours, but pictures_module.SLOW
         assert message.type in {aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR}
         await all_of.driver.rests()
 
@@ -244,6 +245,41 @@ async def test_frame_that_is_broken_is_told_and_the_next_is_shown() -> None:
         assert all_of.driver.calls == ["open", "start"]
 
 
+async def test_looker_that_vanishes_harms_nobody() -> None:
+    async with world() as all_of, Raw.connected(all_of.site) as raw, all_of.looking() as looker:
+        await looker.word()
+        raw.writer.write(
+            b"GET /api/sources/0/pictures HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n"
+            b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+        )
+        await until(lambda: all_of.source.statistics().readers == 2)
+        all_of.driver.give(plain(1))
+        assert (await looker.picture()).frame["sequence"] == 1
+        raw.writer.transport.abort()  # without a word, its picture on the way
+        await until(lambda: all_of.source.statistics().readers == 1)
+        await looker.next()
+        all_of.driver.give(plain(2))
+        assert (await looker.picture()).frame["sequence"] == 2
+        assert all_of.driver.calls == ["open", "start"]
+
+
+async def test_picture_that_is_too_large_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = jpeg(plain(1), 80)
+    monkeypatch.setattr(pictures_module, "MAX_PICTURE", len(small))
+    async with world() as all_of, all_of.looking() as looker:
+        await looker.word()
+        await all_of.driver.streams()
+        for extra, number in ((1, 1), (0, 2)):
+            data = small + bytes(extra)
+            mjpeg = plain(number, data=data, format=find_format("MJPEG"), stride=0)
+            all_of.driver.give(mjpeg)
+            if extra:
+                told = await looker.word()
+                assert told["bad"].endswith(f"expected {len(small)} at most")
+        assert (await looker.picture()).frame["sequence"] == 2
+
+
 async def test_site_that_stops_says_good_bye() -> None:
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
@@ -257,7 +293,7 @@ async def test_site_that_stops_says_good_bye() -> None:
 
 
 async def test_viewers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frames_module, "MAX_VIEWERS", 1)
+    monkeypatch.setattr(pictures_module, "MAX_VIEWERS", 1)
     assert MAX_VIEWERS >= 16  # four people before four cameras
     async with world() as all_of, all_of.looking() as looker:
         await looker.word()
@@ -369,7 +405,7 @@ async def test_press_makes_a_frame_once_for_all_and_a_cancelled_one_spoils_nothi
         made.append(one.sequence)
         return b"jpeg"
 
-    monkeypatch.setattr(frames_module, "jpeg", slow)
+    monkeypatch.setattr(pictures_module, "jpeg", slow)
     with ThreadPoolExecutor(1) as threads:
         press, one = Press(threads, 80), plain(1)
         waiting = [asyncio.create_task(press.jpeg(one)) for _ in range(3)]

@@ -19,7 +19,7 @@ from tests.web.sitekit import TOKEN, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-    from playwright.async_api import Page
+    from playwright.async_api import Locator, Page
 
     from smartcam.frames import Frame, FrameSource
     from tests.frames.drivers import ScriptedDriver
@@ -211,32 +211,129 @@ async def test_token_is_asked_for_and_opens_the_sockets(page: Page) -> None:
             assert TOKEN not in page.url
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])
-@pytest.mark.parametrize("count", [1, 4])
-async def test_nothing_is_cut(page: Page, width: int, height: int, count: int) -> None:
+SIZES = ["640x480", "320x240", "1280x320", "320x960"]
+NAMES = ["left", "a-name-without-any-place-to-break-it-" * 2, "wide", "deep"]
+
+DRAWN = """
+() => [...document.querySelectorAll("canvas")].filter((c) => c.checkVisibility()).map((c) => {
+  const box = c.getBoundingClientRect();
+  const scale = Math.min(box.width / c.width, box.height / c.height);
+  const contained = getComputedStyle(c).objectFit === "contain";
+  const [width, height] = contained ? [c.width * scale, c.height * scale] : [box.width, box.height];
+  const [left, top] = [box.x + (box.width - width) / 2, box.y + (box.height - height) / 2];
+  return { natural: c.width / c.height, width, height, left, top };
+})
+"""
+"""Where pictures are on the screen, without what is empty beside them."""
+
+
+@contextlib.asynccontextmanager
+async def four(
+    page: Page, width: int, height: int, sizes: Sequence[str] = ("640x480",) * 4
+) -> AsyncIterator[FramesSite]:
+    """Show a source for each size on a screen; all of them are seen."""
     await page.set_viewport_size({"width": width, "height": height})
-    names = ["left", "a-name-without-any-place-to-break-it-" * 2, "wide", "deep"]
-    sizes = ["640x480", "320x240", "1280x320", "320x960"]
     async with contextlib.AsyncExitStack() as stack:
         sources = [
             await stack.enter_async_context(
                 smartcam.frames.open(f"synthetic://?fps=10&name={name}&size={size}")
             )
-            for name, size in zip(names[:count], sizes, strict=False)
+            for name, size in zip(NAMES, sizes, strict=False)
         ]
-        await stack.enter_async_context(opened(page, sources))
-        for place in range(count):
+        site = await stack.enter_async_context(opened(page, sources))
+        for place in range(len(sources)):
             await see(page, f"[data-place='{place}'] canvas")
+        yield site
+    await page.set_viewport_size({"width": 1280, "height": 800})
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (1280, 800)])
+@pytest.mark.parametrize("count", [1, 4])
+async def test_nothing_is_cut(page: Page, width: int, height: int, count: int) -> None:
+    async with four(page, width, height, SIZES[:count]):
         assert await page.evaluate("document.documentElement.scrollWidth") == width
         wide = await page.evaluate(
             "[...document.querySelectorAll('.panel, .view, canvas, dl, h2')]"
-            ".filter((e) => e.getBoundingClientRect().right > innerWidth"
-            " || e.scrollWidth > e.clientWidth + 1).map((e) => e.outerHTML.slice(0, 80))"
+            ".filter((e) => e.getBoundingClientRect().right > innerWidth || (e.scrollWidth >"
+            " e.clientWidth + 1 && getComputedStyle(e).textOverflow !== 'ellipsis'))"
+            ".map((e) => e.outerHTML.slice(0, 80))"
         )
         assert wide == []
-        shapes = await page.evaluate(
-            "[...document.querySelectorAll('canvas')]"
-            ".map((c) => [c.width / c.height, c.clientWidth / c.clientHeight])"
+        for one in await page.evaluate(DRAWN):
+            assert one["width"] / one["height"] == pytest.approx(one["natural"], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "least"), [(390, 844, 200), (844, 390, 180), (360, 640, 130)]
+)
+async def test_phone_has_four_pictures_at_once_that_stay_live(
+    page: Page, width: int, height: int, least: int
+) -> None:
+    async with four(page, width, height) as site:
+        assert await page.evaluate("document.documentElement.scrollHeight") <= height
+        shown = await page.evaluate(DRAWN)
+        assert len(shown) == 4
+        for one in shown:
+            assert one["width"] >= least
+            assert one["left"] >= 0
+            assert one["top"] >= 0
+            assert one["left"] + one["width"] <= width
+            assert one["top"] + one["height"] <= height
+        for place in range(4):
+            await see(page, f"[data-place='{place}'][data-state=live]")
+            assert "ms" in await page.inner_text(f"[data-place='{place}'] [data-count=age]")
+        before = [source.statistics().frames for source in site.sources]
+        numbers = [int(await one.inner_text()) for one in await numbers_of(page)]
+        await until(
+            lambda: all(
+                source.statistics().frames >= number + 5
+                for source, number in zip(site.sources, before, strict=True)
+            ),
+            PATIENCE,
         )
-        for natural, drawn in shapes:
-            assert drawn == pytest.approx(natural, rel=0.02)
+        for place, number in enumerate(numbers):
+            await page.wait_for_function(
+                "([place, number]) => Number(document.querySelector("
+                "`[data-place='${place}'] [data-count=number]`).textContent) > number",
+                arg=[place, number],
+            )
+
+
+async def numbers_of(page: Page) -> list[Locator]:
+    """Return where the frames' numbers stand, which a phone does not show."""
+    return await page.locator("[data-count=number]").all()
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (1280, 800)])
+async def test_tap_enlarges_one_and_the_others_stop(page: Page, width: int, height: int) -> None:
+    async with four(page, width, height) as site:
+        (small, *_) = await page.evaluate(DRAWN)
+        await page.click("[data-place='2'] .view")
+        await until(lambda: [one.place for one in site.viewers] == [2], PATIENCE)
+        await until(
+            lambda: [s.statistics().readers for s in site.sources] == [0, 0, 1, 0], PATIENCE
+        )
+        await until(lambda: not site.sources[0].statistics().streaming, PATIENCE)
+        (large,) = await page.evaluate(DRAWN)
+        assert large["width"] > 1.4 * small["width"]
+        assert large["top"] + large["height"] <= height
+        assert await page.get_attribute("[data-place='2'] .view", "aria-pressed") == "true"
+        await see(page, "[data-place='2'][data-state=live]")
+        await page.click("[data-place='2'] .view")
+        await until(lambda: len(site.viewers) == 4, PATIENCE)
+        await page.click("[data-place='1'] .view")
+        await until(lambda: [one.place for one in site.viewers] == [1], PATIENCE)
+        await page.keyboard.press("Escape")
+        await until(lambda: len(site.viewers) == 4, PATIENCE)
+        for place in range(4):
+            await see(page, f"[data-place='{place}'][data-state=live]")
+
+
+async def test_picture_that_is_scrolled_away_stops(page: Page) -> None:
+    async with four(page, 1280, 800) as site:
+        await page.evaluate("document.querySelector('main').style.paddingTop = '3000px'")
+        await until(lambda: not site.viewers, PATIENCE)
+        await see(page, ".state", "paused")
+        await page.evaluate("document.querySelector('.source').scrollIntoView()")
+        await until(lambda: bool(site.viewers), PATIENCE)
+        await see(page, "[data-place='0'][data-state=live]")

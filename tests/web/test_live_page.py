@@ -10,10 +10,12 @@ import pytest
 import pytest_asyncio
 
 import smartcam
+import smartcam.fleet
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight
+from smartcam.fleet import FleetFile
 from smartcam.web import LiveSite
-from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong
-from tests.web.sitekit import TOKEN
+from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
+from tests.web.sitekit import TOKEN, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -196,6 +198,90 @@ async def test_picture_of_an_insight_is_shown_with_a_token(page: Page) -> None:
         assert site.view.picture.serial == 2
         assert await picture.evaluate("i => i.decode().then(() => i.naturalWidth)") == 16
         assert TOKEN not in page.url
+
+
+@contextlib.asynccontextmanager
+async def fleet_shown(
+    page: Page, frames: str | None = "synthetic://?fps=20&size=640x480"
+) -> AsyncIterator[LiveSite]:
+    """Show a camera of a fleet, which may have frames."""
+    entry = {"emulated": {}, **PARTS, **({} if frames is None else {"frames": frames})}
+    file = FleetFile.model_validate({"agent": "north", "cameras": {"cam": entry}})
+    with nothing_wrong(page):
+        async with smartcam.fleet.open(file) as fleet, LiveSite(fleet["cam"], control=True) as site:
+            await page.goto(site.url)
+            await see(page, LIVE)
+            yield site
+        await page.goto("about:blank")
+
+
+async def looked_at(site: LiveSite, count: int) -> None:
+    """Wait until so many look at the frames."""
+    pictures = site.frames.pictures
+    assert pictures is not None
+    await until(lambda: len(pictures.viewers) == count, PATIENCE)
+
+
+async def test_what_a_fleets_camera_sees_is_beside_its_results(page: Page) -> None:
+    async with fleet_shown(page) as site:
+        await page.click("#trigger")
+        await see(page, ".found")
+        await see(page, ".source[data-state=live]", "What the camera sees")
+        await page.wait_for_function(
+            "Number(document.querySelector('[data-count=number]').textContent) > 5"
+        )
+        boxes = [await page.locator(one).bounding_box() for one in (".now", ".source")]
+        assert None not in boxes
+        assert boxes[0]["x"] == boxes[1]["x"]  # type: ignore[index]
+        small = await page.locator("canvas").bounding_box()
+        await page.click(".view")
+        await see(page, ".source.large")
+        large = await page.locator("canvas").bounding_box()
+        assert small is not None
+        assert large is not None
+        assert large["height"] > 1.2 * small["height"]
+        await page.keyboard.press("Escape")
+        await page.locator(".source:not(.large)").wait_for()
+        await looked_at(site, 1)
+        await page.evaluate("document.querySelector('main').style.paddingTop = '3000px'")
+        await looked_at(site, 0)
+
+
+async def test_camera_without_frames_has_no_such_panel_and_asks_for_none(page: Page) -> None:
+    asked: list[str] = []
+    page.on("websocket", lambda socket: asked.append(socket.url))
+    async with fleet_shown(page, None) as site:
+        await page.click("#trigger")
+        await see(page, ".found")
+        assert await page.locator(".source").count() == 0
+        assert site.frames.pictures is None
+    assert asked == []
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (1280, 800)])
+async def test_nothing_is_cut_of_frames(page: Page, width: int, height: int) -> None:
+    await page.set_viewport_size({"width": width, "height": height})
+    try:
+        async with fleet_shown(page):
+            await page.click("#trigger")
+            await see(page, ".found")
+            await page.locator(".source").scroll_into_view_if_needed()
+            await see(page, ".source[data-state=live]")
+            assert await page.evaluate("document.documentElement.scrollWidth") == width
+            box = await page.locator("canvas").bounding_box()
+            assert box is not None
+            assert box["width"] / box["height"] == pytest.approx(640 / 480, rel=0.02)
+            assert box["height"] <= height
+            panels = await page.evaluate(
+                "[...document.querySelectorAll('.panel')].filter((e) => e.checkVisibility())"
+                ".map((e) => e.getBoundingClientRect()).map((b) => [b.x, b.y, b.right, b.bottom])"
+            )
+            for index, one in enumerate(panels):  # none is over another
+                for other in panels[:index]:
+                    apart = one[0] >= other[2] - 1 or other[0] >= one[2] - 1
+                    assert apart or one[1] >= other[3] - 1 or other[1] >= one[3] - 1
+    finally:
+        await page.set_viewport_size({"width": 1280, "height": 800})
 
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])

@@ -37,6 +37,39 @@ export function setText(id, text) {
   if (element && element.textContent !== text) element.textContent = text;
 }
 
+// ---------------------------------------------------------------------- the token
+
+const TOKEN = "smartcam-token"; // in the tab's memory
+
+export const token = () => sessionStorage.getItem(TOKEN);
+export const headers = () => (token() ? { Authorization: `Bearer ${token()}` } : {});
+
+// Take the token out of the address, and go on whenever one was entered at the gate.
+export function atGate(goOn) {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (given) sessionStorage.setItem(TOKEN, given);
+  history.replaceState(null, "", location.pathname);
+  $("gate").addEventListener("submit", (event) => {
+    event.preventDefault();
+    sessionStorage.setItem(TOKEN, $("token").value.trim());
+    $("gate").hidden = true;
+    goOn();
+  });
+}
+
+// Ask for the token in place of all else; answer: why the server refused.
+export function askToken(answer) {
+  $("main").hidden = $("alarm").hidden = true;
+  $("gate").hidden = false;
+  $("gate-error").textContent = token() ? `Refused: ${answer.came}` : "";
+  live("lost", "token needed");
+}
+
+export function live(mode, text) {
+  $("live").dataset.state = mode;
+  setText("live", text);
+}
+
 // The events of a stream, as they come.
 export async function* events(body) {
   const reader = body.pipeThrough(new TextDecoderStream()).getReader();

@@ -1,13 +1,13 @@
 // The live page: shows what a camera sends. Everything it does is one of the HTTP calls of GET /api.
 
-import { $, BITS, SILENT_MS, draw, events, make, setText } from "./base.js";
+import { $, BITS, SILENT_MS, askToken, atGate, draw, events, headers, live, make, setText } from "./base.js";
+import { Source } from "./pictures.js";
 
 const MAX_ROWS = 100; // results in the document
 const OLD_S = 10; // a result of before is called old
 const SERIES = 300; // seconds that the plots show
 const MM = 1000;
 
-let token = null;
 let state = null; // the camera, as its events tell it
 let reached = false; // whether the page's own server answers
 let results = []; // the newest first
@@ -17,8 +17,6 @@ let view = null; // what the drawing shows, metres
 let offset = 0; // seconds that this machine's clock is ahead of the server's
 
 // ---------------------------------------------------------------------- calls
-
-const headers = () => (token ? { Authorization: `Bearer ${token}` } : {});
 
 async function ask(path, options = {}) {
   const response = await fetch(path, { ...options, headers: { ...headers(), ...options.headers }, cache: "no-store" });
@@ -43,26 +41,6 @@ function tell(text, bad = false) {
   const box = make("div", { className: bad ? "bad" : "", textContent: text });
   $("told").replaceChildren(box);
   setTimeout(() => box.remove(), bad ? 9000 : 3500);
-}
-
-function askToken(answer) {
-  $("main").hidden = $("alarm").hidden = true;
-  $("gate").hidden = false;
-  $("gate-error").textContent = token ? `Refused: ${answer.came}` : "";
-  live("lost", "token needed");
-}
-
-$("gate").addEventListener("submit", (event) => {
-  event.preventDefault();
-  token = $("token").value.trim();
-  sessionStorage.setItem("smartcam-token", token);
-  $("gate").hidden = true;
-  listen();
-});
-
-function live(mode, text) {
-  $("live").dataset.state = mode;
-  setText("live", text);
 }
 
 // ---------------------------------------------------------------------- the event stream
@@ -133,6 +111,7 @@ function takeState(value) {
   };
   $("facts").replaceChildren(...list(facts));
   showControls(can);
+  takeFrames();
   $("image-panel").hidden = !can.read_image;
   if (can.read_image) setText("image-note", state.picture_error || ($("image").hidden ? "Not fetched yet." : ""));
   arrange();
@@ -355,7 +334,33 @@ function arrange() {
   const shown = [$("scene-panel"), $("image-panel")].filter((one) => !one.hidden).length;
   $("main").classList.toggle("plain", shown === 0);
   $("main").classList.toggle("both", shown === 2);
+  $("main").classList.toggle("seeing", frames !== null);
 }
+
+// ---------------------------------------------------------------------- frames
+
+let frames = null; // the newest frame of a camera that has some
+
+function takeFrames() {
+  if (state.frames === Boolean(frames)) return;
+  if (frames) {
+    frames.end();
+    frames.panel.remove();
+    frames = null;
+    return;
+  }
+  frames = new Source({ name: "What the camera sees", path: "/api/frames" });
+  frames.view.addEventListener("click", enlarge);
+  $("main").append(frames.panel);
+}
+
+function enlarge() {
+  const large = frames?.panel.classList.toggle("large") ?? false;
+  frames?.view.setAttribute("aria-pressed", String(large));
+}
+
+document.addEventListener("keydown", ({ key }) => key === "Escape" && frames?.panel.classList.contains("large") && enlarge());
+setInterval(() => frames?.age(), 250);
 
 // ---------------------------------------------------------------------- picture
 
@@ -444,10 +449,7 @@ function plot(id, points) {
 
 // ---------------------------------------------------------------------- begin
 
-const given = new URLSearchParams(location.hash.slice(1)).get("token");
-if (given) sessionStorage.setItem("smartcam-token", given);
-token = sessionStorage.getItem("smartcam-token");
-history.replaceState(null, "", location.pathname);
+atGate(listen);
 setInterval(showAge, 500);
 addEventListener("resize", drawParts);
 listen();

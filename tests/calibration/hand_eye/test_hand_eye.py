@@ -297,6 +297,7 @@ def _parts(transform: Transform) -> tuple[NDArray[np.float64], NDArray[np.float6
     return transform.rotation, transform.translation
 
 
+@pytest.mark.long
 def test_hand_eye_with_a_wrong_lens_adjusts_it_and_says_so() -> None:
     poses, views = measured("eye-in-hand", 0.1, NOISE, poses=9, tilt=40.0)
     matrix = CAMERA.matrix.copy()

@@ -120,6 +120,7 @@ def _nodding(rms: float) -> list[Transform]:
     return poses
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("rms", "told"), [(2.5, True), (12.0, False)])
 def test_remark_on_rotation_does_not_come_and_go_with_a_pose(rms: float, told: bool) -> None:
     truth, poses = scene("eye-in-hand"), _nodding(rms)

@@ -1,0 +1,242 @@
+"""``smartcam frames serve`` and ``show``: pictures of some sources, for people and for players."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.frame_players import (
+    USER,
+    Players,
+    address,
+    names_of,
+    rtsp_server,
+    rtsp_urls,
+    send_rtp,
+)
+from smartcam._cli.frame_sources import TIMEOUT, opened
+from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.page import PageOptions, page_options
+from smartcam._cli.running import first
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameFormatError,
+    UnsupportedError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from smartcam.exceptions import SmartCamError
+    from smartcam.frames import RtspServer
+    from smartcam.web import FramesSite
+
+MOST_SHOWN = 4
+"""Sources side by side on a page."""
+
+FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
+"""Errors of a source that will hardly ever be what was asked for."""
+
+FIRST = 3.0
+"""Seconds that the first try of each source is waited for, before the others are served."""
+
+PERIOD = 1.0
+"""Seconds between two looks at who looks."""
+
+
+def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., None]]:
+    """Give a command what both have; ``terminated``: its exit code after SIGTERM."""
+    parts: list[Any] = [
+        click.argument("urls", metavar="URL...", nargs=-1, required=True),
+        click.option(
+            "--quality",
+            type=click.IntRange(1, 100),
+            default=80,
+            show_default=True,
+            help="Of the JPEGs that the page gets; those of a camera that sends some stay as they "
+            "are.",
+        ),
+        page_options("", always=True),
+        option("--seconds"),
+        option("--timeout", help=TIMEOUT),
+        runs(*OUTPUT, terminated=terminated),
+    ]
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., None]:
+        for part in reversed(parts):
+            function = part(function)
+        return function
+
+    return decorate
+
+
+@click.command(
+    help=f"Serve pictures of one source, or of up to {MOST_SHOWN}, until Ctrl-C or SIGTERM: a page "
+    "with all of them side by side, and for players and recorders RTSP or RTP. What is served "
+    "goes to stdout, who looks, on a terminal, to stderr. A device streams while somebody looks; "
+    'one that is not there is awaited, and the others go on. Needs the extras "web" and "frames", '
+    'for RTSP and RTP "video".'
+)
+@click.option(
+    "--rtsp",
+    metavar="HOST:PORT",
+    callback=address,
+    help="Serve them as H.264 by RTSP, too, as rtsp://HOST:PORT/NAME. Where the page has a token, "
+    f"that is the password, and {USER} the user; on an address that others can reach, one is made.",
+)
+@click.option(
+    "--rtp",
+    metavar="HOST:PORT",
+    callback=address,
+    help="Send the one source as H.264 by RTP to this address, whether somebody is there or not.",
+)
+@click.option(
+    "--sdp",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    help="Write what a player of --rtp has to know to this file, and not to stdout.",
+)
+@_serves(terminated=0)
+async def serve(
+    urls: tuple[str, ...],
+    quality: int,
+    rtsp: tuple[str, int] | None,
+    rtp: tuple[str, int] | None,
+    sdp: str | None,
+    web: PageOptions,
+    options: Options,
+) -> None:
+    """Serve pictures of some sources."""
+    if rtp is not None and len(urls) != 1:
+        raise click.UsageError(f"--rtp sends one source: expected one URL, got {len(urls)}")
+    if rtp is not None and not rtp[1]:
+        raise click.UsageError("--rtp: expected the port of who receives it, got 0")
+    if sdp is not None and rtp is None:
+        raise click.UsageError("--sdp needs --rtp")
+    await serve_sources(urls, quality, Players(rtsp, rtp, sdp), web, options)
+
+
+@click.command(
+    help=f"Show one source, or up to {MOST_SHOWN} side by side, on a page until Ctrl-C: the newest "
+    "frame of each, its age, rates, what was skipped and lost. It is serve, with nothing but the "
+    "page: its address goes to stdout. A device streams while somebody looks; one that is not "
+    'there is awaited, and the page says so. Needs the extras "web" and "frames".'
+)
+@_serves(terminated=143)
+async def show(urls: tuple[str, ...], quality: int, web: PageOptions, options: Options) -> None:
+    """Show some sources."""
+    await serve_sources(urls, quality, Players(), web, options)
+
+
+async def serve_sources(
+    urls: Sequence[str], quality: int, players: Players, web: PageOptions, options: Options
+) -> None:
+    """Serve sources until cancelled, or for ``--seconds``; one that fails harms no other.
+
+    Raises ConfigurationError, FrameFormatError, UnsupportedError: so it is with all of them;
+    ConfigurationError: it cannot listen.
+    """
+    if len(urls) > MOST_SHOWN:
+        raise click.UsageError(f"expected {MOST_SHOWN} URLs at most, got {len(urls)}")
+    from smartcam.web import FramesSite
+
+    sources = [opened(url, options) for url in urls]
+    site = FramesSite(sources, quality=quality, **web.place)
+    tries = _Tries(len(sources))
+    keeping = [site.pictures.keep_open(place, tries.of(place)) for place in range(len(sources))]
+    await first([_serve(site, tries, players, options), *keeping], None)
+
+
+async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Options) -> None:
+    """Serve, once each source was tried, or :data:`FIRST` seconds are over."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(FIRST):
+            await tries.check()
+    async with contextlib.AsyncExitStack() as stack:
+        server: RtspServer | None = None
+        urls: dict[str, str] = {}
+        if players.rtsp is not None:
+            server, password = rtsp_server(site.sources, players.rtsp, site.token)
+            await stack.enter_async_context(server)
+            urls = rtsp_urls(server, site.sources, password)
+        await stack.enter_async_context(site)
+        lines = [f"page: {site.url}", *(f"rtsp: {url}" for url in urls.values())]
+        value = {"page": site.url, **({"rtsp": urls} if urls else {})}
+        options.show(value, "\n".join(lines))
+        jobs = [_tell_viewers(site, server), tries.watch()]
+        if players.rtp is not None:
+            jobs.append(send_rtp(site.sources[0], players, options))
+        await first(jobs, options.seconds)
+
+
+class _Tries:
+    """What became of the first try of each source; later ones that fail are told on stderr."""
+
+    def __init__(self, count: int) -> None:
+        self._done = asyncio.Event()  # each was tried
+        self._count = count
+        self._first: dict[int, SmartCamError | None] = {}
+        self._told: dict[int, str] = {}
+
+    def of(self, place: int) -> Callable[[SmartCamError | None], None]:
+        """Return what hears of the tries of a source."""
+
+        def tried(error: SmartCamError | None) -> None:
+            self._first.setdefault(place, error)
+            text = "" if error is None else str(error)
+            if text and self._told.get(place, "") != text and not self._all_for_good():
+                click.echo(f"note: {text}; it is awaited", err=True)
+            self._told[place] = text
+            if len(self._first) == self._count:
+                self._done.set()
+
+        return tried
+
+    def _all_for_good(self) -> bool:
+        wrong = [isinstance(one, FOR_GOOD) for one in self._first.values()]
+        return len(wrong) == self._count and all(wrong)
+
+    async def check(self) -> None:
+        """Wait until each was tried; raise what is wrong with the first, where all are for good."""
+        await self._done.wait()
+        error = self._first[0]
+        if error is not None and self._all_for_good():
+            raise error
+
+    async def watch(self) -> None:
+        """Do so until cancelled."""
+        await self.check()
+        await asyncio.Event().wait()
+
+
+# ---------------------------------------------------------------------- who looks
+
+
+async def _tell_viewers(site: FramesSite, server: RtspServer | None) -> None:
+    """Tell on a terminal's stderr who looks, when that changes; until cancelled."""
+    if not sys.stderr.isatty():
+        await asyncio.Event().wait()
+    told = viewers_text(site, server)
+    while True:
+        await asyncio.sleep(PERIOD)
+        text = viewers_text(site, server)
+        if text != told:
+            told = text
+            click.echo(f"{datetime.now().astimezone():%H:%M:%S} {text}", err=True)
+
+
+def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
+    """Return who looks at which source: addresses of those at the page, how many by RTSP."""
+    played = {} if server is None else server.statistics()
+    rows: list[str] = []
+    for place, (name, source) in enumerate(names_of(site.sources).items()):
+        who = sorted(one.address for one in site.viewers if one.place == place)
+        by_rtsp = played[name].viewers if name in played else 0
+        who += [f"{by_rtsp} by RTSP"] if by_rtsp else []
+        rows += [f"{source.name}: {', '.join(who)}"] if who else []
+    return "; ".join(rows) or "nobody looks"

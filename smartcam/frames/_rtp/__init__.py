@@ -1,0 +1,1 @@
+"""H.264 over RTP: RFC 3550, RFC 4585 and RFC 6184."""

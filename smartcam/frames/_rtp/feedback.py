@@ -1,0 +1,139 @@
+"""What receivers say to a sender: who they are, how it arrives, and what they want again."""
+
+from __future__ import annotations
+
+import collections
+import time
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from smartcam.frames._rtp.packets import ReceiverReport, ReportBlock
+from smartcam.frames._rtp.parameters import CLOCK_RATE
+from smartcam.frames._rtp.reception import middle, ntp_time
+
+SILENT: Final = 10.0
+"""Seconds after which a receiver that no longer reports is forgotten."""
+
+MOST_RECEIVERS: Final = 64
+
+REMEMBERED: Final = 1024
+"""Packets that can be sent again."""
+
+OLD: Final = 0.2
+"""Seconds after which a packet is not sent again: its picture would be late."""
+
+RESENT: Final = 5
+"""Times that one packet is sent again at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class RtpReceiver:
+    """What a receiver said in its last report.
+
+    Attributes:
+        address: it reports from, ``HOST:PORT``.
+        loss: share of the packets that did not reach it since the report before, 0 to 1.
+        lost: packets since the beginning; those that were sent again make up for some.
+        jitter: of the arrival, seconds.
+        round_trip: seconds there and back; None: not known.
+        age: seconds since it was last heard.
+    """
+
+    address: str
+    loss: float
+    lost: int
+    jitter: float
+    round_trip: float | None
+    age: float
+
+
+class _Heard(NamedTuple):
+    address: str
+    block: ReportBlock
+    round_trip: float | None
+    at: float
+
+
+class Audience:
+    """Who receives a stream.
+
+    Args:
+        ssrc: the stream's.
+    """
+
+    def __init__(self, ssrc: int) -> None:
+        self._nothing = ReportBlock(ssrc, 0, 0, 0, 0)
+        self._heard: dict[int, _Heard] = {}
+
+    def report(self, report: ReceiverReport, address: str) -> bool:
+        """Take a report, and return whether it is a new one's."""
+        now = time.monotonic()
+        self._forget(now)
+        new = report.ssrc not in self._heard
+        if new and len(self._heard) >= MOST_RECEIVERS:
+            return False
+        known = self._heard.get(report.ssrc, _Heard(address, self._nothing, None, now))
+        block = next((one for one in report.blocks if one.ssrc == self._nothing.ssrc), None)
+        if block is not None:  # what is asked for in a hurry comes without
+            known = _Heard(address, block, _round_trip(block), now)
+        self._heard[report.ssrc] = known._replace(at=now)
+        return new
+
+    def left(self, ssrc: int) -> None:
+        """Take that one said goodbye."""
+        self._heard.pop(ssrc, None)
+
+    def receivers(self) -> tuple[RtpReceiver, ...]:
+        """Return those that are heard of."""
+        now = time.monotonic()
+        self._forget(now)
+        return tuple(
+            RtpReceiver(
+                one.address,
+                one.block.fraction / 256,
+                one.block.lost,
+                one.block.jitter / CLOCK_RATE,
+                one.round_trip,
+                now - one.at,
+            )
+            for one in self._heard.values()
+        )
+
+    def _forget(self, now: float) -> None:
+        self._heard = {ssrc: one for ssrc, one in self._heard.items() if now - one.at < SILENT}
+
+
+def _round_trip(block: ReportBlock) -> float | None:
+    """Return RFC 3550's round-trip time, seconds, where a sender report came back."""
+    if not block.last_report:
+        return None
+    ticks = middle(ntp_time(time.time())) - block.last_report - block.delay & 0xFFFF_FFFF
+    return ticks / 65536 if ticks < 1 << 31 else 0.0  # below 0 by a clock that was set
+
+
+class _Sent:
+    __slots__ = ("at", "data", "times")
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.times, self.at = data, 0, time.monotonic()
+
+
+class History:
+    """The packets of the last moments."""
+
+    def __init__(self) -> None:
+        self._sent: collections.OrderedDict[int, _Sent] = collections.OrderedDict()
+
+    def sent(self, sequence: int, data: bytes) -> None:
+        """Remember a packet."""
+        self._sent[sequence] = _Sent(data)
+        if len(self._sent) > REMEMBERED:
+            self._sent.popitem(last=False)
+
+    def again(self, sequence: int) -> bytes | None:
+        """Return a packet that is to be sent again; None: it is too old, or was too often."""
+        found = self._sent.get(sequence)
+        if found is None or found.times >= RESENT or time.monotonic() - found.at > OLD:
+            return None
+        found.times += 1
+        return found.data

@@ -1,0 +1,91 @@
+"""The newest frame of the live page's camera, where that has frames: one of a fleet may."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
+
+from smartcam.web._pictures import SitePictures
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.frames import FrameSource
+
+_log = logging.getLogger("smartcam.web")
+
+QUALITY: Final = 80
+"""Of the JPEGs; the agent makes them, so that nothing larger crosses the bus."""
+
+LOOK: Final = 0.1
+"""Seconds between two looks at which camera the page shows, and whether it has frames."""
+
+
+@runtime_checkable
+class HasFrames(Protocol):
+    """A camera that may have frames, as one of a fleet."""
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether it has some."""
+        ...
+
+    def frame_source(self, encoding: Any, quality: int | None) -> FrameSource:
+        """Return what gives them, unopened."""
+        ...
+
+
+class LiveFrames:
+    """Follows the page's camera, and has its frames for whoever looks.
+
+    Nothing is asked of a camera without frames, and one with frames streams while somebody looks.
+
+    Args:
+        camera: returns the camera that the page shows now.
+
+    Attributes:
+        pictures: of its frames; None where it has none.
+    """
+
+    def __init__(self, camera: Callable[[], object]) -> None:
+        self.pictures: SitePictures | None = None
+        self._camera = camera
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Begin."""
+        self._task = asyncio.create_task(self._follow(), name="smartcam.live.frames")
+
+    async def stop(self) -> None:
+        """End; harmless when done twice."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def _follow(self) -> None:
+        while True:
+            camera: object = self._camera()
+            if isinstance(camera, HasFrames) and camera.has_frames:
+                await self._show(camera)
+            await asyncio.sleep(LOOK)
+
+    async def _show(self, camera: HasFrames) -> None:
+        """Have its frames there until the page shows another camera."""
+        pictures = SitePictures([camera.frame_source("jpeg", QUALITY)], QUALITY)
+        pictures.start()
+        keeping = asyncio.create_task(pictures.keep_open(0), name="smartcam.live.source")
+        self.pictures = pictures
+        try:
+            while (  # noqa: ASYNC110 - nothing tells of it
+                self._camera() is camera and camera.has_frames and not keeping.done()
+            ):
+                await asyncio.sleep(LOOK)
+        finally:
+            self.pictures = None
+            keeping.cancel()
+            await asyncio.wait([keeping])
+            await pictures.stop()
+            if not keeping.cancelled():
+                _log.error("! the live page's frames end", exc_info=keeping.exception())

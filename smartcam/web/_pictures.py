@@ -1,0 +1,388 @@
+"""The newest frames of some sources, to whoever looks: what pages of pictures have in common.
+
+Each who looks at a source has a reader of it and a WebSocket, with one picture on the way at a
+time: the next one, the newest then, goes when the page says that it has shown the last. So who is
+slow skips, and delays neither the device nor anybody else. With nobody there is no reader, and
+the device does not stream.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final
+
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from smartcam.backoff import Backoff
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameFormatError,
+    FrameSourceError,
+    FrameTimeoutError,
+    LocalProtocolError,
+    UnsupportedError,
+)
+from smartcam.web._errors import RefusedError, shown
+from smartcam.web._jpeg import jpeg
+from smartcam.web._site import FAREWELL
+from smartcam.web._streams import SLOW
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable
+
+    from smartcam.exceptions import SmartCamError
+    from smartcam.frames import Frame, FrameReader, FrameSource
+
+_log = logging.getLogger("smartcam.web")
+
+FILES: Final = ("pictures.css", "pictures.js")
+"""What pages with pictures have beside their own."""
+
+MAX_VIEWERS: Final = 32
+"""WebSockets at a time: eight people before four cameras."""
+
+PROTOCOL: Final = "smartcam.frames"
+"""Of the WebSockets."""
+
+MAX_PICTURE: Final = 1 << 24
+"""Bytes of a picture that is sent; what a camera sends as a JPEG may be of any size."""
+
+ACCOUNT_PERIOD: Final = 1.0
+"""Seconds without a frame after which the page is told the account all the same."""
+
+LONGEST_WORD: Final = 64
+"""Bytes of what a page may say: that it wants the next one."""
+
+THREADS: Final = 2
+"""That make JPEGs; with more they wait for the processor instead."""
+
+AGAIN: Final = Backoff(initial=0.5, maximum=5.0)
+"""When a source that ended with an error is read again."""
+
+
+def _heard(_error: SmartCamError | None) -> None:
+    """Hear of a try."""
+
+
+class SitePictures:
+    """The sources of a site, and who looks at them.
+
+    Args:
+        sources: they are opened and closed by who made them; one that is not open is awaited.
+        quality: of the JPEGs that are made. What comes as a JPEG stays as it is.
+
+    Attributes:
+        sources: as given.
+        failures: why a source is not open, by its place in ``sources``.
+        viewers: who looks.
+    """
+
+    def __init__(self, sources: Iterable[FrameSource], quality: int) -> None:
+        if not 1 <= quality <= 100:
+            raise ConfigurationError(f"quality: expected 1 to 100, got {quality!r}")
+        self.sources: tuple[FrameSource, ...] = tuple(sources)
+        self.failures: dict[int, str] = {}
+        self.viewers: set[Viewer] = set()
+        self._quality = quality
+        self._presses: list[Press] = []
+        self._threads: ThreadPoolExecutor | None = None
+
+    def start(self) -> None:
+        """Have what makes pictures; does nothing if it is there."""
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="smartcam.web.jpeg")
+            self._presses = [Press(self._threads, self._quality) for _ in self.sources]
+
+    def end_viewers(self) -> None:
+        """Have everybody told that it ends."""
+        for one in self.viewers:
+            one.end()
+
+    async def stop(self) -> None:
+        """End the threads, once nobody looks any longer.
+
+        Cancellation: takes effect at once; the threads end by themselves.
+        """
+        self.end_viewers()
+        for one in tuple(self.viewers):
+            await one.gone.wait()
+        threads, self._threads = self._threads, None
+        if threads is not None:
+            await asyncio.to_thread(threads.shutdown)
+
+    def press(self, place: int) -> Press:
+        """Return what makes JPEGs of a source."""
+        return self._presses[place]
+
+    def state(self, place: int) -> dict[str, Any]:
+        """Return how a source is."""
+        source = self.sources[place]
+        try:
+            streams: str | None = str(source.format)
+        except LocalProtocolError:
+            streams = None
+        account = source.statistics()
+        return {
+            "place": place,
+            "name": source.name,
+            "format": streams,
+            "failure": self._failure(place) if streams is None else "",
+            "streaming": account.streaming,
+            "readers": account.readers,
+            "started": account.started,
+            "frames": account.frames,
+            "lost": account.lost,
+        }
+
+    def _failure(self, place: int) -> str:
+        return self.failures.get(place, f"{self.sources[place].name} is not open")
+
+    async def keep_open(
+        self, place: int, tried: Callable[[SmartCamError | None], None] = _heard
+    ) -> None:
+        """Have a source open until this is cancelled, and try again where it cannot be opened.
+
+        Args:
+            place: of the source.
+            tried: is told each time what went wrong, None for nothing.
+        """
+        for delay in Backoff().delays():
+            try:
+                async with self.sources[place]:
+                    self.failures.pop(place, None)
+                    tried(None)
+                    await asyncio.Event().wait()
+            except (FrameSourceError, ConfigurationError, UnsupportedError) as exc:
+                self.failures[place] = str(exc)
+                tried(exc)
+            await asyncio.sleep(delay)
+
+    async def view(self, place: int, request: web.Request) -> web.WebSocketResponse:
+        """Show a source to who asks, until the end.
+
+        Raises:
+            RefusedError: it is no WebSocket, or there are :data:`MAX_VIEWERS` already.
+        """
+        headers = request.headers
+        given = headers.get("Sec-WebSocket-Protocol", PROTOCOL)
+        offered = [one.strip() for one in given.split(",")]
+        if headers.get("Upgrade", "").lower() != "websocket" or PROTOCOL not in offered:
+            what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+            raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
+        if len(self.viewers) >= MAX_VIEWERS:
+            raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
+        return await Viewer(self, place, request).serve()
+
+
+class Press:
+    """Makes JPEGs of a source in threads, each frame once however many look at it."""
+
+    def __init__(self, threads: ThreadPoolExecutor, quality: int) -> None:
+        self._threads = threads
+        self._quality = quality
+        self._frame: Frame | None = None
+        self._made: asyncio.Future[bytes] | None = None
+
+    async def jpeg(self, frame: Frame) -> bytes:
+        """Return a frame as a JPEG.
+
+        Raises:
+            FrameFormatError: its bytes are wrong, or too many.
+            MissingExtraError: a codec is not installed.
+
+        Cancellation: safe; others who wait for it get it.
+        """
+        if self._made is None or self._frame is not frame:
+            loop = asyncio.get_running_loop()
+            self._frame = frame
+            self._made = loop.run_in_executor(self._threads, _pressed, frame, self._quality)
+            self._made.add_done_callback(_seen)
+        return await asyncio.shield(self._made)
+
+    def forget(self) -> None:
+        """Keep no picture."""
+        self._frame = self._made = None
+
+
+def _pressed(frame: Frame, quality: int) -> bytes:
+    data = jpeg(frame, quality)
+    if len(data) > MAX_PICTURE:
+        raise FrameFormatError(
+            f"{frame.source}: a JPEG of {len(data)} bytes; expected {MAX_PICTURE} at most",
+            source=frame.source,
+        )
+    return data
+
+
+def _seen(made: asyncio.Future[bytes]) -> None:
+    if not made.cancelled():
+        made.exception()  # who asked may be gone, and then nobody else asks
+
+
+class Viewer:
+    """One who looks at a source.
+
+    Attributes:
+        place: of the source.
+        address: of who looks.
+        gone: is set when that is over.
+    """
+
+    def __init__(self, pictures: SitePictures, place: int, request: web.Request) -> None:
+        self._pictures = pictures
+        self._source = pictures.sources[place]
+        self._request = request
+        self.place: int = place
+        self.address: str = request.remote or ""
+        self._socket = web.WebSocketResponse(
+            protocols=(PROTOCOL,), max_msg_size=LONGEST_WORD, timeout=FAREWELL, compress=False
+        )
+        self._shown = asyncio.Event()  # the page has shown the last picture
+        self.gone = asyncio.Event()
+        self._ending = asyncio.Event()
+        self._sent = 0
+
+    def end(self) -> None:
+        """Have it end."""
+        self._ending.set()
+
+    async def serve(self) -> web.WebSocketResponse:
+        """Show frames until the page goes, is too slow, or :meth:`end` is called.
+
+        Cancellation: ends it.
+        """
+        self._pictures.viewers.add(self)
+        try:
+            await self._socket.prepare(self._request)
+            await self._first(self._listen(), self._show(), self._ending.wait())
+            await self._close()
+        except TimeoutError:
+            _log.info("= %s: a page that takes no picture was disconnected", self.address)
+            if self._request.transport is not None:
+                self._request.transport.abort()
+        except ConnectionError:
+            pass  # the page is gone
+        finally:
+            self._pictures.viewers.discard(self)
+            self.gone.set()
+            if not any(one.place == self.place for one in self._pictures.viewers):
+                self._pictures.press(self.place).forget()
+        return self._socket
+
+    async def _close(self) -> None:
+        """Say good-bye; TimeoutError: the page does not even read it."""
+        async with asyncio.timeout(2 * FAREWELL):
+            await self._socket.close(code=WSCloseCode.GOING_AWAY)
+
+    @staticmethod
+    async def _first(*jobs: Coroutine[Any, Any, object]) -> None:
+        """Run jobs until one is over, and raise what it raised."""
+        tasks = [asyncio.create_task(job) for job in jobs]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        for task in done:
+            if not task.cancelled():
+                task.result()
+
+    async def _listen(self) -> None:
+        """Hear that pictures were shown, until the page goes or says something else."""
+        while True:
+            message = await self._socket.receive()
+            if message.type is not WSMsgType.TEXT or message.data != "next":
+                return
+            self._shown.set()
+
+    async def _show(self) -> None:
+        """Show frames, and read the source again where it ended.
+
+        One that is lost stays so for the page until a picture of it comes.
+        """
+        delays, lost = AGAIN.delays(), False
+        while True:
+            before = self._sent
+            try:
+                async with self._source.reader(timeout=ACCOUNT_PERIOD) as reader:
+                    if not lost:
+                        await self._tell({"state": "waiting", **self._pictures.state(self.place)})
+                    await self._show_frames(reader)
+            except LocalProtocolError:
+                await self._tell(
+                    {"state": "awaited", "text": self._pictures.state(self.place)["failure"]}
+                )
+                lost = False
+            except (FrameSourceError, ConfigurationError) as exc:
+                await self._tell({"state": "lost", "text": str(exc)})
+                lost = True
+            else:
+                await self._tell({"state": "ended", "text": f"{self._source.name} has ended."})
+                await asyncio.Event().wait()  # a page that hears it twice would play it again
+            if self._sent > before:
+                delays = AGAIN.delays()
+            await asyncio.sleep(next(delays))
+
+    async def _show_frames(self, reader: FrameReader) -> None:
+        """Show frames until the source ends."""
+        bad = 0
+        while True:
+            try:
+                frame = await anext(reader)
+            except FrameTimeoutError:
+                await self._tell({"account": _account(reader, bad)})
+                continue
+            except StopAsyncIteration:
+                return
+            try:
+                picture = await self._pictures.press(self.place).jpeg(frame)
+            except FrameFormatError as exc:
+                bad += 1
+                await self._tell({"account": _account(reader, bad), "bad": str(exc)})
+                continue
+            await self._send_picture(_about(frame), _account(reader, bad), picture)
+
+    async def _send_picture(
+        self, frame: dict[str, Any], account: dict[str, Any], picture: bytes
+    ) -> None:
+        """Send a picture behind its JSON, and wait until it is shown; TimeoutError: it is not."""
+        said = json.dumps({"frame": frame, "account": account}).encode()
+        self._shown.clear()
+        async with asyncio.timeout(SLOW):
+            await self._socket.send_bytes(len(said).to_bytes(4, "little") + said + picture)
+            self._sent += 1
+            await self._shown.wait()
+
+    async def _tell(self, value: dict[str, Any]) -> None:
+        async with asyncio.timeout(SLOW):
+            await self._socket.send_str(json.dumps(value))
+
+
+def _about(frame: Frame) -> dict[str, Any]:
+    """Return what a page says of a frame; its age is that of now."""
+    return {
+        "sequence": frame.sequence,
+        "width": frame.width,
+        "height": frame.height,
+        "format": frame.format.name,
+        "age": frame.age,
+        "moment": frame.moment.value,
+    }
+
+
+def _account(reader: FrameReader, bad: int) -> dict[str, Any]:
+    """Return what became of the frames since one looks; ``at`` in seconds of a clock."""
+    account = reader.statistics()
+    return {
+        "at": time.monotonic(),
+        "offered": account.offered,
+        "delivered": account.delivered,
+        "skipped": account.skipped,
+        "lost": account.lost,
+        "bad": bad,
+    }

@@ -1,0 +1,89 @@
+"""A way between sender and receiver on the loopback, that does what a test says."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from typing import TYPE_CHECKING, Any
+
+from smartcam.frames._rtp.packets import RtpPacket, is_rtcp
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+HOST = "127.0.0.1"
+
+
+def two_ports() -> int:
+    """Return a port that is free, and the next one, too."""
+    while True:
+        with (
+            socket.socket(type=socket.SOCK_DGRAM) as one,
+            socket.socket(type=socket.SOCK_DGRAM) as two,
+        ):
+            one.bind((HOST, 0))
+            port = int(one.getsockname()[1])
+            with contextlib.suppress(OSError, OverflowError):
+                two.bind((HOST, port + 1))
+                return port
+
+
+class Way:
+    """Carries RTP and RTCP to a receiver, and RTCP back.
+
+    Attributes:
+        port: that a sender sends to.
+        passes: says of each packet of RTP whether it arrives.
+        back: whether what the receiver says does.
+        carried: packets of RTP that arrived.
+    """
+
+    def __init__(self, to: int) -> None:
+        self.port = two_ports()
+        self.passes: Callable[[RtpPacket], bool] = lambda _: True
+        self.back = True
+        self.carried: list[RtpPacket] = []
+        self._to = to
+        self._sender: list[Any] = [None, None]
+        self._loop = asyncio.get_running_loop()
+        self._sockets: list[socket.socket] = []
+        for number in range(2):
+            one = socket.socket(type=socket.SOCK_DGRAM)
+            one.setblocking(False)
+            one.bind((HOST, self.port + number))
+            self._loop.add_reader(one, self._readable, one, number)
+            self._sockets.append(one)
+
+    def close(self) -> None:
+        for one in self._sockets:
+            self._loop.remove_reader(one)
+            one.close()
+
+    def _readable(self, one: socket.socket, number: int) -> None:
+        while True:
+            try:
+                data, who = one.recvfrom(65536)
+            except OSError:
+                return
+            with contextlib.suppress(OSError):
+                if who[1] == self._to + number:
+                    if self.back and self._sender[number] is not None:
+                        one.sendto(data, self._sender[number])
+                    continue
+                self._sender[number] = who
+                if not is_rtcp(data):
+                    packet = RtpPacket.parse(data)
+                    if not self.passes(packet):
+                        continue
+                    self.carried.append(packet)
+                one.sendto(data, (HOST, self._to + number))
+
+
+@contextlib.asynccontextmanager
+async def way(to: int) -> AsyncIterator[Way]:
+    made = Way(to)
+    try:
+        yield made
+    finally:
+        made.close()

@@ -1,0 +1,224 @@
+"""One encoder for all viewers of a source."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError
+from smartcam.frames import Codecs
+from smartcam.frames._shared_stream import FAILURES, KEY_PAUSE, LINGER, SharedH264
+from tests.frames.drivers import GoneError, scripted
+from tests.frames.pictures import frame_of, stamped
+from tests.handmade import until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from smartcam.frames import Frame, FrameSource
+    from tests.frames.drivers import ScriptedDriver
+
+
+def drawn(number: int) -> Frame:
+    return frame_of(stamped(number), "Mono8", number)
+
+
+class Viewer:
+    """Keeps what it is handed."""
+
+    def __init__(self) -> None:
+        self.units: list[tuple[int, bool]] = []
+        self.error: FrameSourceError | None = None
+
+    def take(self, unit: Frame, key: bool) -> None:
+        self.units.append((unit.sequence, key))
+
+    def ended(self, error: FrameSourceError) -> None:
+        self.error = error
+
+
+class Stream:
+    """A shared stream of a scripted device."""
+
+    def __init__(self, driver: ScriptedDriver, source: FrameSource, codecs: Codecs) -> None:
+        self.driver = driver
+        self.shared = SharedH264(source, codecs.h264_encoder())
+
+    async def give(self, *numbers: int) -> None:
+        """Give frames, each when the one before it is encoded."""
+        await self.driver.streams()
+        for number in numbers:
+            before = self.shared.counts.encoded + self.shared.counts.failed
+            self.driver.give(drawn(number))
+            await until(
+                lambda b=before: self.shared.counts.encoded + self.shared.counts.failed > b  # type: ignore[misc]
+            )
+
+
+@pytest.fixture
+async def stream(no_leaks: None) -> AsyncIterator[Stream]:
+    driver, source = scripted(stall=None)
+    async with source, Codecs(threads=1) as codecs:
+        made = Stream(driver, source, codecs)
+        try:
+            yield made
+        finally:
+            await made.shared.close()
+
+
+async def test_twenty_viewers_are_one_encoder(stream: Stream) -> None:
+    viewers = [Viewer() for _ in range(20)]
+    for viewer in viewers:
+        stream.shared.join(viewer)
+    await stream.give(1, 2, 3)
+    assert [viewer.units for viewer in viewers] == [[(1, True), (2, False), (3, False)]] * 20
+    assert (stream.shared.counts.encoded, stream.shared.counts.keys) == (3, 1)
+
+
+async def test_nobody_there_nothing_streams(stream: Stream) -> None:
+    assert stream.driver.calls == ["open"]
+    viewer = Viewer()
+    stream.shared.join(viewer)
+    await stream.give(1)
+    stream.shared.leave(viewer)
+    await asyncio.sleep(LINGER - 0.1)
+    assert stream.driver.calls == ["open", "start"]
+    await asyncio.sleep(0.2)
+    await stream.driver.rests()
+    stream.shared.join(viewer)
+    await stream.give(2)
+    assert viewer.units == [(1, True), (2, True)]
+
+
+async def test_who_comes_back_in_time_finds_it_streaming_and_nothing_was_encoded_meanwhile(
+    stream: Stream,
+) -> None:
+    viewer = Viewer()
+    stream.shared.join(viewer)
+    await stream.give(1)
+    stream.shared.leave(viewer)
+    stream.driver.give(drawn(2))
+    await asyncio.sleep(LINGER / 2)
+    stream.shared.join(viewer)
+    await asyncio.sleep(LINGER * 2)
+    await stream.give(3)
+    assert viewer.units == [(1, True), (3, True)]
+    assert stream.driver.calls == ["open", "start"]
+
+
+async def test_key_frames_come_for_who_joins_and_no_more_often_than_bounded(
+    stream: Stream,
+) -> None:
+    first, second, third = Viewer(), Viewer(), Viewer()
+    stream.shared.join(first)
+    await stream.give(1, 2)
+    stream.shared.join(second)
+    await stream.give(3)
+    stream.shared.join(third)
+    stream.shared.key_frame()
+    await stream.give(4)
+    await asyncio.sleep(KEY_PAUSE)
+    await stream.give(5, 6)
+    assert [number for number, key in first.units if key] == [1, 5]
+    assert second.units == [(3, False), (4, False), (5, True), (6, False)]
+    assert third.units[1:] == [(5, True), (6, False)]
+
+
+async def test_a_slow_encoder_skips_and_never_lags(stream: Stream) -> None:
+    viewer = Viewer()
+    stream.shared.join(viewer)
+    await stream.driver.streams()
+    for number in (1, 2, 3, 4):
+        stream.driver.give(drawn(number))
+        await asyncio.sleep(0)
+    await until(lambda: len(viewer.units) == 2)
+    assert [number for number, _ in viewer.units] == [1, 4]
+
+
+async def test_what_it_is_is_told_before_anybody_looks_and_once_for_all_who_ask(
+    stream: Stream,
+) -> None:
+    asking = [asyncio.create_task(stream.shared.first(5.0)) for _ in range(3)]
+    await stream.give(1)
+    units = [await one for one in asking]
+    assert [unit.sequence for unit in units] == [1, 1, 1]
+    assert (await stream.shared.first(0.0)).sequence == 1
+    assert stream.shared.counts.encoded == 1
+    await asyncio.sleep(LINGER + 0.1)
+    await stream.driver.rests()
+
+
+async def test_a_source_that_gives_nothing_is_told_in_time(stream: Stream) -> None:
+    before = asyncio.get_running_loop().time()
+    with pytest.raises(FrameTimeoutError, match="scripted: no frame came within 5 s"):
+        await stream.shared.first(5.0)
+    assert asyncio.get_running_loop().time() - before == pytest.approx(5.0, abs=0.1)
+
+
+async def test_a_source_that_ends_takes_its_viewers_along_and_is_tried_again(
+    stream: Stream,
+) -> None:
+    viewer = Viewer()
+    stream.shared.join(viewer)
+    await stream.give(1)
+    assert stream.driver.sink is not None
+    stream.driver.sink.ended(GoneError("it was unplugged"))
+    await until(lambda: viewer.error)
+    assert isinstance(viewer.error, GoneError)
+    assert stream.shared.viewers == 0
+    stream.driver.fails["start"] = GoneError("it is not there")
+    with pytest.raises(GoneError, match="not there"):
+        await stream.shared.first(5.0)
+    del stream.driver.fails["start"]
+    asking = asyncio.create_task(stream.shared.first(5.0))
+    await stream.give(2)
+    assert (await asking).sequence == 2
+
+
+async def test_the_end_of_a_recording_is_an_end(stream: Stream) -> None:
+    viewer = Viewer()
+    stream.shared.join(viewer)
+    await stream.give(1)
+    assert stream.driver.sink is not None
+    stream.driver.sink.ended(None)
+    await until(lambda: viewer.error)
+    assert str(viewer.error) == "scripted: it has ended"
+
+
+async def test_one_damaged_frame_is_left_out_but_not_all(stream: Stream) -> None:
+    viewer = Viewer()
+    stream.shared.join(viewer)
+    await stream.give(1)
+    await stream.driver.streams()
+    for _ in range(FAILURES - 1):
+        failed = stream.shared.counts.failed
+        stream.driver.give(replace(drawn(2), data=b"cut off"))
+        await until(lambda f=failed: stream.shared.counts.failed > f)  # type: ignore[misc]
+    await stream.give(3)
+    assert viewer.units == [(1, True), (3, True)]
+    for _ in range(FAILURES):
+        failed = stream.shared.counts.failed
+        stream.driver.give(replace(drawn(4), data=b"cut off"))
+        await until(lambda f=failed: stream.shared.counts.failed > f)  # type: ignore[misc]
+    await until(lambda: viewer.error)
+    assert isinstance(viewer.error, FrameFormatError)
+
+
+async def test_a_source_that_is_closed_is_told(no_leaks: None) -> None:
+    _, source = scripted()
+    async with Codecs(threads=1) as codecs:
+        shared = SharedH264(source, codecs.h264_encoder())
+        with pytest.raises(FrameSourceError, match="is not open"):
+            await shared.first(5.0)
+        await shared.close()
+
+
+async def test_closing_answers_who_asks(stream: Stream) -> None:
+    asking = asyncio.create_task(stream.shared.first(5.0))
+    await stream.driver.streams()
+    await stream.shared.close()
+    with pytest.raises(FrameSourceError, match="its stream was closed"):
+        await asking
