@@ -84,4 +84,5 @@ def _grain(random: np.random.Generator) -> NDArray[np.float64]:
     grain: NDArray[Any] = np.fft.irfft2(
         np.fft.rfft2(random.normal(size=(SIZE[1], SIZE[0]))) * weight, s=(SIZE[1], SIZE[0])
     )
-    return (grain - grain.mean()) / grain.std()
+    even: NDArray[np.float64] = (grain - grain.mean()) / grain.std()
+    return even

@@ -64,6 +64,7 @@ FRAME_TIMEOUT = 5.0
 """Seconds that a frame is waited for."""
 
 FrameEncoding: TypeAlias = Literal["raw", "jpeg", "png", "jpegxl"]
+StreamEncoding: TypeAlias = Literal["raw", "jpeg", "png", "jpegxl", "h264"]
 """What frames may come as."""
 
 
@@ -639,8 +640,11 @@ class Camera(abc.ABC, Generic[ValueT]):
     def frames(
         self,
         *,
-        encoding: FrameEncoding = "raw",
+        encoding: StreamEncoding = "raw",
         quality: int | None = None,
+        bitrate: float | None = None,
+        latency: float | None = None,
+        decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> contextlib.AbstractAsyncContextManager[FrameReader]:
         """Read what the camera sees: ``async with camera.frames() as frames``, then iterate.
@@ -653,8 +657,14 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Args:
             encoding: ``raw`` is as the device gives them; ``jpeg``, or ``png`` and ``jpegxl``
-                without loss. They stay so until somebody asks for pixels.
+                without loss. They stay so until somebody asks for pixels. ``h264`` is decoded here,
+                and only whole pictures are given.
             quality: of JPEG, 1 to 100.
+            bitrate: bits a second that JPEGs are held to, by quality first and frame rate then
+                (each frame's ``rate`` says how); of H.264 what its encoder keeps to.
+            latency: seconds from a JPEG's capture to its arrival that are held the same way.
+            decode: False: of H.264 the encoded frames. Who skips one has no picture until the next
+                key frame.
             timeout: seconds that an iteration waits for a frame; None: as long as it takes.
 
         Raises:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Literal, NoReturn, Self, Unpack
 
-    from smartcam.camera import FrameEncoding
+    from smartcam.camera import FrameEncoding, StreamEncoding
     from smartcam.frames import Frame, FrameReader, ReaderStatistics
     from smartcam.interpreters._base import AnySpec, TypedSpec
     from smartcam.models import (
@@ -526,12 +526,22 @@ class SyncCamera(Generic[ValueT]):
     def frames(
         self,
         *,
-        encoding: FrameEncoding = "raw",
+        encoding: StreamEncoding = "raw",
         quality: int | None = None,
+        bitrate: float | None = None,
+        latency: float | None = None,
+        decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> Generator[SyncFrameReader]:
         """Read what the camera sees, in a ``with``: :meth:`smartcam.Camera.frames`."""
-        inside = self._camera.frames(encoding=encoding, quality=quality, timeout=timeout)
+        inside = self._camera.frames(
+            encoding=encoding,
+            quality=quality,
+            bitrate=bitrate,
+            latency=latency,
+            decode=decode,
+            timeout=timeout,
+        )
         reader = self._wait(inside.__aenter__)
         try:
             yield SyncFrameReader(reader, self)

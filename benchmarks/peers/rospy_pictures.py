@@ -39,8 +39,8 @@ def can(modules: str) -> bool:
 
 def publish(how: str) -> None:
     """Publish pictures with their stamps until killed."""
-    import rospy
-    from sensor_msgs.msg import CompressedImage, Image
+    import rospy  # type: ignore[import-not-found]
+    from sensor_msgs.msg import CompressedImage, Image  # type: ignore[import-not-found]
 
     rospy.init_node("near", disable_signals=True)
     kind = Image if how == "raw" else CompressedImage
@@ -126,16 +126,16 @@ def main(how: str, seconds: float) -> None:
         ]
         try:
             for _ in range(100):
-                with socket.socket() as one:
-                    if one.connect_ex(("127.0.0.1", port)) == 0:
+                with socket.socket() as tried:
+                    if tried.connect_ex(("127.0.0.1", port)) == 0:
                         break
                 time.sleep(0.1)
             started.append(subprocess.Popen([*here, "publish", how], env=environment))
             subprocess.run([*here, "subscribe", how, str(seconds)], env=environment, check=True)
         finally:
-            for one in reversed(started):
-                one.terminate()
-                one.wait()
+            for process in reversed(started):
+                process.terminate()
+                process.wait()
 
 
 if __name__ == "__main__":

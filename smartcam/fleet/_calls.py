@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._frame_stream import FrameOrder
 from smartcam.fleet._frame_wire import FrameForm
-from smartcam.fleet._frames import FrameOrder
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._shared import Carrier, Owner
 from smartcam.fleet._wire import TriggerOrder, encode_runs
@@ -212,12 +212,21 @@ async def _request(call: ProgramCall) -> Answer:
     return {}, [] if answer is None else [answer]
 
 
-def _frame_order(call: ProgramCall) -> FrameOrder:
-    name = call.host.name
+MOST_REST = 3600.0
+"""Seconds from one frame of a stream to the next that one may ask for."""
+
+
+def _frame_order(call: ProgramCall, *, stream: bool = False) -> FrameOrder:
     encoding = FrameForm.checked(
-        call.argument("encoding", str) or "raw", call.argument("quality", int), name
+        call.argument("encoding", str) or "raw",
+        call.argument("quality", int),
+        call.host.name,
+        bitrate=call.argument("bitrate", int),
+        stream=stream,
     )
-    return FrameOrder(call.program, call.owner.call, encoding, call.timeout)
+    rest = min(MOST_REST, max(0.0, call.argument("rest", int, float) or 0.0))
+    have = call.argument("have", int) or 0
+    return FrameOrder(call.program, call.owner.call, encoding, call.timeout, rest, have)
 
 
 async def _frame(call: ProgramCall) -> Answer:
@@ -230,7 +239,9 @@ async def _frame(call: ProgramCall) -> Answer:
 
 
 async def _next_frame(call: ProgramCall) -> Answer:
-    return await call.host.frames.next(_frame_order(call), call.wanted("stream", int)), []
+    return await call.host.frames.next(
+        _frame_order(call, stream=True), call.wanted("stream", int)
+    ), []
 
 
 async def _leave_frames(call: ProgramCall) -> Answer:

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from smartcam._client.listeners import Listeners
     from smartcam._client.triggering import TriggerRequest
-    from smartcam.camera import FrameEncoding
+    from smartcam.camera import FrameEncoding, StreamEncoding
     from smartcam.fleet._frame_caller import FrameCaller
     from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._program import Program
@@ -687,14 +687,17 @@ class FleetCamera(Camera[ValueT]):
     async def frames(
         self,
         *,
-        encoding: FrameEncoding = "raw",
+        encoding: StreamEncoding = "raw",
         quality: int | None = None,
+        bitrate: float | None = None,
+        latency: float | None = None,
+        decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> AsyncGenerator[FrameReader]:
-        async with (
-            self.frame_source(encoding, quality, timeout=timeout) as source,
-            source.reader() as reader,
-        ):
+        source = self.frame_source(
+            encoding, quality, bitrate=bitrate, latency=latency, decode=decode, timeout=timeout
+        )
+        async with source, source.reader() as reader:
             yield reader
 
     @property
@@ -704,16 +707,20 @@ class FleetCamera(Camera[ValueT]):
 
     def frame_source(
         self,
-        encoding: FrameEncoding = "raw",
+        encoding: StreamEncoding = "raw",
         quality: int | None = None,
         *,
+        bitrate: float | None = None,
+        latency: float | None = None,
+        decode: bool = True,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> FrameSource:
         """Return what :meth:`frames` reads, for several readers; not opened yet."""
-        from smartcam.fleet._frame_caller import SharedFrameDriver
+        from smartcam.fleet._frame_shared_driver import SharedFrameDriver
+        from smartcam.fleet._frame_wish import StreamWish
         from smartcam.frames import FrameAddress, FrameSource
 
-        wanted = FrameForm.checked(encoding, quality, self.name)
+        wanted = StreamWish.checked(encoding, quality, bitrate, latency, self.name, decode=decode)
         driver = SharedFrameDriver(FrameAddress.parse(self.url), self.frame_caller, wanted)
         return FrameSource(driver, timeout=timeout, stall=None)
 

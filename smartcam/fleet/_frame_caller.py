@@ -10,35 +10,22 @@ from typing import TYPE_CHECKING, Any
 from smartcam.calibration import CameraModel
 from smartcam.exceptions import (
     CalibrationError,
-    ConfigurationError,
     FrameSourceError,
     FrameTimeoutError,
     RemoteProtocolError,
     ResponseTimeoutError,
     SmartCamError,
-    UnsupportedError,
 )
-from smartcam.fleet._frame_encoding import FORMATS
-from smartcam.fleet._frame_wire import FrameForm, from_fields
-from smartcam.fleet._frames import HOLD
-from smartcam.frames import FrameDriver, StreamFormat, find_format
+from smartcam.fleet._frame_wire import from_fields
+from smartcam.frames import StreamFormat, find_format
 
 if TYPE_CHECKING:
+    from smartcam.fleet._bus import Data
     from smartcam.fleet._caller import Caller
-    from smartcam.fleet._frame_wire import FleetFrame
-    from smartcam.frames import FrameAddress, FrameSink
+    from smartcam.fleet._frame_wire import FleetFrame, FrameForm
+    from smartcam.fleet._frame_wish import StreamWish
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
-
-ANSWER = 4.0
-"""Seconds for the answer to a request of a stream, beyond those that it waits for a frame: to
-encode it, and for the way."""
-
-MOST_SILENT = 3
-"""Requests in a row without an answer after which a stream has ended."""
-
-MOST_TORN = 10
-"""Frames in a row that did not come whole after which it has ended, too."""
 
 OPEN_TIMEOUT = 15.0
 """Seconds for an agent to open its device."""
@@ -46,14 +33,14 @@ OPEN_TIMEOUT = 15.0
 MOST_LENSES = 16
 
 
-class _StreamCounts:
+class StreamCounts:
     """What a stream's last frame said of those before it."""
 
     def __init__(self) -> None:
         self._last: tuple[int, int, int, int] | None = None
 
-    def since(self, said: dict[str, Any]) -> tuple[int, int]:
-        """Return how many were skipped, and lost, since the frame before."""
+    def since(self, said: dict[str, Any], came: int = 1) -> tuple[int, int]:
+        """Return how many were skipped, and lost, since the frames before; ``came`` are here."""
         now = int(said["stream"]), int(said["sent"]), int(said["skipped"]), int(said["lost"])
         last, self._last = self._last, now
         if last is None or last[0] != now[0]:  # the first one, or the agent took it for over
@@ -61,7 +48,7 @@ class _StreamCounts:
         sent, skipped, lost = (
             max(0, new - old) for new, old in zip(now[1:], last[1:], strict=True)
         )
-        return skipped, lost + max(0, sent - 1)  # those that were sent and did not come
+        return skipped, lost + max(0, sent - came)  # those that were sent and did not come
 
 
 class FrameCaller:
@@ -76,7 +63,7 @@ class FrameCaller:
         self.name, self._caller = name, caller
         self._lenses: dict[tuple[int, int], CameraModel | None] = {}
 
-    async def about(self, encoding: FrameForm) -> StreamFormat:
+    async def about(self, wish: StreamWish) -> StreamFormat:
         """Return what frames come, as the device says; it is opened for that.
 
         Raises:
@@ -88,8 +75,7 @@ class FrameCaller:
         try:
             rates = tuple(float(rate) for rate in said["rates"])
             size = int(said["width"]), int(said["height"])
-            pixels = FORMATS.get(encoding.name, str(said["format"]))
-            return StreamFormat(find_format(pixels), *size, rates)
+            return StreamFormat(find_format(wish.pixels(str(said["format"]))), *size, rates)
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"{self.name}: what the agent says of it: {exc!r}") from exc
 
@@ -123,7 +109,7 @@ class FrameCaller:
             arguments["after"] = self._caller.clock_at_most(moment + self._ahead)
         try:
             while True:  # nothing is done by it, so it may be asked again where a part was dropped
-                _, frame = await self.ask("frame", deadline, arguments, _StreamCounts())
+                _, frame = await self.ask("frame", deadline, arguments, StreamCounts())
                 if frame is not None:
                     return frame
                 if loop.time() >= deadline:
@@ -136,7 +122,7 @@ class FrameCaller:
             raise FrameTimeoutError(str(exc), source=self.name) from exc
 
     async def ask(
-        self, do: str, deadline: float, arguments: dict[str, Any], counts: _StreamCounts
+        self, do: str, deadline: float, arguments: dict[str, Any], counts: StreamCounts
     ) -> tuple[dict[str, Any], FleetFrame | None]:
         """Ask once; return what the agent says, and the frame if there is one that came whole.
 
@@ -146,6 +132,13 @@ class FrameCaller:
             arguments: of the call.
             counts: of the stream.
         """
+        answer, frames = await self.ask_all(do, deadline, arguments, counts)
+        return answer, frames[-1] if frames else None
+
+    async def ask_all(
+        self, do: str, deadline: float, arguments: dict[str, Any], counts: StreamCounts
+    ) -> tuple[dict[str, Any], list[FleetFrame]]:
+        """Ask once, as :meth:`ask` does; of H.264 several encoded frames come together."""
         caller = self._caller
         caller.require()
         number = caller.program.next_call()
@@ -156,30 +149,45 @@ class FrameCaller:
             answer = reply.fields["answer"]
             said = answer.get("frame")
             if said is None:
-                return answer, None
+                return answer, []
             data = await incoming.whole(int(said["size"]))
             if data is None:
-                return answer, None
+                return answer, []
             caller.bound(float(answer["came"]), said_at)
-            earliest, latest = caller.here(float(said["captured"]))
-            skipped, lost = counts.since(answer) if "stream" in answer else (0, int(said["lost"]))
-            lens = await self._lens(int(reply.fields["epoch"]), int(said["lens"]), deadline)
+            units = answer.get("units", [said])
+            stream = "stream" in answer
+            skipped, lost = counts.since(answer, len(units)) if stream else (0, int(said["lost"]))
+            epoch, place = int(reply.fields["epoch"]), 0
+            frames: list[FleetFrame] = []
+            for unit in units:
+                end = place + int(unit["size"])
+                part = data if len(units) == 1 else memoryview(data)[place:end]
+                frames.append(await self._made(unit, part, lost, epoch, deadline))
+                place, lost = end, 0
+            if place != len(data):
+                raise ValueError(f"{len(data)} bytes of {place}")
         except (KeyError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError):
                 raise
             raise RemoteProtocolError(f"{self.name}: what the agent says: {exc!r}") from exc
         finally:
             incoming.forget()
-        frame = from_fields(
+        return {**answer, "skipped": skipped}, frames
+
+    async def _made(
+        self, said: dict[str, Any], data: Data, lost: int, epoch: int, deadline: float
+    ) -> FleetFrame:
+        """Return a frame of what the agent says of it, and its bytes."""
+        earliest, latest = self._caller.here(float(said["captured"]))
+        return from_fields(
             said,
             data,
             captured=(earliest + latest) / 2 - self._ahead,
             doubt=(latest - earliest) / 2,
             lost=lost,
             source=self.name,
-            camera_info=lens,
+            camera_info=await self._lens(epoch, int(said["lens"]), deadline),
         )
-        return {**answer, "skipped": skipped}, frame
 
     @property
     def _ahead(self) -> float:
@@ -212,103 +220,6 @@ class FrameCaller:
     def next_stream(self) -> int:
         """Return the number of another stream."""
         return self._caller.program.next_call()
-
-
-class SharedFrameDriver(FrameDriver):
-    """Frames of a fleet's camera that is open.
-
-    Args:
-        address: the camera's.
-        frames: asks for them.
-        encoding: how they are to come.
-    """
-
-    times_frames = True
-
-    def __init__(self, address: FrameAddress, frames: FrameCaller, encoding: FrameForm) -> None:
-        super().__init__(address)
-        self._frames, self._encoding = frames, encoding
-        self._task: asyncio.Task[None] | None = None
-
-    @property
-    def name(self) -> str:
-        """The camera's name."""
-        return self._frames.name
-
-    async def open(self) -> StreamFormat:
-        """Have the agent open the device.
-
-        Raises:
-            FrameSourceError: it cannot, or there is no agent.
-            UnsupportedError: the camera has no frames.
-        """
-        try:
-            return await self._frames.about(self._encoding)
-        except (FrameSourceError, UnsupportedError, ConfigurationError):
-            raise
-        except SmartCamError as exc:
-            raise as_source_error(self.name, exc) from exc
-
-    async def start(self, sink: FrameSink) -> None:
-        """Ask for one frame after the other."""
-        self._task = asyncio.get_running_loop().create_task(
-            self._ask(sink, self._frames.next_stream()), name=f"frames of {self.name}"
-        )
-
-    async def stop(self) -> None:
-        """Ask no more."""
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
-
-    async def close(self) -> None:
-        """Ask no more."""
-        await self.stop()
-
-    async def _ask(self, sink: FrameSink, stream: int) -> None:
-        try:
-            end = await self._until_end(sink, stream)
-        except Exception as exc:
-            logger.exception("%s ! its frames end", self.name)
-            end = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
-        finally:
-            self._frames.leave(stream)
-        sink.ended(end)
-
-    async def _until_end(self, sink: FrameSink, stream: int) -> FrameSourceError | None:
-        """Take frames until there will be none, and return why."""
-        loop = asyncio.get_running_loop()
-        arguments = {**self._encoding.fields(), "stream": stream}
-        counts, silent, torn = _StreamCounts(), 0, 0
-        while True:
-            try:
-                deadline = loop.time() + HOLD + ANSWER
-                answer, frame = await self._frames.ask("next_frame", deadline, arguments, counts)
-            except FrameSourceError as exc:
-                return exc
-            except ResponseTimeoutError as exc:
-                silent += 1
-                if silent >= MOST_SILENT:
-                    return as_source_error(self.name, exc)
-                continue
-            except SmartCamError as exc:
-                return as_source_error(self.name, exc)
-            silent = 0
-            if frame is not None:
-                torn = 0
-                if answer["skipped"]:
-                    sink.skipped(answer["skipped"])
-                sink.frame(frame)
-            elif answer.get("ended"):
-                return None
-            elif "frame" in answer:
-                torn += 1
-                if torn >= MOST_TORN:
-                    return FrameSourceError(
-                        f"{self.name}: {torn} frames in a row did not come here whole",
-                        source=self.name,
-                    )
 
 
 def as_source_error(name: str, error: SmartCamError) -> FrameSourceError:

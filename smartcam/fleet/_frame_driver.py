@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 from smartcam.exceptions import SmartCamError
-from smartcam.fleet._frame_caller import SharedFrameDriver, as_source_error
-from smartcam.fleet._frame_wire import FrameForm
+from smartcam.fleet._frame_caller import as_source_error
+from smartcam.fleet._frame_shared_driver import SharedFrameDriver
+from smartcam.fleet._frame_wish import StreamWish
 from smartcam.fleet._opening import fleet_camera
 
 if TYPE_CHECKING:
@@ -15,20 +16,35 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameAddress, StreamFormat
 
 
+_NUMBERS = {"quality": (1, 100), "bitrate": (1e4, 1e9), "latency": (1e-3, 60.0)}
+"""What a URL may say of a stream, beside its encoding; the least and the most."""
+
+
 class FleetFrameDriver(SharedFrameDriver):
     """Frames of a fleet's camera: ``fleet://HOST/CAMERA?encoding=jpeg&quality=15``.
 
-    The other parameters are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
+    ``bitrate`` and ``latency`` are as :meth:`smartcam.Camera.frames` has them. The other parameters
+    are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         url, said = _split(address.url)
-        quality = said.get("quality")
-        number = None if quality is None else int(address.number("quality", quality, 1, 100))
-        encoding = FrameForm.checked(said.get("encoding", "raw"), number, f"{address.shown!r}")
+        numbers = {
+            name: address.number(name, said[name], least, most)
+            for name, (least, most) in _NUMBERS.items()
+            if name in said
+        }
+        quality = numbers.get("quality")
+        wish = StreamWish.checked(
+            said.get("encoding", "raw"),
+            None if quality is None else int(quality),
+            numbers.get("bitrate"),
+            numbers.get("latency"),
+            f"{address.shown!r}",
+        )
         self._url = url
         self._camera = self._make()
-        super().__init__(address, self._camera.frame_caller, encoding)
+        super().__init__(address, self._camera.frame_caller, wish)
 
     def _make(self) -> FleetCamera[Any]:
         return fleet_camera(self._url, {}, ())
@@ -54,6 +70,6 @@ def _split(url: str) -> tuple[str, dict[str, str]]:
     """Return a fleet URL, and what its query says of frames."""
     parts = urlsplit(url)
     said = parse_qsl(parts.query, keep_blank_values=True)
-    own = {key: value for key, value in said if key in {"encoding", "quality"}}
+    own = {key: value for key, value in said if key in {"encoding", *_NUMBERS}}
     query = urlencode([(key, value) for key, value in said if key not in own])
     return urlunsplit(parts._replace(query=query)), own

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from smartcam.exceptions import ConfigurationError, RemoteProtocolError
 from smartcam.frames import Frame, Moment
@@ -18,6 +18,7 @@ from smartcam.frames import Frame, Moment
 if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.fleet._bus import Data
+    from smartcam.frames import RateStatistics
 
 MOST_FRAME = 1 << 28
 """Bytes of a frame at most: 14,000 x 10,000 pixels of 16 bits."""
@@ -26,39 +27,72 @@ ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
 """What frames may be encoded as; raw is as the camera gave them."""
 
 
+VIDEO = "h264"
+"""What a stream may be encoded as, too."""
+
+LEAST_BITRATE, MOST_BITRATE = 10_000, 1_000_000_000
+
+
 class FrameForm(NamedTuple):
     """How frames are to come.
 
     Attributes:
-        name: one of :data:`ENCODINGS`.
+        name: one of :data:`ENCODINGS`, or :data:`VIDEO`.
         quality: of JPEG, 1 to 100; None: the codec's own.
+        bitrate: of H.264, bits a second; None: of even quality.
     """
 
     name: str = "raw"
     quality: int | None = None
+    bitrate: int | None = None
 
     @classmethod
-    def checked(cls, name: object, quality: object, who: str) -> FrameForm:
+    def checked(
+        cls,
+        name: object,
+        quality: object,
+        who: str,
+        *,
+        bitrate: object = None,
+        stream: bool = False,
+    ) -> FrameForm:
         """Return it.
 
+        Args:
+            name: the encoding.
+            quality: None where nothing is said.
+            who: asks.
+            bitrate: None where nothing is said.
+            stream: whether it is for a stream, which video can be.
+
         Raises:
-            ConfigurationError: there is no such encoding, or it has no such quality; ``who`` asks.
+            ConfigurationError: there is no such encoding, or it has no such quality or bit rate.
         """
-        if name not in ENCODINGS:
+        known = (*ENCODINGS, VIDEO) if stream else ENCODINGS
+        if name not in known:
+            why = ": it is for streams, no frame of it is a picture by itself"
             raise ConfigurationError(
-                f"{who}: encoding: expected {', '.join(ENCODINGS)}, got {name!r:.40}"
+                f"{who}: encoding: expected {', '.join(known)}, got {name!r:.40}"
+                f"{why if name == VIDEO else ''}"
             )
-        if quality is None:
-            return cls(str(name))
-        if name != "jpeg":
-            raise ConfigurationError(f"{who}: quality: {name} has none, got {quality!r:.40}")
-        if isinstance(quality, bool) or not isinstance(quality, int) or not 1 <= quality <= 100:
-            raise ConfigurationError(f"{who}: quality: expected 1 to 100, got {quality!r:.40}")
-        return cls(str(name), quality)
+        for what, value, of, least, most in (
+            ("quality", quality, "jpeg", 1, 100),
+            ("bitrate", bitrate, VIDEO, LEAST_BITRATE, MOST_BITRATE),
+        ):
+            if value is None:
+                continue
+            if name != of:
+                raise ConfigurationError(f"{who}: {what}: {name} has none, got {value!r:.40}")
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise ConfigurationError(
+                    f"{who}: {what}: expected {least} to {most}, got {value!r:.40}"
+                )
+        return cls(str(name), cast("int | None", quality), cast("int | None", bitrate))
 
     def fields(self) -> dict[str, Any]:
         """Return it as arguments of a call."""
-        return {"encoding": self.name, "quality": self.quality}
+        said = {"encoding": self.name, "quality": self.quality}
+        return said if self.bitrate is None else {**said, "bitrate": self.bitrate}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,9 +102,11 @@ class FleetFrame(Frame):
     Attributes:
         encoding_time: seconds that its agent took to encode it; 0 where it is as the camera gave
             it, or was encoded for somebody else before.
+        rate: what held the stream's bit rate or latency when it came, and why; None: nothing did.
     """
 
     encoding_time: float = 0.0
+    rate: RateStatistics | None = None
 
 
 def to_fields(frame: Frame, ahead: float, encoding_time: float, lens: int) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from smartcam.exceptions import (
     LocalProtocolError,
     UnsupportedError,
 )
-from smartcam.fleet._frame_wire import MOST_FRAME, FrameForm, to_fields
+from smartcam.fleet._frame_stream import FrameStream, PictureStream, VideoStream
+from smartcam.fleet._frame_wire import MOST_FRAME, VIDEO, FrameForm, to_fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.model import CameraModel
     from smartcam.fleet._frame_encoding import FrameEncoder
     from smartcam.fleet._frame_sender import FrameSender
-    from smartcam.frames import Frame, FrameReader, FrameSource
+    from smartcam.fleet._frame_stream import FrameOrder, TakenFrame
+    from smartcam.fleet._frame_video import SharedVideo
+    from smartcam.frames import Frame, FrameSource
 
 T = TypeVar("T")
 
@@ -43,16 +46,13 @@ MOST_OF_PROGRAM = 16
 MOST_ASKED = 16
 """Calls for frames of one camera that one program may have under way: each may keep a frame."""
 
-IDLE = 3.0
-"""Seconds without a request after which a stream has ended."""
-
 MOST_ENCODINGS = 16
 """Ways of encoding whose last frame is kept, for who wants the same."""
 
-MOST_LENSES = 16
+MOST_VIDEOS = 4
+"""Settings of H.264 that are encoded at one time."""
 
-HOLD = 1.0
-"""Seconds that a request waits for a frame at most; then it is answered that there is none."""
+MOST_LENSES = 16
 
 
 class FramesOf(NamedTuple):
@@ -68,48 +68,6 @@ class FramesOf(NamedTuple):
 
 
 NO_FRAMES = FramesOf(None, None)
-
-
-class FrameOrder(NamedTuple):
-    """Who wants a frame, and how.
-
-    Attributes:
-        program: its name.
-        call: number of its call.
-        encoding: how it is to come.
-        timeout: seconds.
-    """
-
-    program: str
-    call: int
-    encoding: FrameForm
-    timeout: float
-
-
-@dataclass(eq=False)
-class _FrameStream:
-    """A stream of a program."""
-
-    number: int
-    reader: FrameReader
-    idle: asyncio.TimerHandle | None = None
-    busy: bool = False
-
-    def rest(self, close: Callable[[], None]) -> None:
-        """Nothing is asked for now: ``close`` is called if that stays so."""
-        self.busy = False
-        self.idle = asyncio.get_running_loop().call_later(IDLE, close)
-
-    def wake(self) -> None:
-        """Something is asked for."""
-        self.busy = True
-        if self.idle is not None:
-            self.idle.cancel()
-            self.idle = None
-
-    def close(self) -> None:
-        self.wake()
-        self.reader.close()
 
 
 class _Encoded(NamedTuple):
@@ -138,10 +96,11 @@ class SharedFrames:
     url: str | None = None
     _source: FrameSource | None = None
     _opening: asyncio.Task[FrameSource] | None = None
-    _viewers: dict[tuple[str, int], _FrameStream] = field(
-        default_factory=dict[tuple[str, int], _FrameStream]
+    _viewers: dict[tuple[str, int], FrameStream] = field(
+        default_factory=dict[tuple[str, int], FrameStream]
     )
     _asking: dict[str, int] = field(default_factory=dict[str, int])
+    _videos: dict[FrameForm, SharedVideo] = field(default_factory=dict[FrameForm, "SharedVideo"])
     _encoded: dict[FrameForm, _Encoded] = field(default_factory=dict[FrameForm, _Encoded])
     _lenses: dict[int, CameraModel] = field(default_factory=dict[int, "CameraModel"])
     _numbers: itertools.count[int] = field(default_factory=lambda: itertools.count(1))
@@ -156,6 +115,9 @@ class SharedFrames:
         for viewer in self._viewers.values():
             viewer.close()
         self._viewers.clear()
+        for video in [*self._videos.values()]:
+            await video.close()
+        self._videos.clear()
         tasks = [*self._tasks]
         for task in tasks:
             task.cancel()
@@ -220,7 +182,8 @@ class SharedFrames:
         """Send one frame, as :meth:`get` has it."""
         came = asyncio.get_running_loop().time()
         frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
-        return {"came": came, "frame": self._send(frame, order, took)}
+        self._send([frame], order)
+        return {"came": came, "frame": self._said(frame, took)}
 
     async def get(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
@@ -246,21 +209,20 @@ class SharedFrames:
                 return await self._encode(frame, order.encoding)
 
     async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
-        """Send the newest frame that a stream has not had; say that there is none after a while."""
+        """Send what a stream has not had; say that there is none after a while."""
         came = asyncio.get_running_loop().time()
         key = order.program, stream
         with self._counted(order):
             viewer = self._viewers.get(key)
             if viewer is None:
-                viewer = await self._view(key, order.timeout)
+                viewer = await self._view(key, order)
             if viewer.busy:
                 raise LocalProtocolError(f"{self.name}: two requests for the frames of one stream")
+            if isinstance(viewer, VideoStream) != (order.encoding.name == VIDEO):
+                raise LocalProtocolError(f"{self.name}: a stream does not become {VIDEO}, nor back")
             viewer.wake()
             try:
-                async with asyncio.timeout(min(order.timeout, HOLD)):
-                    frame = await anext(viewer.reader)
-                async with asyncio.timeout(order.timeout):
-                    sent, took = await self._encode(frame, order.encoding)
+                taken = await viewer.take(order)
             except FrameTimeoutError:
                 raise
             except TimeoutError:
@@ -274,19 +236,13 @@ class SharedFrames:
             finally:
                 if self._viewers.get(key) is viewer:
                     viewer.rest(lambda: self._leave(key, viewer))
-        account = viewer.reader.statistics()
-        counts = {
-            "stream": viewer.number,
-            "sent": account.delivered,
-            "skipped": account.skipped,
-            "lost": account.lost,
-        }
-        return {"came": came, "frame": self._send(sent, order, took), **counts}
+        self._send([one.frame for one in taken], order)
+        return {"came": came, "stream": viewer.number, **viewer.counts(), **self._all_said(taken)}
 
-    async def _view(self, key: tuple[str, int], timeout: float) -> _FrameStream:
+    async def _view(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
         """Begin a stream."""
-        with self._within(timeout, "the device"):
-            async with asyncio.timeout(timeout):
+        with self._within(order.timeout, "the device"):
+            async with asyncio.timeout(order.timeout):
                 source = await self.source()
         if key in self._viewers:
             return self._viewers[key]
@@ -296,8 +252,42 @@ class SharedFrames:
                 f"{self.name}: {len(self._viewers)} streams of frames, {theirs} of them this "
                 "program's; no more are possible"
             )
-        viewer = self._viewers[key] = _FrameStream(next(self._numbers), source.reader(timeout=None))
+        number = next(self._numbers)
+        viewer: FrameStream
+        if order.encoding.name == VIDEO:
+            viewer = VideoStream(number, self._video(source, order.encoding), self._leave_video)
+        else:
+            viewer = PictureStream(number, source.reader(timeout=None), self._encode)
+        self._viewers[key] = viewer
         return viewer
+
+    def _video(self, source: FrameSource, form: FrameForm) -> SharedVideo:
+        """Return the H.264 of one setting, for one more who looks."""
+        from smartcam.fleet._frame_video import SharedVideo
+
+        video = self._videos.get(form)
+        if video is None or video.over:
+            if len(self._videos) >= MOST_VIDEOS:
+                raise LocalProtocolError(
+                    f"{self.name}: {len(self._videos)} settings of H.264 are encoded; no more are "
+                    "possible"
+                )
+            rates = source.format.rates
+            encoder = self.encoder.h264(min(rates) if rates else None, form.bitrate)
+            video = self._videos[form] = SharedVideo(source, encoder, self.name)
+        video.viewers += 1
+        return video
+
+    def _leave_video(self, video: SharedVideo) -> None:
+        """Encode no longer what nobody looks at."""
+        video.viewers -= 1
+        if video.viewers:
+            return
+        for form in [form for form, one in self._videos.items() if one is video]:
+            del self._videos[form]
+        ending = video.end()
+        self._tasks.add(ending)
+        ending.add_done_callback(self._done)
 
     def leave(self, program: str, stream: int) -> None:
         """End a stream; one that is not there is none."""
@@ -305,7 +295,7 @@ class SharedFrames:
         if viewer is not None:
             self._leave((program, stream), viewer)
 
-    def _leave(self, key: tuple[str, int], viewer: _FrameStream) -> None:
+    def _leave(self, key: tuple[str, int], viewer: FrameStream) -> None:
         if self._viewers.get(key) is viewer:
             del self._viewers[key]
         viewer.close()
@@ -319,19 +309,31 @@ class SharedFrames:
 
     # ------------------------------------------------------------------ a frame
 
-    def _send(self, frame: Frame, order: FrameOrder, took: float) -> dict[str, Any]:
-        """Send a frame's bytes, and return what there is to say of it.
+    def _send(self, frames: list[Frame], order: FrameOrder) -> None:
+        """Send the bytes of frames.
 
         Raises:
             FrameFormatError: there are more of them than a frame may have.
         """
-        if len(frame.data) > MOST_FRAME:
+        size = sum(len(frame.data) for frame in frames)
+        if size > MOST_FRAME:
             raise FrameFormatError(
-                f"{self.name}: a frame of {len(frame.data)} bytes, expected {MOST_FRAME} at most",
+                f"{self.name}: a frame of {size} bytes, expected {MOST_FRAME} at most",
                 source=self.name,
             )
-        self.sender.send(order.program, order.call, frame.data)
+        data = frames[0].data if len(frames) == 1 else b"".join(one.data for one in frames)
+        self.sender.send(order.program, order.call, data)
+
+    def _said(self, frame: Frame, took: float) -> dict[str, Any]:
+        """Return what there is to say of a frame."""
         return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
+
+    def _all_said(self, taken: list[TakenFrame]) -> dict[str, Any]:
+        """Return what there is to say of all frames that go together."""
+        if not taken[-1].number:
+            return {"frame": self._said(taken[-1].frame, taken[-1].took)}
+        units = [{**self._said(one.frame, one.took), "number": one.number} for one in taken]
+        return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
 
     async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
         """Return a frame encoded, once for all who want the same, and how long that took."""

@@ -14,8 +14,8 @@ from smartcam._client.triggering import TriggerRequest
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import FrameFormatError, UnsupportedError
 from smartcam.fleet._calls import ACTIONS, MOST_FILLED, ProgramCall, outcomes
+from smartcam.fleet._frame_stream import FrameOrder
 from smartcam.fleet._frame_wire import FrameForm, to_fields
-from smartcam.fleet._frames import FrameOrder
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._reading import result_fields, singles
 from smartcam.fleet._shared import Carrier

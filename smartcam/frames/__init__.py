@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from smartcam.frames._h264 import H264Decoder, H264Encoder
     from smartcam.frames._opening import discover, open
     from smartcam.frames._pixels import PixelFormat, find_format
+    from smartcam.frames._rate import RateControl, RateStatistics
     from smartcam.frames._reader import FrameReader, ReaderStatistics
     from smartcam.frames._rtp.feedback import RtpReceiver
     from smartcam.frames._rtp.receiver import RtpStatistics
@@ -52,6 +53,8 @@ __all__ = [
     "H264Encoder",
     "Moment",
     "PixelFormat",
+    "RateControl",
+    "RateStatistics",
     "ReaderStatistics",
     "Rectifier",
     "RtpReceiver",
@@ -81,6 +84,7 @@ if not TYPE_CHECKING:
             "_h264": "H264Decoder H264Encoder",
             "_opening": "discover open",
             "_pixels": "PixelFormat find_format",
+            "_rate": "RateControl RateStatistics",
             "_reader": "FrameReader ReaderStatistics",
             "_rtp.feedback": "RtpReceiver",
             "_rtp.receiver": "RtpStatistics",

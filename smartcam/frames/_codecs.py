@@ -63,10 +63,18 @@ class Codecs:
         Raises:
             LocalProtocolError: it was entered before.
         """
+        self.begin()
+        return self
+
+    def begin(self) -> None:
+        """Have the threads, for who calls :meth:`close`.
+
+        Raises:
+            LocalProtocolError: it was entered before.
+        """
         if self._pool is not None or self._closed:
             raise LocalProtocolError("Codecs: entered before; make new ones")
         self._pool = ThreadPoolExecutor(self._threads, "smartcam codecs")
-        return self
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()

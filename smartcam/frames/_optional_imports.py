@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 from typing import Any, Final
 
 from smartcam.exceptions import MissingExtraError
@@ -16,16 +15,19 @@ EXTRAS: Final = {
 }
 """What for, and the extra, of each module."""
 
+_LOADED: Final[dict[str, Any]] = {}  # whole; sys.modules has those that another thread is at, too
+
 
 def load(name: str) -> Any:
     """Return a module that an extra brings; untyped, which is why it is any.
 
     Raises MissingExtraError: it is not installed.
     """
-    if (there := sys.modules.get(name)) is not None:
+    if (there := _LOADED.get(name)) is not None:
         return there  # import_module looks for longer than a small picture takes
     try:
-        return importlib.import_module(name)
+        _LOADED[name] = module = importlib.import_module(name)
     except ImportError as exc:
         reason, extra = EXTRAS[name.partition(".")[0]]
         raise MissingExtraError(f'{reason}: pip install "smartcam[{extra}]"', extra=extra) from exc
+    return module

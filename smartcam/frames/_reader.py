@@ -147,6 +147,26 @@ class FrameReader:
         what = "a frame exposed after the moment that was given"
         return await self._first(what, timeout, lambda frame: frame.began >= moment)
 
+    async def fresh(self, since: float, until: float) -> None:
+        """Wait until the next frame is one that came since a moment, or it is too late for that.
+
+        Args:
+            since: of the loop's clock; a frame that has waited here longer is waited past.
+            until: of the loop's clock; then an older one will do, or none.
+
+        Cancellation: safe.
+        """
+        loop = asyncio.get_running_loop()
+        while not self._ended and loop.time() < until:
+            if self._next is not None and self.came >= since:
+                return
+            await self._woken(until)
+
+    @property
+    def came(self) -> float:
+        """When the newest frame came here, on the loop's clock; 0.0 before the first."""
+        return 0.0 if self._source is None else self._source._last_came  # noqa: SLF001
+
     async def _first(
         self, what: str, timeout: float | None, wanted: Callable[[Frame], bool]
     ) -> Frame:

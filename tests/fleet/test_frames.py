@@ -22,7 +22,7 @@ from smartcam import (
     UnsupportedError,
 )
 from smartcam.calibration import CameraModel
-from smartcam.fleet import FleetFrame, _frame_caller, _frames
+from smartcam.fleet import FleetFrame, _frame_caller, _frame_stream, _frames
 from smartcam.fleet._frame_wire import to_fields
 from smartcam.fleet._frames import SharedFrames
 from smartcam.frames import Moment
@@ -208,9 +208,9 @@ async def test_program_that_asks_no_more_has_nothing_stream() -> None:
         stream = camera.frame_caller.next_stream()
         loop = asyncio.get_running_loop()
         arguments = {"stream": stream, "encoding": "raw", "quality": None}
-        counts = _frame_caller._StreamCounts()
+        counts = _frame_caller.StreamCounts()
         await camera.frame_caller.ask("next_frame", loop.time() + 1, arguments, counts)
-        await asyncio.sleep(_frames.IDLE - 0.1)
+        await asyncio.sleep(_frame_stream.IDLE - 0.1)
         assert plant.driver.sink is not None
         await asyncio.sleep(0.2)
         assert plant.driver.sink is None
@@ -430,7 +430,7 @@ async def test_one_stream_asks_once_at_a_time() -> None:
     async with looking() as (_, camera):
         ask, loop = camera.frame_caller.ask, asyncio.get_running_loop()
         arguments = {"stream": 1, "encoding": "raw", "quality": None}
-        counts = _frame_caller._StreamCounts()
+        counts = _frame_caller.StreamCounts()
         asked = [ask("next_frame", loop.time() + 1, arguments, counts) for _ in range(2)]
         first, second = await asyncio.gather(*asked, return_exceptions=True)
         assert first == ({"came": pytest.approx(loop.time(), abs=2)}, None)

@@ -15,7 +15,7 @@ from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._optional_imports import load
 from smartcam.frames._pixels import find_format
 from smartcam.frames._rtp.parameters import size_in
-from smartcam.frames._rtp.receiver import Receiver, RtpStatistics
+from smartcam.frames._rtp.receiver import RtpStatistics, StreamReceiver
 from smartcam.frames._rtp.sockets import SocketPair, resolved
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class RtpDriver(FrameDriver):
         said = address.parameters(KNOWN)
         number = address.number
         self._wanted = address.size(said["size"]) if "size" in said else None
-        self._plan = _Plan(
+        self._plan = _RtpPlan(
             said.get("name") or address.shown.partition("?")[0],
             int(number("payload", said.get("payload", "96"), 0, 127)),
             number("repair", said.get("repair", "0.1"), 0, 1),
@@ -74,7 +74,7 @@ class RtpDriver(FrameDriver):
             raise address.wrong("address", "HOST:PORT with a port below 65535", address.shown)
         self._where = (address.host, address.port or 5004)
         self._endpoint: Endpoint | None = None
-        self._stream: _Stream | None = None
+        self._stream: _RtpStream | None = None
 
     @property
     def name(self) -> str:
@@ -97,7 +97,7 @@ class RtpDriver(FrameDriver):
         if self._wanted is not None:
             self._listening(self._endpoint).close()
             return StreamFormat(find_format("I420"), *self._wanted)
-        first = _First()
+        first = _FirstPicture()
         try:
             await self.start(first)
             async with asyncio.timeout(self._plan.timeout):
@@ -133,7 +133,7 @@ class RtpDriver(FrameDriver):
         if self._endpoint is None:
             raise LocalProtocolError(f"{self.name} is not open")
         pair = self._listening(self._endpoint)
-        self._stream = stream = _Stream(self._plan, self._wanted, pair, sink)
+        self._stream = stream = _RtpStream(self._plan, self._wanted, pair, sink)
         await stream.begin()
 
     async def stop(self) -> None:
@@ -147,7 +147,7 @@ class RtpDriver(FrameDriver):
         await self.stop()
 
 
-class _First(FrameSink):
+class _FirstPicture(FrameSink):
     """Takes one picture."""
 
     def __init__(self) -> None:
@@ -166,7 +166,7 @@ class _First(FrameSink):
             self.came.exception()  # nobody may wait any longer
 
 
-class _Plan(NamedTuple):
+class _RtpPlan(NamedTuple):
     """What the URL says."""
 
     name: str
@@ -176,7 +176,7 @@ class _Plan(NamedTuple):
     delay: float
 
 
-class _Stream:
+class _RtpStream:
     """What runs while the driver streams.
 
     Args:
@@ -184,7 +184,7 @@ class _Stream:
     """
 
     def __init__(
-        self, plan: _Plan, size: tuple[int, int] | None, pair: SocketPair, sink: FrameSink
+        self, plan: _RtpPlan, size: tuple[int, int] | None, pair: SocketPair, sink: FrameSink
     ) -> None:
         self._plan, self._sink = plan, sink
         self._expected = self._size = size
@@ -201,7 +201,7 @@ class _Stream:
         self._ended = False
         self._codecs = Codecs(threads=1)
         self._tasks: list[asyncio.Task[None]] = []
-        self._receiver = Receiver(pair, plan.payload, plan.repair, self._take, self._gone)
+        self._receiver = StreamReceiver(pair, plan.payload, plan.repair, self._take, self._gone)
 
     async def begin(self) -> None:
         """Decode what comes."""

@@ -47,7 +47,7 @@ class RtpReceiver:
     age: float
 
 
-class _Heard(NamedTuple):
+class _HeardReceiver(NamedTuple):
     address: str
     block: ReportBlock
     round_trip: float | None
@@ -63,7 +63,7 @@ class Audience:
 
     def __init__(self, ssrc: int) -> None:
         self._nothing = ReportBlock(ssrc, 0, 0, 0, 0)
-        self._heard: dict[int, _Heard] = {}
+        self._heard: dict[int, _HeardReceiver] = {}
 
     def report(self, report: ReceiverReport, address: str) -> bool:
         """Take a report, and return whether it is a new one's."""
@@ -72,10 +72,10 @@ class Audience:
         new = report.ssrc not in self._heard
         if new and len(self._heard) >= MOST_RECEIVERS:
             return False
-        known = self._heard.get(report.ssrc, _Heard(address, self._nothing, None, now))
+        known = self._heard.get(report.ssrc, _HeardReceiver(address, self._nothing, None, now))
         block = next((one for one in report.blocks if one.ssrc == self._nothing.ssrc), None)
         if block is not None:  # what is asked for in a hurry comes without
-            known = _Heard(address, block, _round_trip(block), now)
+            known = _HeardReceiver(address, block, _round_trip(block), now)
         self._heard[report.ssrc] = known._replace(at=now)
         return new
 
@@ -111,22 +111,22 @@ def _round_trip(block: ReportBlock) -> float | None:
     return ticks / 65536 if ticks < 1 << 31 else 0.0  # below 0 by a clock that was set
 
 
-class _Sent:
+class _SentPacket:
     __slots__ = ("at", "data", "times")
 
     def __init__(self, data: bytes) -> None:
         self.data, self.times, self.at = data, 0, time.monotonic()
 
 
-class History:
+class PacketHistory:
     """The packets of the last moments."""
 
     def __init__(self) -> None:
-        self._sent: collections.OrderedDict[int, _Sent] = collections.OrderedDict()
+        self._sent: collections.OrderedDict[int, _SentPacket] = collections.OrderedDict()
 
     def sent(self, sequence: int, data: bytes) -> None:
         """Remember a packet."""
-        self._sent[sequence] = _Sent(data)
+        self._sent[sequence] = _SentPacket(data)
         if len(self._sent) > REMEMBERED:
             self._sent.popitem(last=False)
 

@@ -24,7 +24,7 @@ _SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
 """Columns and rows that share a colour, by the format of colours: cropping counts in them."""
 
 
-class _Bits:
+class _FieldBits:
     """Reads a unit's fields, one after the other."""
 
     def __init__(self, data: bytes) -> None:
@@ -57,7 +57,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
         FrameFormatError: they are none.
     """
     try:
-        width, height = _size(_Bits(sps[1:256].replace(b"\0\0\3", b"\0\0")))
+        width, height = _size(_FieldBits(sps[1:256].replace(b"\0\0\3", b"\0\0")))
     except (StopIteration, RuntimeError, KeyError):
         raise _wrong("whole parameters", sps) from None
     if not (width > 0 and height > 0 and width * height <= MOST_PIXELS):
@@ -65,7 +65,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
     return width, height
 
 
-def _size(bits: _Bits) -> tuple[int, int]:
+def _size(bits: _FieldBits) -> tuple[int, int]:
     profile = bits.fixed(8)
     bits.fixed(16)
     bits.unsigned()
@@ -93,7 +93,7 @@ def _size(bits: _Bits) -> tuple[int, int]:
     )
 
 
-def _high(bits: _Bits) -> int:
+def _high(bits: _FieldBits) -> int:
     """Return the format of colours; 0 where the planes are separate ones."""
     colours = bits.unsigned()
     separate = bits.fixed(1) if colours == 3 else 0
@@ -107,7 +107,7 @@ def _high(bits: _Bits) -> int:
     return 0 if separate else colours
 
 
-def _skip_list(bits: _Bits, count: int) -> None:
+def _skip_list(bits: _FieldBits, count: int) -> None:
     last = following = 8
     for _ in range(count):
         if following:

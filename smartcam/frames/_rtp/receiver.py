@@ -79,7 +79,7 @@ class RtpStatistics:
     jitter: float = 0.0
 
 
-class Receiver:
+class StreamReceiver:
     """One stream from a pair of sockets, until :meth:`close`, which closes them.
 
     Args:

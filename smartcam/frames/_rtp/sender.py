@@ -20,7 +20,7 @@ from smartcam.exceptions import (
 )
 from smartcam.frames._codecs import Codecs
 from smartcam.frames._rtp import packets as wire
-from smartcam.frames._rtp.feedback import Audience, History
+from smartcam.frames._rtp.feedback import Audience, PacketHistory
 from smartcam.frames._rtp.h264 import H264Packetizer, parameter_sets
 from smartcam.frames._rtp.parameters import CLOCK_RATE, description
 from smartcam.frames._rtp.reception import ntp_time
@@ -71,7 +71,7 @@ class RtpSenderStatistics:
     receivers: tuple[RtpReceiver, ...]
 
 
-class _Link(NamedTuple):
+class _RtpOutlet(NamedTuple):
     """What it sends through, and where."""
 
     pair: SocketPair
@@ -131,7 +131,7 @@ class RtpSender:
         self._first = secrets.randbits(32)  # timestamp at the clock's 0
         self._ticks = 0
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
-        self._history = History()
+        self._history = PacketHistory()
         self._audience = Audience(self._packetizer.ssrc)
         self._sets: tuple[bytes, bytes] | None = None
         self._frames = self._packets = self._bytes = self._cut = self._resent = self._anew = 0
@@ -139,7 +139,7 @@ class RtpSender:
         self._wanted = False  # a key frame
         self._made_anew = float("-inf")
         self._endpoint: Endpoint | None = None
-        self._link: _Link | None = None
+        self._link: _RtpOutlet | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._entered = False
 
@@ -198,7 +198,7 @@ class RtpSender:
         who = f"RTP to {host}:{port}"
         self._endpoint = to = await resolved(host, port, who)
         try:
-            self._link = link = _Link(SocketPair.sending(to, self._ttl), to)
+            self._link = link = _RtpOutlet(SocketPair.sending(to, self._ttl), to)
         except OSError as exc:
             raise FrameSourceError(f"{who}: {exc}", source=self._source.name) from exc
         try:
@@ -254,7 +254,7 @@ class RtpSender:
 
     # sending
 
-    async def _send(self, link: _Link) -> None:
+    async def _send(self, link: _RtpOutlet) -> None:
         try:
             async with self._source.reader(timeout=None) as reader:
                 async for frame in reader:
@@ -279,7 +279,7 @@ class RtpSender:
         self._anew += 1
         self._encoder.begin_anew()
 
-    def _put(self, link: _Link, encoded: Frame) -> bool:
+    def _put(self, link: _RtpOutlet, encoded: Frame) -> bool:
         """Send a frame's packets; return whether the socket took them all."""
         data = bytes(encoded.data)
         self._sets = parameter_sets(data) or self._sets
@@ -299,12 +299,12 @@ class RtpSender:
         self._frames += 1
         return True
 
-    async def _report(self, link: _Link) -> None:
+    async def _report(self, link: _RtpOutlet) -> None:
         while True:
             self._say(link)
             await asyncio.sleep(REPORTED)
 
-    def _say(self, link: _Link, *more: wire.Report) -> None:
+    def _say(self, link: _RtpOutlet, *more: wire.Report) -> None:
         now = int(time.monotonic() * CLOCK_RATE) + self._first & 0xFFFF_FFFF
         report = wire.SenderReport(
             self._packetizer.ssrc, ntp_time(time.time()), now, self._packets, self._octets
@@ -314,14 +314,14 @@ class RtpSender:
 
     # what receivers say
 
-    def _reported(self, link: _Link, data: bytes, sender: tuple[Any, ...]) -> None:
+    def _reported(self, link: _RtpOutlet, data: bytes, sender: tuple[Any, ...]) -> None:
         if not link.to.multicast and sender[0] != link.to.host:
             return
         with contextlib.suppress(MessageError):  # anybody may send anything
             for report in wire.parse_rtcp(data):
                 self._take(link, report, f"{sender[0]}:{sender[1]}")
 
-    def _take(self, link: _Link, report: wire.Report, address: str) -> None:
+    def _take(self, link: _RtpOutlet, report: wire.Report, address: str) -> None:
         ours = self._packetizer.ssrc
         if isinstance(report, wire.PacketsMissing) and report.media == ours:
             self._send_again(link, report.sequences)
@@ -334,7 +334,7 @@ class RtpSender:
             self._wanted = True
             self._say(link)  # it wants to know our clock
 
-    def _send_again(self, link: _Link, sequences: tuple[int, ...]) -> None:
+    def _send_again(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:
             packet = self._history.again(sequence)
             if packet is None:

@@ -37,6 +37,9 @@ HALF: Final = 10.0
 IDLE: Final = 60.0
 """Seconds without a request or a session."""
 
+MOST_STRAYS: Final = 64
+"""Packets that come when there is no session, such as RTCP behind a TEARDOWN."""
+
 FAREWELL: Final = 1.0
 """Seconds for the last bytes to be taken; then a connection is cut off."""
 
@@ -89,6 +92,7 @@ class RtspConnection(asyncio.Protocol):
         self._parser = RequestParser()
         self._came, self._lost = asyncio.Event(), asyncio.Event()
         self._asked_at = asyncio.get_running_loop().time()
+        self._strays = 0
         self._closing = False
         self._reading = True
         self._cut: asyncio.TimerHandle | None = None
@@ -237,13 +241,13 @@ class RtspConnection(asyncio.Protocol):
         return True
 
     def _take(self, packet: ChannelData) -> bool:
-        """Take RTCP; return whether the connection is for anything."""
+        """Take RTCP; return whether there were not too many without a session."""
         for session in self.sessions.values():
             delivery = session.delivery
             if isinstance(delivery, ChannelDelivery) and packet.channel == delivery.channels[1]:
                 session.take_rtcp(packet.data)
-        idle_since = asyncio.get_running_loop().time() - self._asked_at
-        return bool(self.sessions) or idle_since < IDLE
+        self._strays += not self.sessions
+        return self._strays <= MOST_STRAYS
 
     async def _answer(self, request: RtspRequest) -> None:
         cseq = ""

@@ -48,6 +48,7 @@ class Client:
     @classmethod
     async def connect(cls, server: RtspServer, name: str = "left", room: int = 0) -> Client:
         sock = socket.socket()
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if room:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room)
         sock.setblocking(False)

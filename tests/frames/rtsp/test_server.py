@@ -13,8 +13,9 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, LocalProtocolError
 from smartcam.frames import RtspServer
-from smartcam.frames._rtsp.connection import HALF, IDLE
+from smartcam.frames._rtsp.connection import HALF, IDLE, MOST_STRAYS
 from smartcam.frames._rtsp.session import TIMEOUT
+from smartcam.frames._shared_stream import LINGER
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.rtsp.client import TCP, Client, digest
 from tests.frames.rtsp.test_shared_stream import drawn
@@ -219,6 +220,45 @@ async def test_a_connection_that_asks_nothing_is_closed(server: Served) -> None:
             client.writer.write(b"\r\n$\1\0\0")
         await asyncio.sleep(IDLE / 7)
         assert await client.ended()
+
+
+async def test_packets_without_a_session_are_left_but_not_many(server: Served) -> None:
+    _, serving = server
+    async with await Client.connect(serving) as client:
+        client.writer.write(b"$\1\0\0" * MOST_STRAYS)
+        assert (await client.ask("OPTIONS")).status == 200
+        before = asyncio.get_running_loop().time()
+        client.writer.write(b"$\1\0\0")
+        assert await client.ended()
+        assert asyncio.get_running_loop().time() - before < 1
+
+
+async def test_who_goes_while_it_waits_for_a_description_leaves_nothing(server: Served) -> None:
+    driver, serving = server
+    async with await Client.connect(serving) as client:
+        client.writer.write(f"DESCRIBE {client.base} RTSP/1.0\r\nCSeq: 1\r\n\r\n".encode())
+        await driver.streams()
+    await until(lambda: not connections(serving))
+    await asyncio.sleep(LINGER + 0.1)
+    await driver.rests()
+
+
+async def test_to_stop_is_finished_also_where_it_is_cancelled() -> None:
+    driver, source = scripted(stall=None)
+    async with source:
+        server = RtspServer({"left": source}, port=0)
+        await server.start()
+        async with await Client.connect(server) as client:
+            await client.play()
+            await driver.streams()
+            stopping = asyncio.create_task(server.stop())
+            await asyncio.sleep(0)
+            stopping.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await stopping
+            await driver.rests()
+            assert await client.ended()
+        await server.stop()
 
 
 async def test_who_takes_no_answers_is_cut_off(server: Served) -> None:

@@ -106,6 +106,7 @@ async def test_who_comes_back_in_time_finds_it_streaming_and_nothing_was_encoded
     await asyncio.sleep(LINGER * 2)
     await stream.give(3)
     assert viewer.units == [(1, True), (3, True)]
+    assert stream.shared.counts.encoded == 2
     assert stream.driver.calls == ["open", "start"]
 
 

@@ -386,6 +386,15 @@ async def test_datagrams_that_have_no_room_are_dropped_and_it_begins_anew(
             assert (stage.counts.sent, stage.counts.skipped) == (2, 2)
 
 
+def test_a_report_of_another_host_counts_not() -> None:
+    heard: list[bytes] = []
+    port = delivery._ControlPort("192.0.2.1", heard.append)
+    port.datagram_received(b"theirs", ("192.0.2.2", 5001))
+    port.datagram_received(b"its own", ("192.0.2.1", 5001))
+    port.error_received(OSError("no such port"))
+    assert heard == [b"its own"]
+
+
 async def test_port_pairs_are_even_and_odd(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(10):
         one, two = port_pair("127.0.0.1", socket.AF_INET)

@@ -1,0 +1,80 @@
+"""A reader of frames, such as ``camera.frames()`` gives, as a source that can be paired."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, ClassVar
+
+from smartcam.exceptions import FrameSourceError, FrameTimeoutError
+from smartcam.frames import FrameAddress, FrameDriver, StreamFormat
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+    from smartcam.frames import FrameReader, FrameSink
+
+
+class ReaderDriver(FrameDriver):
+    """Frames of a reader that is entered when this is opened, and left when it is closed."""
+
+    times_frames: ClassVar[bool] = True  # the reader's source did
+
+    def __init__(self, frames: AbstractAsyncContextManager[FrameReader], name: str) -> None:
+        super().__init__(FrameAddress.parse("synthetic://"))
+        self._frames, self._name = frames, name
+        self._reader: FrameReader | None = None
+        self._pump: asyncio.Task[None] | None = None
+
+    @property
+    def name(self) -> str:
+        """Left or right, until a frame tells more."""
+        return self._name
+
+    async def open(self) -> StreamFormat:
+        """Enter the reader, and see its first frame.
+
+        Raises:
+            FrameTimeoutError: none came in time.
+            FrameSourceError: the reader's source is not there.
+        """
+        self._reader = await self._frames.__aenter__()
+        first = await self._reader.newest(max_age=math.inf)
+        self._name = first.source
+        return StreamFormat(first.format, first.width, first.height)
+
+    async def start(self, sink: FrameSink) -> None:
+        """Hand on what the reader gives."""
+        if self._reader is None:
+            raise FrameSourceError(f"{self._name}: the reader is closed", source=self._name)
+        self._pump = asyncio.create_task(
+            _hand_on(self._reader, sink), name=f"frames of {self._name} for depth"
+        )
+
+    async def stop(self) -> None:
+        """Hand on nothing any longer."""
+        pump, self._pump = self._pump, None
+        if pump is not None:
+            pump.cancel()
+            await asyncio.wait([pump])
+
+    async def close(self) -> None:
+        """Leave the reader."""
+        await self.stop()
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            await self._frames.__aexit__(None, None, None)
+
+
+async def _hand_on(reader: FrameReader, sink: FrameSink) -> None:
+    while True:
+        try:
+            async for frame in reader:
+                sink.frame(frame)
+        except FrameTimeoutError:
+            continue  # who iterates over the pair has a deadline of its own
+        except FrameSourceError as error:
+            sink.ended(error)
+        else:
+            sink.ended(None)
+        return

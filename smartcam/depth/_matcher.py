@@ -1,0 +1,363 @@
+"""Disparity of two rectified pictures: OpenCV's matchers, what is wrong taken out."""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam._suggestions import did_you_mean
+from smartcam.calibration._optional_imports import load
+from smartcam.depth._subpixel import refined
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from typing import Literal
+
+    from numpy.typing import NDArray
+
+    Value = int | str
+
+SUBPIXELS: Final = 16
+"""OpenCV's steps of a disparity in a pixel."""
+
+WINDOWS: Final = (0, 5, 7, 9, 11, 13, 15)
+"""Sides of the window that a disparity is refined in, pixels; 0: none is."""
+
+MOST: Final = 4096
+"""Disparities that are searched, at most."""
+
+
+class Disparity(NamedTuple):
+    """What a :class:`StereoMatcher` finds.
+
+    Attributes:
+        pixels: (H, W), float32: a point of the left picture is so far further left in the right
+            one; NaN: none was found.
+        sigma: (H, W), float32: standard deviation of ``pixels``, pixels; NaN where that is.
+    """
+
+    pixels: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+
+class _WholeParameter(NamedTuple):
+    """A parameter that is a whole number."""
+
+    default: int
+    low: int
+    high: int
+    every: int = 1  # it is ``low`` and a multiple of this
+
+    def __str__(self) -> str:
+        step = {1: "", 2: ", odd" if self.low % 2 else ", even"}
+        return f"{self.low} to {self.high}{step.get(self.every, f', a multiple of {self.every}')}"
+
+    def check(self, value: object) -> int | None:
+        """Return a value as OpenCV takes it; None: it is none of these."""
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not whole or not self.low <= value <= self.high:  # type: ignore[operator]
+            return None
+        number = int(value)  # type: ignore[call-overload]
+        return number if (number - self.low) % self.every == 0 else None
+
+
+class _WordParameter(NamedTuple):
+    """A parameter that is one of some words; the first is the default."""
+
+    words: tuple[str, ...]
+    prefix: str  # of OpenCV's constant
+
+    @property
+    def default(self) -> str:
+        """Of what nobody said."""
+        return self.words[0]
+
+    def __str__(self) -> str:
+        return " or ".join(self.words)
+
+    def check(self, value: object) -> int | None:
+        """Return OpenCV's number of a word; None: there is no such word."""
+        if value not in self.words:
+            return None
+        return int(getattr(load("cv2"), self.prefix + str(value).upper()))
+
+
+_BOTH: Final[dict[str, _WholeParameter | _WordParameter]] = {
+    "min_disparity": _WholeParameter(0, -MOST, MOST),
+    "num_disparities": _WholeParameter(128, 16, MOST, 16),
+    "speckle_window_size": _WholeParameter(100, 0, 1_000_000),
+    "speckle_range": _WholeParameter(1, 0, 1000),
+}
+
+_PARAMETERS: Final[dict[str, dict[str, _WholeParameter | _WordParameter]]] = {
+    "sgbm": {
+        **_BOTH,
+        "block_size": _WholeParameter(5, 1, 51, 2),
+        "P1": _WholeParameter(0, 0, 1_000_000),
+        "P2": _WholeParameter(0, 0, 1_000_000),
+        "uniqueness_ratio": _WholeParameter(5, 0, 100),
+        "pre_filter_cap": _WholeParameter(63, 1, 63),
+        "mode": _WordParameter(("sgbm_3way", "sgbm", "hh", "hh4"), "StereoSGBM_MODE_"),
+    },
+    "bm": {
+        **_BOTH,
+        "block_size": _WholeParameter(15, 5, 255, 2),
+        "uniqueness_ratio": _WholeParameter(5, 0, 100),
+        "pre_filter_type": _WordParameter(("xsobel", "normalized_response"), "StereoBM_PREFILTER_"),
+        "pre_filter_size": _WholeParameter(9, 5, 255, 2),
+        "pre_filter_cap": _WholeParameter(31, 1, 63),
+        "texture_threshold": _WholeParameter(10, 0, 1_000_000),
+    },
+}
+"""By OpenCV's names, words with underscores between them; what is ours has other defaults."""
+
+
+class StereoMatcher:
+    """Finds how far apart the points of two rectified pictures are.
+
+    ::
+
+        matcher = StereoMatcher("sgbm", num_disparities=96, block_size=5)
+        disparity = matcher(left, right)
+        disparity.pixels, disparity.sigma
+
+    OpenCV's matcher looks from left to right and from right to left; what the two do not agree on
+    is none, as is a speckle. It is then refined by least squares in a window, which also tells its
+    sigma: see :attr:`Disparity.sigma` and ``docs/depth.md``. Points near the left border are found,
+    too, which OpenCV alone leaves out. Colours are made grey.
+
+    Args:
+        algorithm: ``sgbm``, semi-global, or ``bm``, blocks: three times faster, with more holes.
+        left_right: pixels by which both ways may differ; None: they are not compared.
+        refine: side of the window that disparities are refined in, odd, 5 to 15 pixels; 0: they
+            are OpenCV's sixteenths.
+        wls: lambda and sigma of OpenCV's weighted least squares filter, such as (8000, 1.5), which
+            makes them smooth between edges and fills holes; None: without.
+        parameters: of OpenCV's matcher, by its names with underscores: ``num_disparities``,
+            ``block_size``, ``P1``, ``uniqueness_ratio``, ``mode="hh"``. ``P1`` and ``P2`` of 0 are
+            8 and 32 times ``block_size`` squared.
+
+    Raises:
+        ConfigurationError: no such algorithm, parameter or value; the text lists what there is.
+            ``wls`` without ``cv2.ximgproc``, which is in OpenCV's contrib packages only.
+        MissingExtraError: OpenCV (extra ``depth``) is not installed.
+    """
+
+    def __init__(
+        self,
+        algorithm: Literal["sgbm", "bm"] = "sgbm",
+        *,
+        left_right: float | None = 1.0,
+        refine: int = 9,
+        wls: tuple[float, float] | None = None,
+        **parameters: Value,
+    ) -> None:
+        if algorithm not in _PARAMETERS:
+            raise ConfigurationError(
+                f"StereoMatcher: expected {' or '.join(_PARAMETERS)}, got {algorithm!r}"
+            )
+        self.algorithm = algorithm
+        self.parameters: Mapping[str, Value] = _merged(algorithm, parameters)
+        if left_right is not None and not 0 <= left_right <= MOST:
+            raise _wrong("left_right", f"0 to {MOST} pixels or None", left_right)
+        if refine not in WINDOWS:
+            raise _wrong("refine", f"one of {WINDOWS}", refine)
+        self._left_right, self._refine = left_right, refine
+        self._smooth = None if wls is None else _wls(wls)
+        numbers = {
+            name: _PARAMETERS[algorithm][name].check(value)
+            for name, value in self.parameters.items()
+        }
+        # OpenCV's own check is between its guesses only; it is in whole pixels, and -1 does not
+        # turn that of SGBM off
+        numbers["disp12_max_diff"] = MOST if left_right is None else math.ceil(left_right)
+        self._compute = _ALGORITHMS[algorithm](numbers)
+        self._lock = threading.Lock()  # OpenCV's matchers keep their buffers
+
+    @property
+    def nearest(self) -> int:
+        """Largest disparity that is found, pixels."""
+        return int(self.parameters["min_disparity"]) + int(self.parameters["num_disparities"]) - 1
+
+    def __call__(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Disparity:
+        """Return the disparity of two rectified pictures.
+
+        Blocks for as long as that takes: in a coroutine have a thread do it. Threads take turns.
+
+        Args:
+            left: (H, W) or, red first, (H, W, 3); uint8.
+            right: the same size.
+
+        Raises:
+            FrameFormatError: other shapes or types, or the pictures are too small.
+        """
+        first, second = _grey(left, "left"), _grey(right, "right")
+        window = int(self.parameters["block_size"])
+        if first.shape != second.shape or min(first.shape) < window:
+            raise FrameFormatError(
+                f"stereo: expected two pictures of one size, {window} pixels or more along a side, "
+                f"got {first.shape[1]}x{first.shape[0]} and {second.shape[1]}x{second.shape[0]}"
+            )
+        with self._lock:
+            found = self._match(first, second)
+        return Disparity(*refined(first, second, found, self._refine))
+
+    def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return OpenCV's disparities, NaN where there is none."""
+        cv2 = load("cv2")
+        none = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
+        sixteenths = self._padded(left, right)
+        if self._smooth is not None:
+            sixteenths = self._smooth(sixteenths, left, np.negative(self._back(left, right)))
+        elif self._left_right is not None:
+            apart = _disagreement(sixteenths, self._back(left, right), none)
+            sixteenths[~(apart <= self._left_right * SUBPIXELS)] = none
+        column = np.arange(left.shape[1])
+        there = column - np.round(sixteenths / SUBPIXELS)
+        sixteenths[(there < 0) | (there >= left.shape[1])] = none
+        size = int(self.parameters["speckle_window_size"])
+        if size:
+            reach = int(self.parameters["speckle_range"]) * SUBPIXELS
+            cv2.filterSpeckles(sixteenths, none, size, reach)
+        return np.where(sixteenths > none, sixteenths / np.float32(SUBPIXELS), np.float32(np.nan))
+
+    def _back(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+        """Return sixteenths from right to left, above 0 where those from left to right are."""
+        # seen in a mirror, the right picture is the left one of a pair
+        return np.ascontiguousarray(self._padded(right[:, ::-1], left[:, ::-1])[:, ::-1])
+
+    def _padded(self, left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.int16]:
+        """Return sixteenths, also where OpenCV would have no room for all disparities."""
+        cv2 = load("cv2")
+        before = max(0, self.nearest + 1)
+        after = max(0, -int(self.parameters["min_disparity"]))
+        wide = [
+            cv2.copyMakeBorder(np.ascontiguousarray(one), 0, 0, before, after, cv2.BORDER_REPLICATE)
+            for one in (left, right)
+        ]
+        width = left.shape[1]
+        found = np.asarray(self._compute(*wide))[:, before : before + width]
+        return np.ascontiguousarray(found)
+
+
+def _merged(algorithm: str, said: Mapping[str, Value]) -> dict[str, Value]:
+    """Return all parameters of an algorithm."""
+    known = _PARAMETERS[algorithm]
+    for name, value in said.items():
+        if name not in known:
+            raise ConfigurationError(
+                f"StereoMatcher {algorithm}: no parameter {name!r}; there are "
+                f"{', '.join(known)}{did_you_mean(name, known)}"
+            )
+        if known[name].check(value) is None:
+            raise _wrong(f"{algorithm}: {name}", str(known[name]), value)
+    merged: dict[str, Value] = {name: one.default for name, one in known.items()} | dict(said)
+    if algorithm == "sgbm":
+        area = int(merged["block_size"]) ** 2
+        merged["P1"] = merged["P1"] or 8 * area
+        merged["P2"] = merged["P2"] or max(32 * area, 4 * int(merged["P1"]))
+        if int(merged["P2"]) <= int(merged["P1"]):
+            raise _wrong("sgbm: P2", f"more than P1, {merged['P1']}", merged["P2"])
+    return merged
+
+
+def _wrong(what: str, expected: str, got: object) -> ConfigurationError:
+    return ConfigurationError(f"StereoMatcher: {what}: expected {expected}, got {got!r}")
+
+
+def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    shape = picture.shape
+    if picture.dtype != np.uint8 or not (len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)):
+        raise FrameFormatError(
+            f"stereo: {name}: expected (H, W) or (H, W, 3) of uint8, got {shape} of {picture.dtype}"
+        )
+    if len(shape) == 2:
+        return picture
+    cv2 = load("cv2")
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def _disagreement(
+    there: NDArray[np.int16], back: NDArray[np.int16], none: int
+) -> NDArray[np.float32]:
+    """Return by how much a disparity differs from that of its point in the right picture.
+
+    Sixteenths; infinite where either is none, or the point is outside of the right picture.
+    """
+    width = there.shape[1]
+    column = np.arange(width, dtype=np.int32)[None] - ((there.astype(np.int32) + 8) >> 4)
+    inside = (column >= 0) & (column < width) & (there > none)
+    other = np.take_along_axis(back, np.clip(column, 0, width - 1), axis=1)
+    apart = np.abs(other.astype(np.float32) - there)
+    return np.where(inside & (other > none), apart, np.float32(np.inf))
+
+
+def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
+    """Return OpenCV's filter of sixteenths, the left picture, and sixteenths from right to left."""
+    cv2 = load("cv2")
+    if not hasattr(cv2, "ximgproc"):
+        raise ConfigurationError(
+            f"StereoMatcher: wls: expected an OpenCV with ximgproc (the packages "
+            f"opencv-contrib-python and opencv-contrib-python-headless have it), got "
+            f"{cv2.__version__} without; leave wls out"
+        )
+    try:
+        smoothness, edges = (float(one) for one in wls)
+    except (TypeError, ValueError):
+        smoothness = edges = -1.0
+    if not (0 < smoothness < 1e9 and 0 < edges < 1e3):
+        raise _wrong("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)
+    made = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # what both ways say, counts more
+    made.setLambda(smoothness)
+    made.setSigmaColor(edges)
+
+    def smooth(
+        sixteenths: NDArray[np.int16], left: NDArray[np.uint8], back: NDArray[np.int16]
+    ) -> NDArray[np.int16]:
+        return np.array(made.filter(sixteenths, left, None, back), dtype=np.int16)
+
+    return smooth
+
+
+def _sgbm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
+    names = {
+        "min_disparity": "minDisparity",
+        "num_disparities": "numDisparities",
+        "block_size": "blockSize",
+        "P1": "P1",
+        "P2": "P2",
+        "uniqueness_ratio": "uniquenessRatio",
+        "pre_filter_cap": "preFilterCap",
+        "mode": "mode",
+        "disp12_max_diff": "disp12MaxDiff",
+    }
+    given = {names[name]: value for name, value in numbers.items() if name in names}
+    # speckles come later, when both ways were compared
+    compute: Callable[..., Any] = (
+        load("cv2").StereoSGBM_create(**given, speckleWindowSize=0).compute
+    )
+    return compute
+
+
+def _bm(numbers: Mapping[str, int | None]) -> Callable[..., Any]:
+    made = load("cv2").StereoBM_create(numbers["num_disparities"], numbers["block_size"])
+    made.setMinDisparity(numbers["min_disparity"])
+    made.setUniquenessRatio(numbers["uniqueness_ratio"])
+    made.setPreFilterType(numbers["pre_filter_type"])
+    made.setPreFilterSize(numbers["pre_filter_size"])
+    made.setPreFilterCap(numbers["pre_filter_cap"])
+    made.setTextureThreshold(numbers["texture_threshold"])
+    made.setDisp12MaxDiff(numbers["disp12_max_diff"])
+    made.setSpeckleWindowSize(0)
+    compute: Callable[..., Any] = made.compute
+    return compute
+
+
+_ALGORITHMS: Final[dict[str, Callable[[Mapping[str, int | None]], Callable[..., Any]]]] = {
+    "sgbm": _sgbm,
+    "bm": _bm,
+}

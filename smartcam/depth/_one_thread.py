@@ -1,0 +1,58 @@
+"""A thread that does one thing after the other for an object of the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from smartcam.exceptions import LocalProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+T = TypeVar("T")
+
+
+class OneThread:
+    """One thread; its owner closes it.
+
+    Cancellation: what the thread is at is finished and thrown away.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._pool: ThreadPoolExecutor | None = ThreadPoolExecutor(1, f"smartcam {name}")
+        self._running: asyncio.Future[Any] | None = None
+
+    async def idle(self) -> None:
+        """Return when the thread has nothing to do."""
+        while self._running is not None and not self._running.done():
+            await asyncio.wait([self._running])
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """Have the thread do something; who is idle first is first.
+
+        Raises LocalProtocolError: it is closed.
+        """
+        await self.idle()
+        if self._pool is None:
+            raise LocalProtocolError(f"{self._name}: closed")
+        self._running = asyncio.get_running_loop().run_in_executor(self._pool, work)
+        self._running.add_done_callback(_seen)
+        return await asyncio.shield(self._running)
+
+    async def close(self) -> None:
+        """End the thread when it has finished. Idempotent.
+
+        Cancellation: the thread ends all the same.
+        """
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(wait=False)
+            await self.idle()
+
+
+def _seen(done: asyncio.Future[Any]) -> None:
+    if not done.cancelled():
+        done.exception()  # nobody may be there for it any longer

@@ -1,0 +1,261 @@
+"""A calibrated pair of cameras: its frames rectified, its disparities as metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.calibration._codes import Code
+from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._optional_imports import load
+from smartcam.calibration._stereo.rectification import rectify
+from smartcam.calibration.formats._cameras import MAX_FILE, CameraChain, parse_camera_info
+from smartcam.exceptions import CalibrationError, ConfigurationError, FrameFormatError
+
+if TYPE_CHECKING:
+    import os
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._stereo.calibration import StereoCalibration
+
+SIDES: Final = ("left", "right")
+
+SAME_SHAPE: Final = 0.01
+"""Part by which a picture's width to height may differ from the calibrated one's."""
+
+ROUNDED: Final = 1e-3
+"""By which an element of a rotation may be off: ROS writes five digits."""
+
+REMAPPED: Final = (1 / 32) ** 2 / 12
+"""Variance of a disparity, pixels^2: OpenCV's remap goes in steps of 1/32.
+
+It does so in both pictures, of which a window averages about a half.
+"""
+
+SMALLER: Final = 1.25
+"""A picture that is made smaller by more is averaged first: remap looks at four pixels."""
+
+
+def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str]) -> CameraChain:
+    """Return the pair of two ``camera_info`` files, as ROS' ``camera_calibration`` writes them.
+
+    Where the right camera is, only their rectification tells: ``T_right_left`` is made of
+    ``rectification_matrix`` and ``projection_matrix``. A file that is read blocks.
+
+    Raises:
+        CalibrationError: ``MALFORMED``, ``NOT_FINITE`` or ``SHAPE``: a file is not one;
+            ``NOT_RIGID``: a rectification is no rotation; ``SWAPPED_SIDES``: the right one is not
+            that of the right camera of a pair.
+        MissingExtraError: PyYAML is not installed.
+        OSError: one cannot be read.
+    """
+    given = [(parse_camera_info(_text(path)), path) for path in (left, right)]
+    (one, _), (two, _) = given
+    shift = float(two.projection[0, 3] / two.projection[0, 0])
+    if not shift < 0:
+        raise CalibrationError(
+            f"{right}: expected the camera_info of the right camera of a pair, with a "
+            f"projection_matrix whose fourth column begins with minus focal length times baseline, "
+            f"got {two.projection[0, 3]:g}",
+            code=Code.SWAPPED_SIDES,
+            got=float(two.projection[0, 3]),
+        )
+    # p_rectified = R1 p_left, and in the right rectified frame that and the shift, so that
+    # p_right = R2^T (R1 p_left + shift)
+    first, second = (_rotation(info.rectification, path) for info, path in given)
+    transform = Transform("right", "left", second.T @ first, second.T @ np.array([shift, 0, 0]))
+    return CameraChain(
+        cameras=(one.camera, two.camera), transforms=(transform,), names=("left", "right")
+    )
+
+
+def _rotation(matrix: NDArray[np.float64], path: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """Return the rotation that a matrix of five digits was."""
+    u, _, v = np.linalg.svd(matrix)
+    turn = np.asarray(u @ v)
+    if np.linalg.det(turn) < 0 or np.abs(turn - matrix).max() > ROUNDED:
+        raise CalibrationError(
+            f"{path}: rectification_matrix: expected a rotation, got {matrix.tolist()}",
+            code=Code.NOT_RIGID,
+            got=matrix.tolist(),
+        )
+    return turn
+
+
+def _text(path: str | os.PathLike[str]) -> str:
+    with Path(path).open("rb") as file:
+        said = file.read(MAX_FILE + 1)
+    if len(said) > MAX_FILE:
+        raise CalibrationError(
+            f"{path}: expected a camera_info of {MAX_FILE} bytes at most", code=Code.MALFORMED
+        )
+    try:
+        return said.decode()
+    except UnicodeDecodeError as exc:
+        raise CalibrationError(f"{path}: expected text: {exc}", code=Code.MALFORMED) from exc
+
+
+def scaled(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
+    """Return the lens of a picture that was made larger or smaller."""
+    # pixels count from the middle of the first one, so its corner, at -1/2, is what stays
+    across, down = size[0] / camera.size[0], size[1] / camera.size[1]
+    matrix = camera.matrix.copy()
+    matrix[0] = [across * matrix[0, 0], 0, across * (matrix[0, 2] + 0.5) - 0.5]
+    matrix[1] = [0, down * matrix[1, 1], down * (matrix[1, 2] + 0.5) - 0.5]
+    return CameraModel(
+        size=size,
+        matrix=matrix,
+        distortion=camera.distortion,
+        distortion_model=camera.distortion_model,
+    )
+
+
+class CalibratedPair:
+    """What a calibration says of a pair, for pictures of one size.
+
+    Everything here blocks; a thread does it.
+
+    Raises ConfigurationError: it is no pair side by side; CalibrationError: as
+    :meth:`StereoCalibration.rectify` has it.
+    """
+
+    def __init__(
+        self,
+        calibration: StereoCalibration | CameraChain,
+        *,
+        size: tuple[int, int] | None,
+        alpha: float,
+        focal_sigma: float,
+    ) -> None:
+        lenses, transform, covariance = _parts(calibration)
+        self._shapes = tuple(lens.size for lens in lenses)
+        wanted = lenses[0].size if size is None else size
+        left, right = (scaled(lens, wanted) for lens in lenses)
+        found = rectify(left, right, transform, alpha=alpha)
+        self.size = found.size
+        projection = found.projections[1]
+        self.focal = float(projection[0, 0])
+        self.baseline = -float(projection[0, 3]) / self.focal
+        if not self.baseline > 0:
+            where = "right of the right one" if projection[0, 3] else "above or below it"
+            raise ConfigurationError(
+                f"stereo: expected a left camera that is left of the right one, got one {where}: "
+                "swap the two, or turn both by a quarter"
+            )
+        self.camera_info = CameraModel(size=found.size, matrix=found.projections[0][:, :3])
+        self._focal_sigma = focal_sigma * wanted[0] / lenses[0].size[0]
+        self._spread = _spread(found.rotations[1], covariance)
+        self._maps, self._masks = found.maps, found.masks
+        self._fixed: list[tuple[tuple[int, int], Any]] = [((0, 0), None)] * 2
+
+    def rectified(self, picture: NDArray[Any], side: int, source: str) -> NDArray[Any]:
+        """Return a picture of any size, (H, W) or (H, W, C), rectified; 0 where it has no source.
+
+        Raises FrameFormatError: it is not of the calibrated shape.
+        """
+        cv2 = load("cv2")
+        height, width = picture.shape[:2]
+        shape = self._shapes[side]
+        if abs(width * shape[1] / (height * shape[0]) - 1) > SAME_SHAPE:
+            raise FrameFormatError(
+                f"{source}: expected a picture of the shape that the {SIDES[side]} camera was "
+                f"calibrated with, {shape[0]}x{shape[1]} made larger or smaller, got "
+                f"{width}x{height}: cut, or of another mode of the sensor?",
+                source=source,
+            )
+        if width > SMALLER * self.size[0]:
+            picture = cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA)
+            width, height = self.size
+        made_for, maps = self._fixed[side]
+        if made_for != (width, height):
+            scale = np.array([width / self.size[0], height / self.size[1]], np.float32)
+            chart = (self._maps[side] + np.float32(0.5)) * scale - np.float32(0.5)
+            maps = cv2.convertMaps(chart, None, cv2.CV_16SC2)
+            self._fixed[side] = ((width, height), maps)
+        return np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR))
+
+    def drop_outside(self, disparity: NDArray[np.float32]) -> None:
+        """Make NaN of what is where either picture has no source."""
+        first, second = self._masks
+        if first.all() and second.all():
+            return
+        column = np.arange(self.size[0]) - np.nan_to_num(disparity)
+        column = np.clip(np.round(column), 0, self.size[0] - 1).astype(np.intp)
+        disparity[~(first & np.take_along_axis(second, column, axis=1))] = np.nan
+
+    def depth(self, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return metres (H, W), 0 where there is no disparity above 0."""
+        metres = np.zeros_like(disparity)
+        np.divide(self.focal * self.baseline, disparity, out=metres, where=disparity > 0)
+        return metres
+
+    def sigma(
+        self, depth: NDArray[np.float32], disparity_sigma: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return the standard deviation of depths, metres; NaN where there is none."""
+        # Z = f b / d, so that sigma_Z = Z^2 / (f b) sigma_d, and what the calibration may be off
+        # counts as a disparity, too
+        known = depth > 0
+        z = np.where(known, depth, np.float32(1))
+        variance = disparity_sigma.astype(np.float32) ** 2 + np.float32(REMAPPED)
+        if self._spread is not None:
+            variance += self._of_calibration(z, self._spread)
+        sigma = z * z / np.float32(self.focal * self.baseline) * np.sqrt(variance)
+        if self._focal_sigma:
+            sigma = np.hypot(sigma, z * np.float32(self._focal_sigma / self.focal))
+        return np.where(known, sigma, np.float32(np.nan)).astype(np.float32)
+
+    def _of_calibration(
+        self, z: NDArray[np.float32], spread: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return the variance of the disparity that the transform's covariance leads to."""
+        # A point (X, Y, Z) is at P - (b, 0, 0) in the right rectified frame; a small turn w and
+        # shift t of the left camera in it moves that by w x P + t, and its column by
+        # f (dx / Z - x' dz / Z), with x' = (X - b) / Z: a row of the six unknowns' factors.
+        f, (cx, cy) = np.float32(self.focal), self.camera_info.matrix[:2, 2]
+        x = ((np.arange(self.size[0]) - cx) / self.focal).astype(np.float32)[None]
+        y = ((np.arange(self.size[1]) - cy) / self.focal).astype(np.float32)[:, None]
+        near = 1 / z
+        beside = x - np.float32(self.baseline) * near
+        factors = (-beside * y, 1 + beside * x, -y, near, np.float32(0), -beside * near)
+        variance = np.zeros_like(z)
+        for column in spread.T:
+            part = np.zeros_like(z)
+            for factor, weight in zip(factors, column, strict=True):
+                part += np.float32(weight) * factor
+            variance += part * part
+        return variance * f * f
+
+
+def _parts(
+    calibration: StereoCalibration | CameraChain,
+) -> tuple[tuple[CameraModel, CameraModel], Transform, NDArray[np.float64] | None]:
+    """Return lenses, ``T_right_left`` and its covariance, where that is known."""
+    if not isinstance(calibration, CameraChain):
+        return (
+            (calibration.left, calibration.right),
+            calibration.transform,
+            calibration.covariance,
+        )
+    if len(calibration.cameras) != 2:
+        raise ConfigurationError(
+            f"stereo: expected the calibration of two cameras, got {len(calibration.cameras)}: "
+            f"{', '.join(calibration.names)}"
+        )
+    left, right = calibration.cameras
+    return (left, right), calibration.transforms[0], None
+
+
+def _spread(
+    turn: NDArray[np.float64], covariance: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """Return A (6, 6), A A^T the covariance in the right rectified frame; None: none."""
+    if covariance is None or not covariance.any():
+        return None
+    both = np.kron(np.eye(2), turn)
+    values, vectors = np.linalg.eigh(both @ covariance @ both.T)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))

@@ -1,0 +1,291 @@
+"""Two cameras as one that sees depth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from smartcam.depth._from_reader import ReaderDriver
+from smartcam.depth._matcher import MOST, StereoMatcher
+from smartcam.depth._one_thread import OneThread
+from smartcam.depth._pair import CalibratedPair
+from smartcam.depth._pair_clock import PairClock
+from smartcam.exceptions import ConfigurationError, LocalProtocolError
+from smartcam.frames import FrameGroup, FrameSource
+from smartcam.frames._reader import FRAME_TIMEOUT
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+    from typing import Any, Self
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration._stereo.calibration import StereoCalibration
+    from smartcam.calibration.formats import CameraChain
+    from smartcam.frames import Frame, FrameReader, FrameSet, GroupStatistics
+
+SEARCHED: Final = 5
+"""Part of the width, one in so many, that disparities are searched in by default."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthFrame:
+    """What two cameras saw at one moment, as the left one sees it after rectification.
+
+    Attributes:
+        depth: (H, W), float32, metres along the optical axis; 0: none.
+        sigma: (H, W), float32, standard deviation of ``depth``, metres; NaN: none.
+        disparity: (H, W), float32, pixels; NaN: none.
+        left: the rectified left picture, uint8: (H, W), or, red first, (H, W, 3); 0 where it has
+            no source.
+        camera_info: its lens, without distortion.
+        baseline: metres between the cameras.
+        captured: when the left frame was captured, seconds of ``time.monotonic()``.
+        utc: the same, seconds since 1970.
+        skew: seconds by which the right one was captured later.
+        sequences: the numbers that the cameras gave the frames, left and right.
+    """
+
+    depth: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    disparity: NDArray[np.float32]
+    left: NDArray[np.uint8]
+    camera_info: CameraModel
+    baseline: float
+    captured: float
+    utc: float
+    skew: float
+    sequences: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class StereoStatistics:
+    """What became of the frames of a pair.
+
+    Attributes:
+        group: of the frames' pairing; its ``skew`` is the largest.
+        skew: seconds by which the right frames are later: the median of the last pairs; None: no
+            pair came yet.
+        drift: by how much the right camera's clock is faster than the left one's, seconds a second;
+            None: not known yet.
+        drift_from: ``clocks``: of what the cameras' own clocks said; ``frames``: they have none,
+            and it is by how much the right one gives more frames of the same nominal rate; "".
+    """
+
+    group: GroupStatistics
+    skew: float | None
+    drift: float | None
+    drift_from: str
+
+
+class StereoDepth:
+    """Two cameras and their calibration; an iterator of :class:`DepthFrame`, the newest first.
+
+    ::
+
+        calibration = StereoCalibration.load("pair.json")
+        async with StereoDepth(open(LEFT), open(RIGHT), calibration) as cameras:
+            async for frame in cameras:
+                frame.depth, frame.sigma, frame.skew
+
+    The frames may have any size of the calibrated shape, and any format with brightness. They are
+    paired by when they were captured. The matching is done in a thread, when it is asked for: who
+    is slow skips pairs, and never lags.
+
+    Args:
+        left: the left camera, as ``smartcam.frames.open`` or ``camera.frames()`` gives it, not
+            open; it belongs to this object from now on.
+        right: the right one.
+        calibration: of the pair: ours, that of :func:`read_camera_infos`, or of
+            ``smartcam.calibration.formats.read_cameras`` with two cameras.
+        matcher: None: ``sgbm`` for disparities up to a fifth of the width.
+        size: width and height of the rectified pictures, pixels; None: as the left one was
+            calibrated.
+        alpha: 0 to 1, from no invalid pixels to no lost ones.
+        colour: whether :attr:`DepthFrame.left` is in colour.
+        focal_sigma: standard deviation of the focal length, pixels of the calibrated left picture;
+            a calibration of a pair tells only that of where the cameras are.
+        within: largest skew, seconds; None: half of the time between two frames.
+        timeout: seconds that an iteration waits for a pair; None: as long as it takes.
+
+    Raises:
+        ConfigurationError: a value that is none, or no calibration of two cameras.
+    """
+
+    def __init__(
+        self,
+        left: FrameSource | AbstractAsyncContextManager[FrameReader],
+        right: FrameSource | AbstractAsyncContextManager[FrameReader],
+        calibration: StereoCalibration | CameraChain,
+        *,
+        matcher: StereoMatcher | None = None,
+        size: tuple[int, int] | None = None,
+        alpha: float = 0.0,
+        colour: bool = True,
+        focal_sigma: float = 0.0,
+        within: float | None = None,
+        timeout: float | None = FRAME_TIMEOUT,
+    ) -> None:
+        if not 0 <= alpha <= 1:
+            raise ConfigurationError(f"stereo: alpha: expected 0 to 1, got {alpha!r}")
+        if not 0 <= focal_sigma < math.inf:
+            raise ConfigurationError(f"stereo: focal_sigma: expected pixels, got {focal_sigma!r}")
+        if size is not None and not (
+            len(size) == 2 and all(isinstance(one, int) and one > 0 for one in size)
+        ):
+            raise ConfigurationError(f"stereo: size: expected width and height, got {size!r}")
+        self._make = partial(
+            CalibratedPair, calibration, size=size, alpha=alpha, focal_sigma=focal_sigma
+        )
+        sources = {
+            name: one
+            if isinstance(one, FrameSource)
+            else FrameSource(ReaderDriver(one, name), stall=None)
+            for name, one in (("left", left), ("right", right))
+        }
+        self._group = FrameGroup(sources, within=within, timeout=timeout)
+        self._matcher, self._colour = matcher, colour
+        self._clock = PairClock()
+        self._worker: OneThread | None = None
+        self._pair: CalibratedPair | None = None
+        self._closed = False
+
+    async def __aenter__(self) -> Self:
+        """Make the maps, and open both cameras; they do not stream yet.
+
+        Raises:
+            CalibrationError: rectified, the pictures would have nothing in them.
+            ConfigurationError: the cameras are swapped, or one above the other.
+            FrameSourceError: a camera cannot be opened; nothing stays open.
+            MissingExtraError: OpenCV (extra ``depth``) is not installed.
+
+        Cancellation: nothing stays open.
+        """
+        if self._worker is not None or self._closed:
+            raise LocalProtocolError("the pair of cameras was opened before; make a new one")
+        self._worker = OneThread("stereo")
+        try:
+            self._pair = await self._worker.run(self._make)
+            if self._matcher is None:
+                self._matcher = _default_matcher(self._pair.size[0])
+            await self._group.__aenter__()
+        except BaseException:
+            await self._end_thread()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close both cameras and end the thread. Idempotent.
+
+        Cancellation: as of :meth:`FrameSource.close`; the thread ends all the same.
+        """
+        self._closed = True
+        try:
+            await self._group.close()
+        finally:
+            await self._end_thread()
+
+    async def _end_thread(self) -> None:
+        worker, self._worker, self._pair = self._worker, None, None
+        if worker is not None:
+            await worker.close()
+
+    @property
+    def camera_info(self) -> CameraModel:
+        """The lens of the rectified left picture.
+
+        Raises:
+            LocalProtocolError: the pair is not open.
+        """
+        return self._opened()[1].camera_info
+
+    @property
+    def baseline(self) -> float:
+        """Metres between the cameras; raises as :attr:`camera_info` does."""
+        return self._opened()[1].baseline
+
+    @property
+    def nearest(self) -> float:
+        """Metres from which on a depth is found; raises as :attr:`camera_info` does."""
+        _, pair, matcher = self._opened()
+        return pair.focal * pair.baseline / max(matcher.nearest, 1)
+
+    def statistics(self) -> StereoStatistics:
+        """Return the account as it is now."""
+        sources = self._group.sources
+        clocks = [sources[name].statistics().clock for name in ("left", "right")]
+        skew = self._clock.skew()
+        return StereoStatistics(self._group.statistics(), skew, *self._clock.drift(clocks))
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> DepthFrame:
+        """Return the depth of the newest pair.
+
+        Raises:
+            FrameTimeoutError: none came in time.
+            FrameFormatError: a frame is cut, or has no brightness; the next one may have.
+            FrameSourceError: of the camera that ended with one.
+            LocalProtocolError: the pair is not open.
+
+        Cancellation: safe; a pair that is matched then is thrown away, and the next call waits
+        until that is done before it takes the newest.
+        """
+        worker, pair, matcher = self._opened()
+        await worker.idle()
+        both = await anext(self._group)
+        self._clock.saw(both["left"], both["right"])
+        return await worker.run(partial(_depth, both, pair, matcher, self._colour))
+
+    def _opened(self) -> tuple[OneThread, CalibratedPair, StereoMatcher]:
+        if self._worker is None or self._pair is None or self._matcher is None:
+            raise LocalProtocolError("the pair of cameras is not open: async with it")
+        return self._worker, self._pair, self._matcher
+
+
+def _default_matcher(width: int) -> StereoMatcher:
+    return StereoMatcher(num_disparities=min(MOST, 16 * math.ceil(width / SEARCHED / 16)))
+
+
+def _depth(
+    both: FrameSet, pair: CalibratedPair, matcher: StereoMatcher, colour: bool
+) -> DepthFrame:
+    left, right = both["left"], both["right"]
+    grey = [
+        pair.rectified(_bytes(one, one.grey()), side, one.source)
+        for side, one in enumerate((left, right))
+    ]
+    found = matcher(grey[0], grey[1])
+    disparity = found.pixels
+    pair.drop_outside(disparity)
+    disparity[~(disparity > 0)] = np.nan  # at infinity, or behind it
+    depth = pair.depth(disparity)
+    shown = pair.rectified(_bytes(left, left.rgb()), 0, left.source) if colour else grey[0]
+    return DepthFrame(
+        depth=depth,
+        sigma=pair.sigma(depth, found.sigma),
+        disparity=disparity,
+        left=shown,
+        camera_info=pair.camera_info,
+        baseline=pair.baseline,
+        captured=left.captured,
+        utc=left.utc,
+        skew=right.captured - left.captured,
+        sequences=(left.sequence, right.sequence),
+    )
+
+
+def _bytes(frame: Frame, pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return pixels of more than 8 bits by their 8 highest."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    return (pixels >> (frame.format.depth - 8)).astype(np.uint8)

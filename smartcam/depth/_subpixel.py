@@ -1,0 +1,272 @@
+"""Disparities between the pixels: by least squares, which tell how sure they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Field = NDArray[np.floating[Any]]
+
+COARSE: Final = 0.5
+"""Least sigma of a disparity that least squares could not refine, pixels."""
+
+STEPS: Final = 3
+"""Of Gauss and Newton."""
+
+FARTHEST: Final = 0.5
+"""Pixels by which a disparity may be moved: farther off is another point."""
+
+ROUGHEST: Final = 0.5
+"""Pixels, rms, of coarse disparities from a plane; a window with more has an edge in it."""
+
+FILLED: Final = 0.5
+"""Part of a window that has disparities, at least."""
+
+BESIDE: Final = 2
+"""Pixels from a hole within which nothing is refined."""
+
+ROUNDED: Final = 1 / 6
+"""Variance of the difference of two pictures of whole grey levels, at least."""
+
+OUTLIER: Final = 4.0
+"""A pixel that differs by more times its noise does not count."""
+
+LEAST_PIXELS: Final = 12
+"""Of a window, whose least squares have two unknowns."""
+
+LAGS: Final = 2
+"""Pixels over which noise is looked at for correlation."""
+
+LEAST: Final = 0.2
+"""Of what is found there."""
+
+
+def refined(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], coarse: NDArray[np.float32], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return disparities and their sigma, both (H, W), NaN where ``coarse`` is.
+
+    In a window the disparity is a plane, and the brightness of the pictures differs by a constant.
+    Where a window has an edge in it, too little texture, or the least squares lead too far, the
+    coarse value stays: its sigma is ``COARSE``, or how rough the window is where that is more.
+    """
+    known = np.isfinite(coarse)
+    sigma = np.where(known, np.float32(COARSE), np.float32(np.nan))
+    if not window or not known.any():
+        return coarse, sigma
+    sums = _WindowSums(window)
+    pictures = left.astype(np.float32), right.astype(np.float32)
+    start = np.where(known, coarse, np.float32(0))
+    plane = _plane(start, known, sums)
+    smooth = (plane.rough <= ROUGHEST) & (plane.pixels >= FILLED * window**2)
+    smooth &= _whole_around(known)
+    # near an edge of depth a coarse value may be that of its other side
+    told = np.fmax(sigma, plane.rough)
+    found, usable = start, known
+    fit = _fitted(_linearized(pictures, found, known), found, usable, plane, sums)
+    for step in range(STEPS):
+        if step:
+            plane = _plane(found, usable if usable.any() else known, sums)
+            linear = _without_outliers(_linearized(pictures, found, known), fit)
+            fit = _fitted(linear, found, usable, plane, sums)
+        if step == STEPS - 1:
+            fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
+        usable = smooth & (fit.sigma < COARSE) & (np.abs(fit.disparity - start) < FARTHEST)
+        found = np.where(usable, fit.disparity, start)
+    told = np.where(usable, fit.sigma, told)
+    found[~known] = np.nan
+    told[~known] = np.nan
+    return found.astype(np.float32, copy=False), told.astype(np.float32, copy=False)
+
+
+def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return what has no hole next to it: behind a near thing's edge there is one."""
+    around = np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8)
+    return np.asarray(load("cv2").erode(known.astype(np.uint8), around) > 0)
+
+
+class _WindowSums:
+    """Sums over the window around each pixel; outside of the picture there is nothing."""
+
+    def __init__(self, side: int) -> None:
+        self._cv2 = load("cv2")
+        self._side = (side, side)
+        self._ramp = np.arange(side, dtype=np.float32) - side // 2
+        self._border = self._cv2.BORDER_CONSTANT
+
+    def __call__(self, values: Field, across: int = 0, down: int = 0) -> Field:
+        """Return the sums of values times powers of the distance from the window's middle."""
+        if not (across or down):
+            found = self._cv2.boxFilter(
+                values, -1, self._side, normalize=False, borderType=self._border
+            )
+        else:
+            x, y = self._ramp**across, self._ramp**down
+            found = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
+        return np.asarray(found, dtype=np.float32)
+
+
+class _DisparityPlane(NamedTuple):
+    """The disparities in each window, as a plane; all are (H, W)."""
+
+    across: Field  # slope, pixels a pixel
+    down: Field
+    rough: Field  # how far the disparities are from it, rms, pixels
+    pixels: Field  # how many have a disparity
+
+
+def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _DisparityPlane:
+    mask = known.astype(np.float32)
+    # near 0, so that the squares below keep their digits
+    values = (disparity - disparity.mean(where=known, dtype=np.float64).astype(np.float32)) * mask
+    count = np.maximum(sums(mask), 1)
+    total = sums(values)
+    left = sums(values * values) - total * total / count
+    x, y = sums(mask, 1, 0), sums(mask, 0, 1)
+    xx = np.maximum(sums(mask, 2, 0) - x * x / count, 1)
+    yy = np.maximum(sums(mask, 0, 2) - y * y / count, 1)
+    xy = sums(mask, 1, 1) - x * y / count
+    xd, yd = sums(values, 1, 0) - total * x / count, sums(values, 0, 1) - total * y / count
+    scale = np.maximum(xx * yy - xy * xy, 1)
+    across: Field = (yy * xd - xy * yd) / scale
+    down: Field = (xx * yd - xy * xd) / scale
+    left -= across * xd + down * yd
+    return _DisparityPlane(across, down, np.sqrt(np.maximum(left, 0) / count), count)
+
+
+class _LinearMatch(NamedTuple):
+    """How the pictures differ, and by how much more with a disparity; 0 where that is unknown."""
+
+    e: Field  # left less right, grey levels
+    g: Field  # slope of both, grey levels a pixel
+    mask: Field  # 1 where they are known
+
+
+def _linearized(
+    pictures: tuple[Field, Field], disparity: Field, known: NDArray[np.bool_]
+) -> _LinearMatch:
+    left, right = pictures
+    width = left.shape[1]
+    there = np.arange(width, dtype=np.float32) - disparity
+    inside = known & (there >= 2) & (there <= width - 4)  # six pixels are looked at
+    mask = inside.astype(np.float32)
+    moved, slope = _sampled(right, np.where(inside, there, np.float32(2)))
+    slope += np.gradient(left, axis=1)
+    return _LinearMatch((left - moved) * mask, slope * mask / 2, mask)
+
+
+class _Refined(NamedTuple):
+    """All (H, W); the sigma is infinite where there is no texture."""
+
+    disparity: Field  # pixels
+    sigma: Field  # of noise that is not correlated, pixels
+    linear: _LinearMatch
+    mean: Field  # of linear.e in each window, grey levels
+    variance: Field  # of linear.e, grey levels^2
+
+
+def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
+    """Return the equations without pixels of another surface, whose disparity is far off."""
+    fits = np.abs(linear.e - fit.mean) <= OUTLIER * np.sqrt(fit.variance)
+    return _LinearMatch(linear.e * fits, linear.g * fits, linear.mask * fits)
+
+
+def _fitted(
+    linear: _LinearMatch,
+    disparity: Field,
+    trusted: NDArray[np.bool_],
+    plane: _DisparityPlane,
+    sums: _WindowSums,
+) -> _Refined:
+    """Return one step of Gauss and Newton for every window.
+
+    What noise there is follows from the ``trusted`` pixels.
+    """
+    # With the right picture's row taken at u - d_q, L - R_q = b - g (D + s (q - p) - d_q) + noise
+    # for all q of the window around p: linear in D and b. g is the mean of both pictures' slopes,
+    # whose noise does not go with that of their difference.
+    e, g, mask = linear
+    gd, gg = g * disparity, g * g
+    n = np.maximum(sums(mask), 1)
+    sg = sums(g)
+    sgd = sums(gd) - plane.across * sums(g, 1) - plane.down * sums(g, 0, 1)
+    sggd = sums(g * gd) - plane.across * sums(gg, 1) - plane.down * sums(gg, 0, 1)
+    sgy, sy = sums(g * e) - sggd, sums(e) - sgd
+    curvature = sums(gg) - sg * sg / n
+    trust = mask * trusted
+    m = np.maximum(sums(trust), 1)
+    se = sums(e * trust)
+    variance = (sums(e * e * trust) - se * se / m) / np.maximum(m - 2, 1)
+    variance = np.maximum(variance, ROUNDED)
+    # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's
+    texture = curvature - n * variance / 8
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = (sg * sy / n - sgy) / curvature
+        sigma = np.sqrt(variance / texture)
+    usable = (texture > 0) & np.isfinite(found) & (n >= LEAST_PIXELS)
+    return _Refined(
+        np.where(usable, found, disparity),
+        np.where(usable, sigma, np.inf),
+        linear,
+        se / m,
+        variance,
+    )
+
+
+def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
+    """Return brightness and slope at columns (H, W) of each row."""
+    # Lagrange's polynomial through six pixels. OpenCV's remap is of no use here: its cubic kernel
+    # (a = -0.75) moves a ramp by up to 0.03 pixels.
+    height, width = picture.shape
+    wide = np.pad(picture, ((0, 0), (3, 3)), mode="edge").ravel()
+    whole = np.floor(columns)
+    t = columns - whole
+    start = whole.astype(np.int32) + (1 + np.arange(height, dtype=np.int32) * (width + 6))[:, None]
+    pixels = [wide[k:].take(start) for k in range(6)]  # at -2 to 3 from the column
+    factors = {node: t - np.float32(node) for node in range(-2, 4)}
+    value = np.zeros_like(t)
+    for node, pixel in zip(factors, pixels, strict=True):
+        others = [one for one in factors if one != node]
+        weight = pixel * np.float32(1 / np.prod([node - one for one in others]))
+        for one in others:
+            weight *= factors[one]
+        value += weight
+    # central differences, as those of the left picture, and linear between
+    slope = (1 - t) * (pixels[3] - pixels[1]) / 2 + t * (pixels[4] - pixels[2]) / 2
+    return value, slope
+
+
+def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
+    """Return by how much the noise e of neighbours is correlated, as it counts for sums of g e.
+
+    1: not at all. A picture that was rectified has some: its pixels share those of the source.
+    """
+    # Var(sum g e) = sum over all lags of C_ee C_gg + C_eg C_ge, as of normal values: Isserlis, On a
+    # formula for the product-moment coefficient (1918). Of white noise only lag 0 is there. Where
+    # one picture is sharper e has texture in it; that goes with g, and for the most part cancels.
+    mask = fit.linear.mask * trusted
+    e, g = fit.linear.e * mask, fit.linear.g * mask
+    e = (e - e.sum() / np.maximum(mask.sum(), 1)) * mask
+    height, width = e.shape
+
+    def products(one: Field, other: Field, u: int, v: int) -> float:
+        here = one[v:, max(u, 0) : width + min(u, 0)]
+        there = other[: height - v, max(-u, 0) : width + min(-u, 0)]
+        return float(np.einsum("ij,ij->", here, there))
+
+    power = products(e, e, 0, 0) * products(g, g, 0, 0)
+    if power <= 0:
+        return 1.0
+    whole = 1.0
+    for v in range(LAGS + 1):
+        for u in range(-LAGS if v else 1, LAGS + 1):
+            both = products(e, e, u, v) * products(g, g, u, v)
+            crossed = products(e, g, u, v) * products(g, e, u, v)
+            whole += 2 * (both + crossed) / power
+    return max(whole, LEAST)
