@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from smartcam._cli.frame_colours import colours
 from smartcam._cli.frame_files import SUFFIXES, Encoding, numbered
 from smartcam._cli.frame_measure import measure, measured_text
 from smartcam._cli.frame_sources import TIMEOUT, opened
@@ -280,3 +281,6 @@ async def measure_command(url: str, options: Options) -> None:
     async with opened(url, options) as source:
         value = await measure(source, options.seconds or 5.0)
     options.show(jsonable(value), measured_text)
+
+
+frames.add_command(colours)

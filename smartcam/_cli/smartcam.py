@@ -281,6 +281,12 @@ def _first_line(loaded: object) -> str:
     'extra "fleet".',
 )
 @click.option(
+    "--tower",
+    is_flag=True,
+    help="Have a simulated robot with a camera at its hand build a tower of the black blocks that "
+    'it finds, instead. Needs the extra "depth".',
+)
+@click.option(
     "--picture",
     type=click.Path(dir_okay=False),
     default="pick.svg",
@@ -292,14 +298,22 @@ def _first_line(loaded: object) -> str:
     type=click.IntRange(min=0),
     default=1,
     show_default=True,
-    help="With --pick: of all noise, and of where the table is.",
+    help="With --pick and --tower: of all noise, and of where things are.",
 )
 @runs(*OUTPUT)
-async def demo_command(pick: bool, shared: bool, picture: str, seed: int, options: Options) -> None:
+async def demo_command(
+    pick: bool, shared: bool, tower: bool, picture: str, seed: int, options: Options
+) -> None:
     """Watch smartcam do its main job against an emulated camera over real TCP."""
-    if pick and shared:
-        raise click.UsageError("--pick and --fleet do not go together")
-    if shared:
+    asked = {"--pick": pick, "--fleet": shared, "--tower": tower}
+    given = [name for name, wanted in asked.items() if wanted]
+    if len(given) > 1:
+        raise click.UsageError(f"{' and '.join(given)} do not go together")
+    if tower:
+        from smartcam._cli import demo_tower  # it stands on numpy
+
+        await demo_tower.tower(options, seed)
+    elif shared:
         await demo_fleet.demo(options)
     else:
         await (demo_pick.pick(options, picture, seed) if pick else demo.demo(options))

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
+    from smartcam.depth._cleaning import SpatialFilter, TemporalFilter, fill_holes
     from smartcam.depth._cloud import Cloud
     from smartcam.depth._cloud_files import load_cloud, save_cloud
+    from smartcam.depth._colours import ColourRange, ColourRegion, find_regions
     from smartcam.depth._filters import (
         crop_box,
         pass_through,
@@ -22,21 +24,31 @@ if TYPE_CHECKING:
     )
     from smartcam.depth._matcher import Disparity, StereoMatcher
     from smartcam.depth._pair import read_camera_infos
+    from smartcam.depth._regions import RegionDepth, equalize_depth, region_depth
     from smartcam.depth._registration import Registration, register
     from smartcam.depth._stereo import DepthFrame, StereoDepth, StereoStatistics
 
 __all__ = [
     "Cloud",
+    "ColourRange",
+    "ColourRegion",
     "DepthFrame",
     "Disparity",
+    "RegionDepth",
     "Registration",
+    "SpatialFilter",
     "StereoDepth",
     "StereoMatcher",
     "StereoStatistics",
+    "TemporalFilter",
     "crop_box",
+    "equalize_depth",
+    "fill_holes",
+    "find_regions",
     "load_cloud",
     "pass_through",
     "read_camera_infos",
+    "region_depth",
     "register",
     "remove_radius_outliers",
     "remove_statistical_outliers",
@@ -48,12 +60,14 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_cleaning": "SpatialFilter TemporalFilter fill_holes",
             "_cloud": "Cloud",
             "_cloud_files": "load_cloud save_cloud",
-            "_filters": "crop_box pass_through remove_radius_outliers remove_statistical_outliers "
-            "voxel_grid",
+            "_colours": "ColourRange ColourRegion find_regions",
+            "_filters": "crop_box pass_through remove_radius_outliers remove_statistical_outliers voxel_grid",
             "_matcher": "Disparity StereoMatcher",
             "_pair": "read_camera_infos",
+            "_regions": "RegionDepth equalize_depth region_depth",
             "_registration": "Registration register",
             "_stereo": "DepthFrame StereoDepth StereoStatistics",
         },

@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: an emulator, which is controlled, a camera, wizards, frames, clouds.
+"""Pages and HTTP calls: an emulator, a camera, wizards, frames, colours, clouds.
 
 ::
 
@@ -18,17 +18,19 @@ from smartcam.exceptions import MissingExtraError
 
 if TYPE_CHECKING:
     from smartcam.web._clouds import CloudSite
+    from smartcam.web._colours import ColourSite
     from smartcam.web._emulator import EmulatorSite
     from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
     from smartcam.web._wizard import WizardSite
 
-__all__ = ["CloudSite", "EmulatorSite", "FramesSite", "LiveSite", "WizardSite"]
+__all__ = ["CloudSite", "ColourSite", "EmulatorSite", "FramesSite", "LiveSite", "WizardSite"]
 
 _resolve = lazy(
     __name__,
     {
         "_clouds": "CloudSite",
+        "_colours": "ColourSite",
         "_emulator": "EmulatorSite",
         "_frames": "FramesSite",
         "_live": "LiveSite",

@@ -1,0 +1,387 @@
+"""``smartcam demo --tower``: a robot builds a tower of the black blocks that its camera finds.
+
+Nothing is known beforehand but what a block looks like: where one lies is found by its colour,
+where the tower is and how high by the depth. A person puts a block on top meanwhile, and takes one
+away. What was found is compared with the truth, which a real cell does not know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam._cli.demo import Steps
+from smartcam._cli.texts import table_text
+from smartcam.depth import ColourRange, SpatialFilter, TemporalFilter, find_regions, region_depth
+from smartcam.depth._simulation import AXES, BLOCK, FOCAL, laid, to_robot
+from smartcam.exceptions import FrameFormatError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam._cli.options import Options
+    from smartcam.depth import ColourRegion
+    from smartcam.depth._simulation import TableSight, TowerTable, WoodenBlock
+
+LAYERS: Final = 5
+"""Blocks that the robot puts onto the tower."""
+
+PERSON: Final = {2: "add", 4: "remove"}
+"""What a person does to the tower after which of them."""
+
+OVERVIEW: Final = (0.38, 0.0, 0.75)
+"""Metres: where the camera sees the whole table from."""
+
+NEAR: Final = 0.25
+"""Metres above the table, from where a block's pose is measured."""
+
+ABOVE: Final = 0.45
+"""Metres above the table, from where the tower is measured."""
+
+MAPS: Final = 5
+"""Depth maps that are averaged."""
+
+EDGE: Final = BLOCK[2] / 2
+"""Metres: a smaller step of the depth is noise, since no block is so thin."""
+
+REACH: Final = (0.15, 0.50)
+"""Metres from the robot's foot at which it can grip."""
+
+BLACK: Final = ColourRange(value=(0, 60))
+"""The colour of the blocks that the robot is to take."""
+
+AREA: Final = (0.6, 1.7)
+"""Area of a block in the picture, beside that of its upper side: its other sides are seen, too."""
+
+RATIO: Final = (2.2, 3.8)
+"""Of a block's sides in the picture."""
+
+FULLNESS: Final = 0.8
+"""Part of its rectangle that a block fills at least."""
+
+RIM: Final = 2
+"""Pixels at a region's rim whose depth is a mixture."""
+
+TOLERANCE: Final = (2e-3, math.radians(1.0), 1e-3)
+"""Metres beside, radians, and metres of height: how well all is to be found."""
+
+MISSED: Final = 7
+"""Exit code where something was found less well."""
+
+ARM: Final = "camera at the hand"
+"""Whose pictures errors are about."""
+
+
+class BlockPose(NamedTuple):
+    """Where something lies, in the robot's frame: metres and radians."""
+
+    x: float
+    y: float
+    angle: float  # of its length, from x towards y
+    height: float  # of its top
+    sigma: float = 0.0  # of the height, as the depth tells it
+
+
+class Compared(NamedTuple):
+    """Something found, beside the truth: metres and radians."""
+
+    what: str
+    found: BlockPose
+    beside: float
+    turned: float
+    higher: float
+
+    @property
+    def errors(self) -> tuple[float, float, float]:
+        """How large each is, in the order of :data:`TOLERANCE`."""
+        return self.beside, abs(self.turned), abs(self.higher)
+
+
+async def tower(
+    options: Options,
+    seed: int,
+    *,
+    table: TowerTable | None = None,
+    colours: ColourRange = BLACK,
+    layers: int = LAYERS,
+) -> None:
+    """Build the tower, and tell how well it was seen.
+
+    Args:
+        options: how it is told.
+        seed: of where everything lies, and of all noise.
+        table: another one; None: one of the seed.
+        colours: of the blocks.
+        layers: blocks to put onto the tower.
+
+    Raises:
+        FrameFormatError: there is no block, or no tower, to be seen.
+        MissingExtraError: the extra ``depth`` is not installed.
+        SystemExit: something was found less well than :data:`TOLERANCE`.
+    """
+    say = Steps(options)
+    table = laid(seed, layers) if table is None else table
+    say.step(
+        "A camera at a robot's hand, a table with wooden and black blocks on it, and a tower of "
+        f"two. The robot is to put {layers} black ones on top:",
+        layers=layers,
+        seed=seed,
+    )
+    compared: list[Compared] = []
+    for layer in range(1, layers + 1):
+        seen = await asyncio.to_thread(_look, table, colours)
+        compared += _put_one(table, seen, layer, say)
+        doing = PERSON.get(layer)
+        if doing is not None:
+            getattr(table, doing)()
+            did = {"add": "puts a wooden block on top", "remove": "takes the highest block away"}
+            say.step(f"A person {did[doing]}. The robot is not told.", person=doing)
+    _judge(compared, table, say)
+
+
+class Seen(NamedTuple):
+    """What the robot has found out before it moves a block."""
+
+    blocks: list[BlockPose]  # that lie on the table
+    reached: list[BlockPose]  # those of them that it can grip
+    block: BlockPose  # the one that it takes
+    top: BlockPose  # of the tower
+
+
+def _look(table: TowerTable, colours: ColourRange) -> Seen:
+    """Look at the table, at the nearest block within reach, and at the tower.
+
+    Raises:
+        FrameFormatError: there is no such block, or no tower.
+    """
+    overview = table.look(OVERVIEW)
+    depth = SpatialFilter(delta=EDGE)(overview.depth[0])
+    blocks = loose_blocks(overview, depth, colours)
+    reached = [one for one in blocks if REACH[0] <= math.hypot(one.x, one.y) <= REACH[1]]
+    if not reached:
+        raise FrameFormatError(
+            f"{ARM}: expected a block within {REACH[0]:g} to {REACH[1]:g} m of the robot, got "
+            f"{len(blocks)} that are not: nothing to pick",
+            source=ARM,
+        )
+    rough = min(reached, key=lambda one: math.hypot(one.x, one.y))
+    block = measured_block(table, rough, colours)
+    return Seen(blocks, reached, block, measured_top(table, *tower_place(overview, depth)))
+
+
+def _put_one(table: TowerTable, seen: Seen, layer: int, say: Steps) -> list[Compared]:
+    """Put the block on top; return what was found beside the truth.
+
+    Raises:
+        FrameFormatError: the gripper took nothing.
+    """
+    block, top = seen.block, seen.top
+    true_top = table.tower()[-1]
+    grip = table.pick(block.x, block.y, block.angle)
+    rows = [
+        Compared("block", block, grip.off, grip.turned, 0.0),
+        _compared("tower's top", top, true_top),
+    ]
+    say.step(
+        f"Layer {layer}: {len(seen.blocks)} black blocks lie on the table, {len(seen.reached)} "
+        "within reach. The nearest of these, and the tower's top:",
+        layer=layer,
+        seen=len(seen.blocks),
+        reached=len(seen.reached),
+    )
+    told = [row._asdict() | {"found": row.found._asdict()} for row in rows]
+    say.detail(_text(rows), compared=told)
+    if table.held is None:
+        raise FrameFormatError(
+            f"{ARM}: the gripper closed {1e3 * grip.off:.1f} mm beside the block, on nothing",
+            source=ARM,
+        )
+    lies = table.place(top.x, top.y, top.angle + math.pi / 2)
+    say.detail(
+        f"   picked, and put down across at {1e3 * top.height:.1f} mm; the tower is now "
+        f"{1e3 * lies.top:.1f} mm high",
+        height=lies.top,
+    )
+    return rows
+
+
+# ---------------------------------------------------------------------- what the camera tells
+
+
+def loose_blocks(
+    sight: TableSight, depth: NDArray[np.float32], colours: ColourRange
+) -> list[BlockPose]:
+    """Return the blocks of a colour that lie on the table, as seen from far above.
+
+    Raises:
+        FrameFormatError: there is none; it says what there is instead.
+    """
+    lying: list[BlockPose] = []
+    for one in _regions(sight, colours):
+        height = sight.camera[2] - region_depth(depth, one.mask).median
+        if abs(height - BLOCK[2]) < EDGE:  # and not on the tower
+            lying.append(_pose(sight, one, height))
+    if not lying:
+        raise _nothing(sight, colours)
+    return lying
+
+
+def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) -> BlockPose:
+    """Go above a block and return its pose; from there its sides are hardly seen.
+
+    Raises:
+        FrameFormatError: it is not there.
+    """
+    sight = table.look((rough.x, rough.y, NEAR), maps=0)
+    found = [_pose(sight, one, BLOCK[2]) for one in _regions(sight, colours)]
+    if not found:
+        raise _nothing(sight, colours)
+    block = min(found, key=lambda one: math.dist(one[:2], rough[:2]))
+    beside = math.dist(block[:2], rough[:2])
+    if beside > BLOCK[1] / 2:
+        raise FrameFormatError(
+            f"{ARM}: expected the block that was seen from above, got one {1e3 * beside:.0f} mm "
+            "beside it: something has moved",
+            source=ARM,
+        )
+    return block
+
+
+def tower_place(sight: TableSight, depth: NDArray[np.float32]) -> tuple[float, float]:
+    """Return where something is higher than one block, x and y in metres.
+
+    Raises:
+        FrameFormatError: nothing is.
+    """
+    region = _high(sight, depth)[0]
+    height = sight.camera[2] - region_depth(depth, region.mask).median
+    return to_robot(sight.camera, *region.centre, height)
+
+
+def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
+    """Go above the tower and return the pose and the height of its top.
+
+    Raises:
+        FrameFormatError: it is not there, or its top is no block.
+    """
+    sight = table.look((x, y, ABOVE), MAPS)
+    average, smooth = TemporalFilter(delta=EDGE), SpatialFilter(delta=EDGE)
+    depth = smooth([average(one) for one in sight.depth][-1])
+    middle = (sight.rgb.shape[1] / 2, sight.rgb.shape[0] / 2)
+    high = min(_high(sight, depth), key=lambda one: math.dist(one.centre, middle))
+    level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of what is seen
+    upper = high.mask & (np.abs(depth - level) < EDGE)
+    top = find_regions(upper)[0]
+    if not RATIO[0] <= top.ratio <= RATIO[1] or top.fullness < FULLNESS:
+        raise FrameFormatError(
+            f"{ARM}: expected a block on top of the tower, got {_shape(top)}", source=ARM
+        )
+    told = region_depth(depth, _inner(top.mask), shared=smooth.shared)
+    return _pose(sight, top, sight.camera[2] - told.median)._replace(sigma=told.sigma)
+
+
+def _regions(sight: TableSight, colours: ColourRange) -> list[ColourRegion]:
+    """Return what may be a block by its colour, area and sides."""
+    return find_regions(
+        colours.mask(sight.rgb), area=_area(sight), ratio=RATIO, fullness=FULLNESS, whole=True
+    )
+
+
+def _area(sight: TableSight) -> tuple[float, float]:
+    """Return the least and largest area of a block on the table, pixels."""
+    scale = FOCAL / (sight.camera[2] - BLOCK[2])
+    least, most = (part * BLOCK[0] * BLOCK[1] * scale**2 for part in AREA)
+    return least, most
+
+
+def _high(sight: TableSight, depth: NDArray[np.float32]) -> list[ColourRegion]:
+    """Return the regions that are higher than one block, the largest first."""
+    mask = (depth > 0) & (sight.camera[2] - depth > BLOCK[2] + EDGE)
+    found = find_regions(mask, area=(_area(sight)[0], math.inf))
+    if not found:
+        raise FrameFormatError(
+            f"{ARM}: expected a tower, got nothing that is higher than a block of "
+            f"{1e3 * BLOCK[2]:g} mm",
+            source=ARM,
+        )
+    return found
+
+
+def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask without its rim."""
+    inner = mask.copy()
+    for axis in (0, 1):
+        for step in (-RIM, RIM):
+            inner &= np.roll(mask, step, axis)  # a region that is whole touches no rim
+    return inner
+
+
+def _pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
+    x, y = to_robot(sight.camera, *region.centre, height)
+    way = AXES @ (math.cos(region.orientation), math.sin(region.orientation), 0.0)
+    return BlockPose(x, y, math.remainder(math.atan2(way[1], way[0]), math.pi), height)
+
+
+def _nothing(sight: TableSight, colours: ColourRange) -> FrameFormatError:
+    """Return an error that says what there is of a colour, where no block is."""
+    least, most = _area(sight)
+    found = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
+    got = f"{len(found)} regions of it, the largest {_shape(found[0])}" if found else "none of it"
+    return FrameFormatError(
+        f"{ARM}: expected a block on the table of the colour {colours.as_json()}, {least:.0f} to "
+        f"{most:.0f} pixels with sides of {RATIO[0]:g}:1 to {RATIO[1]:g}:1, got {got}",
+        source=ARM,
+    )
+
+
+def _shape(region: ColourRegion) -> str:
+    return f"{region.area} pixels with sides of {region.ratio:.1f}:1"
+
+
+# ---------------------------------------------------------------------- beside the truth
+
+
+def _compared(what: str, found: BlockPose, true: WoodenBlock) -> Compared:
+    beside = math.hypot(found.x - true.x, found.y - true.y)
+    turned = math.remainder(found.angle - true.angle, math.pi)
+    return Compared(what, found, beside, turned, found.height - true.top)
+
+
+def _text(rows: list[Compared]) -> str:
+    head = ("mm, degrees", *(one.rjust(8) for one in ("x", "y", "angle", "height")))
+    off = [one.rjust(8) for one in ("beside", "turned", "higher", "sigma")]
+    cells: list[tuple[Any, ...]] = []
+    for what, found, beside, turned, higher in rows:
+        places = (1e3 * found.x, 1e3 * found.y, math.degrees(found.angle), 1e3 * found.height)
+        errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * found.sigma)
+        known = errors if found.sigma else errors[:2]  # a block's height is what blocks have
+        shown = [f"{value:8.2f}" for value in (*places, *known)]
+        cells.append((what, *shown, *[""] * (8 - len(shown))))
+    return table_text((*head, *off), cells)
+
+
+def _judge(compared: list[Compared], table: TowerTable, say: Steps) -> None:
+    """Tell whether all was found well enough; SystemExit: it was not."""
+    beside, turned, higher = (
+        max(row.errors[place] for row in compared) for place in range(len(TOLERANCE))
+    )
+    within = all(
+        error <= most for row in compared for error, most in zip(row.errors, TOLERANCE, strict=True)
+    )
+    most = f"{1e3 * TOLERANCE[0]:g} mm, {math.degrees(TOLERANCE[1]):g} degree"
+    stack = table.tower()
+    say.step(
+        f"The tower has {len(stack)} layers, {1e3 * stack[-1].top:.1f} mm. At worst "
+        f"{1e3 * beside:.2f} mm beside, {math.degrees(turned):.2f} degrees turned, "
+        f"{1e3 * higher:.2f} mm of height: {'all' if within else 'not all'} within {most}, "
+        f"{1e3 * TOLERANCE[2]:g} mm",
+        within=within,
+        beside=beside,
+        turned=turned,
+        height=higher,
+    )
+    if not within:
+        raise SystemExit(MISSED)

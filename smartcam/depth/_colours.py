@@ -1,0 +1,276 @@
+"""Things of one colour: a range of it, the mask, and the regions that look like what is wanted."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.calibration._optional_imports import load
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+from smartcam.frames._frame import Frame
+from smartcam.frames._pictures import converted
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MOST: Final = {"hue": 179, "saturation": 255, "value": 255}
+"""Largest number of each channel."""
+
+HUES: Final = 180
+"""Of the circle."""
+
+DULL: Final = 40
+"""Saturation or value below which a hue is nothing but noise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColourRange:
+    """A range of colours in HSV, in OpenCV's units of 8 bits; both ends are part of it.
+
+    Attributes:
+        hue: from, to, each 0 to 179: half degrees on the circle of colours: 0 red, 30 yellow, 60
+            green, 90 cyan, 120 blue, 150 magenta. From more than to goes over 179: ``(170, 10)``
+            is red.
+        saturation: from, to, each 0 (grey) to 255.
+        value: from, to, each 0 (black) to 255: the largest of red, green and blue.
+
+    Raises:
+        ConfigurationError: a number out of its range, or from more than to but for the hue.
+    """
+
+    hue: tuple[int, int] = (0, 179)
+    saturation: tuple[int, int] = (0, 255)
+    value: tuple[int, int] = (0, 255)
+
+    def __post_init__(self) -> None:
+        """Check it."""
+        for name, most in MOST.items():
+            given: Any = getattr(self, name)
+            try:
+                low, high = given
+                fits = all(type(one) is int and 0 <= one <= most for one in (low, high))
+            except (TypeError, ValueError):
+                low, high, fits = 0, 0, False
+            if not fits or (low > high and name != "hue"):
+                raise ConfigurationError(
+                    f"ColourRange: {name}: expected (from, to) of whole numbers 0 to {most}, "
+                    f"got {given!r}"
+                )
+            object.__setattr__(self, name, (low, high))  # of JSON it is a list
+
+    def mask(self, picture: Frame | NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which pixels have such a colour, (H, W).
+
+        Args:
+            picture: a frame with colours (of more than 8 bits the upper 8 count), or (H, W, 3) of
+                uint8, red first.
+
+        Raises:
+            FrameFormatError: no such picture.
+            MissingExtraError: OpenCV (extra ``depth``) is not installed.
+        """
+        return self.mask_hsv(hsv(picture))
+
+    def mask_hsv(self, picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Return which pixels of an HSV picture, (H, W, 3) of uint8, have such a colour, (H, W)."""
+        low, high = self.hue
+        if low <= high:
+            found = self._between(picture, low, high)
+        else:
+            found = self._between(picture, low, MOST["hue"]) | self._between(picture, 0, high)
+        return found > 0
+
+    def _between(self, picture: NDArray[np.uint8], low: int, high: int) -> NDArray[np.uint8]:
+        lows, highs = zip((low, high), self.saturation, self.value, strict=True)
+        return np.asarray(load("cv2").inRange(picture, lows, highs))
+
+    @classmethod
+    def around(
+        cls, picture: Frame | NDArray[Any], x: int, y: int, *, radius: int = 4, margin: int = 12
+    ) -> ColourRange:
+        """Return the range of the colours around a pixel.
+
+        Args:
+            picture: as :meth:`mask` takes it.
+            x: column of the pixel.
+            y: its row.
+            radius: pixels to each side that are looked at.
+            margin: by how much the range is wider to each side, hue by half of it. The tenth of
+                the pixels that is farthest out does not count. Of greys and blacks every hue is
+                taken, since they have none, and of blacks every saturation.
+
+        Raises:
+            ConfigurationError: a pixel outside of the picture, or a number out of its range.
+            FrameFormatError: no such picture.
+            MissingExtraError: OpenCV (extra ``depth``) is not installed.
+        """
+        if not (0 <= radius <= 1000 and 0 <= margin <= 255):
+            raise ConfigurationError(
+                f"ColourRange: expected a radius of 0 to 1000 and a margin of 0 to 255, got "
+                f"{radius!r} and {margin!r}"
+            )
+        return around_hsv(hsv(picture), x, y, radius, margin)
+
+    def as_json(self) -> str:
+        """Return it as JSON, of which ``ColourRange(**json.loads(text))`` makes it again."""
+        return json.dumps(asdict(self))
+
+
+def hsv(picture: Frame | NDArray[Any]) -> NDArray[np.uint8]:
+    """Return a picture as hue, saturation and value in OpenCV's units, (H, W, 3) of uint8."""
+    source = ""
+    if isinstance(picture, Frame):
+        source, picture = picture.source, converted(picture, "RGB8").array()
+    given = np.asarray(picture)
+    if given.dtype != np.uint8 or given.ndim != 3 or given.shape[2] != 3 or not given.size:
+        raise FrameFormatError(
+            f"{source or 'colours'}: expected (H, W, 3) of uint8, got {given.shape} of "
+            f"{given.dtype}",
+            source=source,
+        )
+    cv2 = load("cv2")
+    return np.asarray(cv2.cvtColor(given, cv2.COLOR_RGB2HSV))
+
+
+def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: int) -> ColourRange:
+    """Return the range of the colours around a pixel of an HSV picture."""
+    height, width = picture.shape[:2]
+    if not (0 <= x < width and 0 <= y < height):
+        raise ConfigurationError(
+            f"ColourRange: expected a pixel within {width}x{height}, got ({x}, {y})"
+        )
+    near = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
+    hues, saturations, values = near.reshape(-1, 3).astype(int).T
+    saturation, value = _spread(saturations, margin), _spread(values, margin)
+    if np.median(values) < DULL:
+        return ColourRange(value=(0, value[1]))
+    if np.median(saturations) < DULL:
+        return ColourRange(saturation=(0, saturation[1]), value=value)
+    # the hues as seen from their middle, so that red is no two colours
+    middle = round(np.angle(np.exp(2j * np.pi * hues / HUES).sum()) * HUES / (2 * np.pi))
+    off = (hues - middle + HUES // 2) % HUES - HUES // 2
+    low, high = (round(float(one)) for one in np.percentile(off, (5, 95)))
+    low, high = low - (margin + 1) // 2, high + (margin + 1) // 2
+    hue = (0, MOST["hue"])
+    if high - low < HUES - 1:
+        hue = ((middle + low) % HUES, (middle + high) % HUES)
+    return ColourRange(hue=hue, saturation=saturation, value=value)
+
+
+def _spread(levels: NDArray[Any], margin: int) -> tuple[int, int]:
+    low, high = np.percentile(levels, (5, 95))
+    return max(0, round(float(low)) - margin), min(255, round(float(high)) + margin)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ColourRegion:
+    """A connected region of a mask; pixels count from the middle of the upper left one.
+
+    Attributes:
+        centre: x, y of the middle of its pixels.
+        area: pixels.
+        sides: the longer and the shorter side of the smallest rectangle around it, pixels.
+        corners: of this rectangle, (4, 2).
+        orientation: angle of its longer axis, radians, above -pi/2 up to pi/2, from x (right)
+            towards y (down): that about which its pixels lie closest, which noise at the rim
+            changes less than the rectangle. Of squares and circles it means nothing.
+        mask: its pixels, (H, W) of bool.
+    """
+
+    centre: tuple[float, float]
+    area: int
+    sides: tuple[float, float]
+    corners: NDArray[np.float64]
+    orientation: float
+    mask: NDArray[np.bool_]
+
+    @property
+    def ratio(self) -> float:
+        """The longer side beside the shorter one, 1 or more."""
+        return self.sides[0] / self.sides[1]
+
+    @property
+    def fullness(self) -> float:
+        """Part of the rectangle that is filled; a rectangle's own is about 1."""
+        return self.area / (self.sides[0] * self.sides[1])
+
+
+def find_regions(
+    mask: NDArray[np.bool_],
+    *,
+    area: tuple[float, float] = (1, math.inf),
+    ratio: tuple[float, float] = (1, math.inf),
+    fullness: float = 0.0,
+    whole: bool = False,
+    most: int = 1000,
+) -> list[ColourRegion]:
+    """Return the connected regions of a mask, the largest first; pixels touch at corners, too.
+
+    Args:
+        mask: (H, W) of bool.
+        area: least and largest area that is wanted, pixels.
+        ratio: least and largest ratio of the longer to the shorter side.
+        fullness: least part of its rectangle that a region fills, 0 to 1.
+        whole: whether one that touches the picture's rim is not wanted: it may be cut off.
+        most: so many of them, the largest.
+
+    Raises:
+        ConfigurationError: a range that holds nothing.
+        FrameFormatError: no mask.
+        MissingExtraError: OpenCV (extra ``depth``) is not installed.
+    """
+    for name, (low, high) in (("area", area), ("ratio", ratio), ("fullness", (fullness, 1))):
+        if not 0 <= low <= high:
+            raise ConfigurationError(
+                f"find_regions: {name}: expected (from, to), got {low}, {high}"
+            )
+    given = np.asarray(mask)
+    if given.dtype != bool or given.ndim != 2 or not given.size:
+        raise FrameFormatError(
+            f"find_regions: expected a mask (H, W) of bool, got {given.shape} of {given.dtype}"
+        )
+    cv2 = load("cv2")
+    _, labels, rows, _ = cv2.connectedComponentsWithStats(given.view(np.uint8), connectivity=8)
+    areas = rows[1:, cv2.CC_STAT_AREA]
+    wanted = np.flatnonzero((areas >= area[0]) & (areas <= area[1])) + 1
+    found: list[ColourRegion] = []
+    for label in sorted(wanted.tolist(), key=lambda one: -int(rows[one, cv2.CC_STAT_AREA])):
+        left, top, width, height = (int(one) for one in rows[label, :4])
+        cut = (
+            min(left, top) == 0 or left + width == given.shape[1] or top + height == given.shape[0]
+        )
+        if whole and cut:
+            continue
+        one = _region(labels, label, np.s_[top : top + height, left : left + width])
+        if ratio[0] <= one.ratio <= ratio[1] and one.fullness >= fullness:
+            found.append(one)
+        if len(found) == most:
+            break
+    return found
+
+
+def _region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> ColourRegion:
+    cv2 = load("cv2")
+    pixels = labels[box] == label
+    ys, xs = np.nonzero(pixels)
+    points = np.column_stack((xs + box[1].start, ys + box[0].start))
+    middle = points.mean(axis=0)
+    x, y = (points - middle).T
+    turned = 0.5 * math.atan2(2 * float(np.mean(x * y)), float(np.mean(x * x) - np.mean(y * y)))
+    hull = cv2.convexHull(points.astype(np.int32))
+    around = cv2.minAreaRect(hull)
+    (width, height), angle = (one + 1 for one in around[1]), around[2]  # from rim to rim
+    mask = np.zeros(labels.shape, bool)
+    mask[box] = pixels
+    return ColourRegion(
+        centre=(float(middle[0]), float(middle[1])),
+        area=len(points),
+        sides=(max(width, height), min(width, height)),
+        corners=np.asarray(cv2.boxPoints((around[0], (width, height), angle)), float),
+        orientation=turned,
+        mask=mask,
+    )

@@ -1,0 +1,188 @@
+"""A region of a depth map: how far it is, and how it looks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+import numpy as np
+
+from smartcam.depth._cleaning import MILLIMETRE, as_metres
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+DepthArea: TypeAlias = "tuple[int, int, int, int] | Sequence[tuple[float, float]] | NDArray[Any]"
+"""A box ``(x, y, width, height)``, a polygon (N, 2) of ``x, y``, or a mask (H, W) of bool; pixels,
+which count from the middle of the upper left one."""
+
+OF_A_SIGMA: Final = 1.4826
+"""Sigmas that the median of the absolute deviations is, of normal noise."""
+
+OF_A_MEDIAN: Final = math.pi / 2 - 1
+"""By how much of one pixel's the variance of a median is more than that of a mean, of normal noise
+that each pixel has for itself; smooth noise adds next to nothing to it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionDepth:
+    """How far a region is.
+
+    Attributes:
+        median: metres.
+        sigma: standard deviation of ``median``, metres, of noise alone.
+        spread: standard deviation of one pixel, metres, by the median of the deviations: single
+            wild ones do not count; a slope does.
+        count: pixels with a depth.
+        pixels: pixels of the region.
+    """
+
+    median: float
+    sigma: float
+    spread: float
+    count: int
+    pixels: int
+
+
+def region_depth(
+    depth: NDArray[Any],
+    region: DepthArea | None = None,
+    *,
+    scale: float = MILLIMETRE,
+    shared: float = 1.0,
+) -> RegionDepth:
+    """Return the median of a region's depths; holes do not count.
+
+    Args:
+        depth: (H, W): float in metres, or uint16 in steps of ``scale``.
+        region: a box, a polygon or a mask; None: all of it. What lies outside of the map is no
+            part of it.
+        scale: metres of a step of uint16.
+        shared: pixels whose noise is one and the same, for ``sigma``: 1 where each has its own;
+            :attr:`SpatialFilter.shared` after such a filter (holes make it less: ``sigma`` is then
+            told too large, by a fifth where 5 % are holes). A matcher that looks at windows shares
+            about as many as its window has.
+
+    Raises:
+        ConfigurationError: no region, or ``shared`` is below 1.
+        FrameFormatError: nothing there has a depth, or it is no map of depth.
+    """
+    if not (shared >= 1 and math.isfinite(shared)):
+        raise ConfigurationError(f"region_depth: shared: expected 1 or more pixels, got {shared!r}")
+    metres = as_metres(depth, scale)
+    inside = metres[_mask(region, metres.shape)]
+    there = inside[inside > 0].astype(float)
+    if not there.size:
+        raise FrameFormatError(
+            f"region_depth: expected a depth in {_told(region)}, got none in {inside.size} pixels"
+        )
+    median = float(np.median(there))
+    spread = OF_A_SIGMA * float(np.median(np.abs(there - median)))
+    variance = min(1.0, (shared + OF_A_MEDIAN) / there.size)  # of the median, in pixels'
+    return RegionDepth(
+        median=median,
+        sigma=spread * math.sqrt(variance),
+        spread=spread,
+        count=int(there.size),
+        pixels=int(inside.size),
+    )
+
+
+def equalize_depth(
+    depth: NDArray[Any], region: DepthArea | None = None, *, scale: float = MILLIMETRE
+) -> NDArray[np.uint8]:
+    """Return a picture of a region in which small differences are to be seen.
+
+    Each of its greys has as many pixels as the others: the nearest is 255, the farthest 1. Holes,
+    and in the box around a polygon or a mask whatever is outside, are black, 0.
+
+    Args:
+        depth: (H, W): float in metres, or uint16 in steps of ``scale``.
+        region: a box, a polygon or a mask; None: all of it.
+        scale: metres of a step of uint16.
+
+    Returns:
+        (h, w) of the box around the region.
+
+    Raises:
+        ConfigurationError: no region, or all of it is outside.
+        FrameFormatError: no map of depth.
+    """
+    metres = as_metres(depth, scale)
+    mask = _mask(region, metres.shape)
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        raise ConfigurationError(f"equalize_depth: {_told(region)} is outside of the map")
+    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    shown = mask[box] & (metres[box] > 0)
+    picture = np.zeros(shown.shape, np.uint8)
+    if shown.any():
+        picture[shown] = _equal(-metres[box][shown])
+    return picture
+
+
+def _equal(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return levels as greys of 1 to 255, as many pixels of each: by how many are below."""
+    _, place, counts = np.unique(levels, return_inverse=True, return_counts=True)
+    upto = np.cumsum(counts)
+    rest = upto[-1] - upto[0]
+    if not rest:
+        return np.full(levels.shape, 255, np.uint8)
+    greys: NDArray[np.uint8] = np.rint(1 + 254 * (upto - upto[0]) / rest).astype(np.uint8)
+    return greys[place.reshape(levels.shape)]
+
+
+def _told(region: DepthArea | None) -> str:
+    if region is None:
+        return "the map"
+    given = np.asarray(region)
+    if given.dtype == bool:
+        return "the mask"
+    return f"the {'box' if given.ndim == 1 else 'polygon'} {given.tolist()}"
+
+
+def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return a region as a mask of a map's shape."""
+    if region is None:
+        return np.ones(shape, bool)
+    try:
+        given: NDArray[Any] = np.asarray(region)
+    except ValueError:
+        given = np.zeros(0)
+    if given.dtype == bool and given.shape == shape:
+        return given
+    if given.dtype.kind in "iuf" and np.isfinite(given).all():
+        if given.shape == (4,) and given.dtype.kind != "f" and given[2:].min() > 0:
+            x, y, width, height = (int(one) for one in given)
+            mask = np.zeros(shape, bool)
+            mask[max(0, y) : max(0, y + height), max(0, x) : max(0, x + width)] = True
+            return mask
+        if given.ndim == 2 and given.shape[1] == 2 and len(given) > 2:
+            return _polygon(given.astype(float), shape)
+    raise ConfigurationError(
+        "region: expected a box (x, y, width, height) of whole pixels, a polygon (N, 2) or a mask "
+        f"of bool {shape}, got {_shown(region)}"
+    )
+
+
+def _polygon(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return which pixels' middles lie in a polygon: a ray from there meets its sides odd times."""
+    columns = np.arange(shape[1], dtype=float)
+    rows = np.arange(shape[0], dtype=float)[:, None]
+    inside = np.zeros(shape, bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y0 == y1:
+            continue
+        crossed = (y0 <= rows) != (y1 <= rows)
+        met = x0 + (rows - y0) * (x1 - x0) / (y1 - y0)
+        inside ^= crossed & (met <= columns)
+    return inside
+
+
+def _shown(region: object) -> str:
+    text = repr(region)
+    return text if len(text) <= 80 else f"{text[:80]}..."

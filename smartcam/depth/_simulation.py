@@ -1,0 +1,342 @@
+"""A table with wooden blocks, some of them black, and a camera at a robot's hand, all simulated.
+
+The robot's frame: z up, the table is z = 0. The camera looks straight down. Its pictures are drawn
+ray by ray; depth has the noise, the holes and the mixed pixels of two cameras that are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BLOCK: Final = (0.075, 0.025, 0.015)
+"""Metres: length, width, height of a block."""
+
+SIZE: Final = (640, 480)
+"""Pixels of the camera."""
+
+FOCAL: Final = 600.0
+"""Pixels."""
+
+BASELINE: Final = 0.05
+"""Metres between the two cameras that see depth."""
+
+DISPARITY_SIGMA: Final = 0.1
+"""Pixels: noise of a depth is ``Z^2 / (FOCAL * BASELINE)`` times this."""
+
+CAMERA_SIGMA: Final = 2e-4
+"""Metres on each axis by which the camera's place at the hand is not known."""
+
+GRIP: Final = 5e-3
+"""Metres; how far beside a block the gripper still takes it."""
+
+ROOM: Final = 0.01
+"""Metres between things on the table at least, for a gripper and for the eye."""
+
+GREY_SIGMA: Final = 3.0
+"""Noise of a picture's levels."""
+
+HOLES: Final = (0.01, 0.4)
+"""Part of the pixels without a depth: anywhere, and where it jumps."""
+
+JUMP: Final = 0.004
+"""Metres between two pixels that are a jump."""
+
+FINE: Final = 2
+"""Rays along each side of a pixel."""
+
+AXES: Final = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""Rotation from the camera's frame into the robot's: its columns are right, down, ahead."""
+
+COLOURS: Final = {
+    "wood": (196.0, 150.0, 96.0),
+    "black": (24.0, 23.0, 25.0),
+    "table": (158.0, 168.0, 172.0),
+}
+"""Red, green, blue before the light falls on it."""
+
+SHADES: Final = (0.72, 0.84, 1.0)
+"""Light on the sides along the width, along the length, and on top."""
+
+
+@dataclass(slots=True)
+class WoodenBlock:
+    """A box that lies flat, in the robot's frame: metres and radians."""
+
+    x: float
+    y: float
+    angle: float  # of its length, from x towards y
+    z: float = 0.0  # of its lower side
+    colour: str = "wood"
+    size: tuple[float, float, float] = BLOCK
+
+    @property
+    def top(self) -> float:
+        """Height of its upper side, metres."""
+        return self.z + self.size[2]
+
+
+class TableSight(NamedTuple):
+    """What the camera sees from a place."""
+
+    camera: tuple[float, float, float]  # where it is, metres
+    rgb: NDArray[np.uint8]  # (H, W, 3)
+    depth: list[NDArray[np.uint16]]  # (H, W) each, millimetres
+
+
+def to_robot(
+    camera: tuple[float, float, float], x: float, y: float, height: float
+) -> tuple[float, float]:
+    """Return where the ray of a pixel is at a height, x and y in metres in the robot's frame."""
+    ahead = camera[2] - height
+    ray = ((x - SIZE[0] / 2) / FOCAL * ahead, (y - SIZE[1] / 2) / FOCAL * ahead, ahead)
+    place = AXES @ ray + camera
+    return float(place[0]), float(place[1])
+
+
+class Grip(NamedTuple):
+    """How well a gripper took a block, or a thing was found."""
+
+    off: float  # metres on the table, between where it was and where it was thought to be
+    turned: float  # radians: the same of its angle
+
+
+class TowerTable:
+    """The table, what lies on it, and the robot that takes it.
+
+    Args:
+        seed: of all noise, and of how far the camera is beside where the robot thinks it is.
+
+    Attributes:
+        blocks: what lies there; who builds knows nothing of it.
+        random: for all noise.
+        held: what the gripper has.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.random: np.random.Generator = np.random.default_rng(seed)
+        self.blocks: list[WoodenBlock] = []
+        self.held: WoodenBlock | None = None
+        self._beside = self.random.normal(0, CAMERA_SIGMA, 3)
+
+    def look(self, camera: tuple[float, float, float], maps: int = 1) -> TableSight:
+        """Return a picture and so many depth maps, as seen from about a place (metres)."""
+        true = np.add(camera, self._beside)
+        rays = _TableRays((float(true[0]), float(true[1]), float(true[2])))
+        for block in self.blocks:
+            rays.draw(block)
+        seen = rays.picture()
+        seen += GREY_SIGMA * self.random.standard_normal(seen.shape, np.float32)
+        rgb = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
+        return TableSight(camera, rgb, self._measured(rays.depth, maps) if maps else [])
+
+    def tower(self) -> list[WoodenBlock]:
+        """Return the blocks of the tower, the lowest first: of the highest stack."""
+        top = max(self.blocks, key=lambda one: one.top)
+        stack = [one for one in self.blocks if _apart(one, top) < BLOCK[0] / 2]
+        return sorted(stack, key=lambda one: one.z)
+
+    def pick(self, x: float, y: float, angle: float) -> Grip:
+        """Close the gripper at a pose on the table; a block within :data:`GRIP` is taken.
+
+        Returns how far the next black block was from there; ``held`` is None where it is missed.
+        """
+        wanted = WoodenBlock(x, y, angle)
+        loose = [one for one in self.blocks if one.z == 0 and one.colour == "black"]
+        block = min(loose, key=lambda one: _apart(one, wanted))
+        grip = Grip(_apart(block, wanted), math.remainder(angle - block.angle, math.pi))
+        if grip.off < GRIP and block.size == BLOCK:
+            self.blocks.remove(block)
+            c, s = math.cos(angle), math.sin(angle)
+            x, y = block.x - x, block.y - y
+            self.held = WoodenBlock(c * x + s * y, c * y - s * x, -grip.turned, colour="black")
+        return grip
+
+    def place(self, x: float, y: float, angle: float) -> WoodenBlock:
+        """Put what is held onto the tower, with the gripper at a pose; return how it lies there."""
+        held, self.held = self.held, None
+        if held is None:
+            raise ValueError("the gripper is empty")
+        c, s = math.cos(angle), math.sin(angle)
+        held.x, held.y = x + c * held.x - s * held.y, y + s * held.x + c * held.y
+        held.angle += angle
+        held.z = self.tower()[-1].top
+        self.blocks.append(held)
+        return held
+
+    def add(self) -> None:
+        """Have a person put a wooden block onto the tower, across and not quite straight."""
+        top = self.tower()[-1]
+        dx, dy = self.random.uniform(-0.004, 0.004, 2)
+        angle = top.angle + math.pi / 2 + self.random.uniform(-0.15, 0.15)
+        self.blocks.append(WoodenBlock(top.x + dx, top.y + dy, angle, z=top.top))
+
+    def remove(self) -> None:
+        """Have a person take the highest block away."""
+        self.blocks.remove(self.tower()[-1])
+
+    def _measured(self, fine: NDArray[np.float32], maps: int) -> list[NDArray[np.uint16]]:
+        """Return depth as two cameras would measure it: mixed at edges, noisy, with holes."""
+        depth = _pixels(fine)
+        middle = fine[FINE // 2 :: FINE, FINE // 2 :: FINE]
+        rough = _jumps(middle)
+        hidden = _hidden(middle)
+        found: list[NDArray[np.uint16]] = []
+        for _ in range(maps):
+            sigma = depth**2 / (FOCAL * BASELINE) * DISPARITY_SIGMA
+            noisy = depth + sigma * self.random.standard_normal(depth.shape, np.float32)
+            chance = self.random.random(depth.shape, np.float32)
+            lost = hidden | (chance < HOLES[0]) | (rough & (chance < HOLES[1]))
+            found.append(np.where(lost, 0, np.rint(1e3 * noisy)).astype(np.uint16))
+        return found
+
+
+def _apart(one: WoodenBlock, other: WoodenBlock) -> float:
+    return math.hypot(one.x - other.x, one.y - other.y)
+
+
+def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mean of the rays of each pixel."""
+    places = [(row, column) for row in range(FINE) for column in range(FINE)]
+    total = fine[::FINE, ::FINE].copy()
+    for row, column in places[1:]:
+        total += fine[row::FINE, column::FINE]
+    total /= len(places)
+    return total
+
+
+def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which pixels have a neighbour beyond an edge."""
+    found = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth, axis=axis)) > JUMP
+        first, second = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        found[first] |= step
+        found[second] |= step
+    return found
+
+
+def _hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which pixels the second camera, to the right, does not see."""
+    there = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth  # its columns
+    nearer = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
+    found = np.zeros(depth.shape, bool)
+    found[:, :-1] = there[:, :-1] >= nearer[:, 1:]
+    return found
+
+
+class _TableRays:
+    """The rays of a camera; where they end has a depth and a colour."""
+
+    def __init__(self, camera: tuple[float, float, float]) -> None:
+        width, height = (FINE * one for one in SIZE)
+        columns = ((np.arange(width) + 0.5) / FINE - 0.5 - SIZE[0] / 2) / FOCAL
+        rows = ((np.arange(height) + 0.5) / FINE - 0.5 - SIZE[1] / 2) / FOCAL
+        self._camera = camera
+        self._across: NDArray[np.float32] = columns.astype(np.float32)
+        self._down: NDArray[np.float32] = rows.astype(np.float32)[:, None]
+        self.depth: NDArray[np.float32] = np.full((height, width), camera[2], np.float32)
+        self.colour: NDArray[np.float32] = np.empty((height, width, 3), np.float32)
+        self.colour[:] = COLOURS["table"]
+
+    def picture(self) -> NDArray[np.float32]:
+        """Return what the light makes of the colours, (H, W, 3)."""
+        seen = _pixels(self.colour)
+        x, y, z = self._camera
+        light = 1.0 + 0.5 * (x - 0.4 - self._down[::FINE] * z)
+        seen *= (light - 0.7 * (y - self._across[::FINE] * z))[..., None]
+        return seen
+
+    def draw(self, block: WoodenBlock) -> None:
+        """Draw a block where it is nearer than what is there: three slabs, seen from its frame."""
+        box = self._box_of(block)
+        across, down = self._across[box[1]], self._down[box[0]]
+        shape = np.broadcast_shapes(across.shape, down.shape)
+        if 0 in shape:
+            return
+        c, s = np.float32(math.cos(block.angle)), np.float32(math.sin(block.angle))
+        off = np.subtract(self._camera, (block.x, block.y, block.z))
+        # AXES: right is -y of the robot, down is -x, ahead is -z
+        begin = (c * off[0] + s * off[1], c * off[1] - s * off[0], off[2] - block.size[2] / 2)
+        ways = (-c * down - s * across, s * down - c * across, np.full((1, 1), -1.0, np.float32))
+        near, far = np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
+        side = np.zeros(shape, np.int8)
+        for axis, (start, way, size) in enumerate(zip(begin, ways, block.size, strict=True)):
+            way = np.where(np.abs(way) < 1e-9, np.float32(1e-9), way)
+            one, other = ((sign * size / 2 - start) / way for sign in (-1, 1))
+            enters = np.minimum(one, other).astype(np.float32)
+            side[np.broadcast_to(enters, shape) > near] = axis
+            near = np.maximum(near, enters)
+            far = np.minimum(far, np.maximum(one, other).astype(np.float32))
+        hit = (near < far) & (near < self.depth[box])
+        self.depth[box][hit] = near[hit]
+        along = begin[0] + near * ways[0]
+        grain = 1 + 0.06 * np.sin(900 * (begin[1] + near * ways[1]) + 20 * along)
+        shade = np.take(np.asarray(SHADES, np.float32), side) * grain
+        self.colour[box][hit] = shade[hit][:, None] * np.asarray(COLOURS[block.colour], np.float32)
+
+    def _box_of(self, block: WoodenBlock) -> tuple[slice, slice]:
+        """Return the rows and columns in which it is."""
+        reach = math.hypot(*block.size[:2]) / 2
+        off_x, off_y = block.x - self._camera[0], block.y - self._camera[1]
+        lows: list[int] = []
+        highs: list[int] = []
+        for middle, most in ((-off_x, SIZE[1]), (-off_y, SIZE[0])):
+            ends = [
+                FOCAL * (middle + sign * reach) / (self._camera[2] - z) + most / 2
+                for sign in (-1, 1)
+                for z in (block.z, block.top)
+            ]
+            lows.append(max(0, FINE * (math.floor(min(ends)) - 1)))
+            highs.append(max(0, FINE * (math.ceil(max(ends)) + 2)))
+        return slice(lows[0], highs[0]), slice(lows[1], highs[1])
+
+
+# ---------------------------------------------------------------------- what lies there at first
+
+
+def laid(seed: int, supply: int = 5) -> TowerTable:
+    """Return a table with a tower of two wooden blocks and things that lie about.
+
+    ``supply``: black blocks that a robot at (0, 0) reaches. One more is too far for it, two black
+    things are no blocks, and three blocks are wooden.
+    """
+    table = TowerTable(seed)
+    random = table.random
+    x, y = 0.30 + random.uniform(-0.02, 0.02), 0.2 + random.uniform(-0.02, 0.02)
+    angle = random.uniform(-math.pi / 2, math.pi / 2)
+    table.blocks.append(WoodenBlock(x, y, angle))
+    table.blocks.append(WoodenBlock(x, y, angle + math.pi / 2, z=BLOCK[2]))
+    table.blocks.append(WoodenBlock(0.56, -0.17, random.uniform(-1.5, 1.5), colour="black"))
+    others = [("black", (0.04, 0.04, 0.01)), ("black", (0.13, 0.01, 0.004))]
+    wanted = [*others, *[("black", BLOCK)] * supply, *[("wood", BLOCK)] * 3]
+    for colour, size in wanted:
+        table.blocks.append(_anywhere(table, colour, size))
+    return table
+
+
+def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) -> WoodenBlock:
+    """Return a thing that lies where there is room for a gripper, and within a robot's reach.
+
+    Nor does it lie where the tower, when it is high, hides it from a camera above the middle.
+    """
+    tower = table.blocks[0]
+    for _ in range(100_000):
+        x, y = table.random.uniform(0.17, 0.46), table.random.uniform(-0.26, 0.26)
+        apart = min(
+            math.hypot(x - one.x, y - one.y)
+            - math.hypot(*size[:2]) / 2
+            - math.hypot(*one.size[:2]) / 2
+            for one in table.blocks
+        )
+        beside = math.hypot(x - tower.x, y - tower.y)
+        if apart > ROOM and beside > 0.13 and 0.2 < math.hypot(x, y) < 0.47:
+            angle = table.random.uniform(-math.pi / 2, math.pi / 2)
+            return WoodenBlock(x, y, angle, colour=colour, size=size)
+    raise ValueError("the table is full")

@@ -1,0 +1,313 @@
+"""The site on which a colour is picked: the picture of a camera beside the mask of a range.
+
+A page asks for each picture when it has shown the last one, so one is on its way at a time, and
+who is slow skips. What it was shown is kept for it: a click is about that picture, not about the
+newest one, and another range is shown at once where the next picture takes long.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections import OrderedDict, deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
+
+import numpy as np
+from aiohttp import web
+from pydantic import Field
+
+from smartcam.calibration._optional_imports import load
+from smartcam.depth import ColourRange, find_regions
+from smartcam.depth._colours import hsv
+from smartcam.exceptions import ConfigurationError, FrameSourceError, LocalProtocolError
+from smartcam.web._errors import RefusedError, shown
+from smartcam.web._jpeg import jpeg, require_encoder
+from smartcam.web._routes import CallBody, CallRequest, Calls
+from smartcam.web._site import API, Site
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.frames import Frame, FrameSource
+
+MAX_LOOKS: Final = 16
+"""Pictures asked for at a time: eight people, two each."""
+
+MAX_KEPT: Final = 8
+"""People whose pictures are kept."""
+
+KEPT: Final = 2
+"""Pictures of each: the one that is shown, and the one on its way."""
+
+THREADS: Final = 2
+"""That make pictures and masks."""
+
+LEAST_REGION: Final = 2e-3
+"""Part of the picture that a region has at least to be told of."""
+
+MAX_REGIONS: Final = 8
+"""Regions that are told of."""
+
+T = TypeVar("T")
+
+
+class ColourSite(Site):
+    """A page that picks a range of colours in a camera's live picture.
+
+    ::
+
+        async with (
+            smartcam.frames.open("v4l2:///dev/video0?format=YUYV", linger=2.0) as source,
+            ColourSite(source) as site,
+        ):
+            site.url    # http://127.0.0.1:PORT/
+
+    Args:
+        source: it is opened and closed by who made it. It streams for each picture that is asked
+            for; ``linger`` has it go on in between.
+        colours: what the page begins with.
+        quality: of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as it is.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry in ``Authorization: Bearer``, as
+            :class:`~smartcam.web.LiveSite` has it.
+
+    Attributes:
+        source: as given.
+        colours: as given.
+
+    Raises:
+        ConfigurationError: the token cannot be used, or the quality is none.
+        MissingExtraError: the extra ``depth`` is not installed.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        *,
+        colours: ColourRange | None = None,
+        quality: int = 90,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        super().__init__(CALLS, "colours", host=host, port=port, token=token)
+        if not 1 <= quality <= 100:
+            raise ConfigurationError(f"quality: expected 1 to 100, got {quality!r}")
+        require_encoder()
+        load("cv2")
+        self.source: FrameSource = source
+        self.colours: ColourRange = ColourRange() if colours is None else colours
+        self._quality = quality
+        self._threads: ThreadPoolExecutor | None = None
+        self._looks = 0
+        self._kept: OrderedDict[str, deque[Frame]] = OrderedDict()
+
+    async def start(self) -> None:
+        """Open the port."""
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="smartcam.web.colours")
+        await super().start()
+
+    async def stop(self) -> None:
+        """Close the port; nothing is kept."""
+        try:
+            await super().stop()
+        finally:
+            self._kept.clear()
+            threads, self._threads = self._threads, None
+            if threads is not None:
+                await asyncio.to_thread(threads.shutdown)
+
+    async def next_frame(self, viewer: str) -> Frame:
+        """Return the next frame of the source, and keep it for a viewer.
+
+        Raises:
+            RefusedError: there is none, or too many wait for one.
+        """
+        name = self.source.name
+        try:
+            with self._one_more():
+                async with self.source.reader() as reader:
+                    frame = await anext(reader)
+        except LocalProtocolError as exc:
+            raise RefusedError(409, f"{name} is not open", "a source that is there") from exc
+        except (FrameSourceError, ConfigurationError) as exc:
+            raise RefusedError(409, str(exc), "a source that gives frames") from exc
+        except StopAsyncIteration:
+            raise RefusedError(410, f"{name} has ended", "one that goes on") from None
+        kept = self._kept.setdefault(viewer, deque(maxlen=KEPT))
+        kept.append(frame)
+        self._kept.move_to_end(viewer)
+        while len(self._kept) > MAX_KEPT:
+            self._kept.popitem(last=False)
+        return frame
+
+    def kept_frame(self, viewer: str, sequence: int | None = None) -> Frame:
+        """Return the last frame that a viewer got, or the one with a number.
+
+        Raises:
+            RefusedError: it is not kept any longer.
+        """
+        for frame in reversed(self._kept.get(viewer, ())):
+            if sequence in {None, frame.sequence}:
+                return frame
+        which = "a picture" if sequence is None else f"picture {sequence}"
+        raise RefusedError(409, f"{which} that is not kept any longer", "the one that is shown")
+
+    async def work(self, what: Callable[..., T], *args: object) -> T:
+        """Have a thread do something with a frame.
+
+        Raises:
+            RefusedError: its bytes are wrong, or the site is stopped.
+
+        Cancellation: safe; a thread that has begun goes on to the end.
+        """
+        if self._threads is None:
+            raise RefusedError(503, "a site that ends", "one that runs")
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._threads, what, *args)
+        except FrameSourceError as exc:
+            raise RefusedError(409, str(exc), "a frame that can be read") from exc
+
+    def segmented(self, frame: Frame, colours: ColourRange) -> bytes:
+        """Return a frame as the page gets it; it takes milliseconds, and belongs into a thread.
+
+        Returns:
+            The length of the JSON in four bytes, the lowest first, the JSON, a JPEG of the frame
+            and a PNG of the mask; ``jpeg`` in the JSON is the length of the JPEG.
+
+        Raises:
+            FrameFormatError: its bytes are wrong.
+        """
+        picture = jpeg(frame, self._quality)
+        mask = colours.mask_hsv(hsv(frame))
+        _, png = load("cv2").imencode(".png", mask.view(np.uint8) * 255)
+        regions = find_regions(mask, area=(LEAST_REGION * mask.size, np.inf), most=MAX_REGIONS)
+        said = {
+            "sequence": frame.sequence,
+            "width": frame.width,
+            "height": frame.height,
+            "format": frame.format.name,
+            "age": frame.age,
+            "range": asdict(colours),
+            "part": float(mask.mean()),
+            "regions": [
+                {
+                    "area": one.area,
+                    "sides": one.sides,
+                    "ratio": one.ratio,
+                    "fullness": one.fullness,
+                    "orientation": one.orientation,
+                    "centre": one.centre,
+                    "corners": one.corners.tolist(),
+                }
+                for one in regions
+            ],
+            "jpeg": len(picture),
+        }
+        head = json.dumps(said).encode()
+        return b"".join((len(head).to_bytes(4, "little"), head, picture, png.tobytes()))
+
+    @contextlib.contextmanager
+    def _one_more(self) -> Iterator[None]:
+        """Count one who waits for a frame."""
+        if self._looks >= MAX_LOOKS:
+            raise RefusedError(503, f"picture {MAX_LOOKS + 1}", f"{MAX_LOOKS} at one time")
+        self._looks += 1
+        try:
+            yield
+        finally:
+            self._looks -= 1
+
+
+# ---------------------------------------------------------------------- what calls do
+
+CALLS: Calls[ColourSite] = Calls()
+"""All calls."""
+
+_Viewer = Annotated[str, Field(min_length=1, max_length=64)]
+
+
+class RangeBody(CallBody):
+    """A range of colours, as :class:`ColourRange` has it."""
+
+    hue: list[int]
+    saturation: list[int]
+    value: list[int]
+
+    def colours(self) -> ColourRange:
+        """Return it.
+
+        Raises:
+            RefusedError: it is none.
+        """
+        try:
+            return ColourRange(**self.model_dump())
+        except ConfigurationError as exc:
+            raise RefusedError(422, str(exc), "a range of colours") from exc
+
+
+class LookBody(CallBody):
+    """A picture is wanted."""
+
+    viewer: _Viewer
+    range: RangeBody
+    again: bool = False
+
+
+class AroundBody(CallBody):
+    """The colours around a pixel of a picture are wanted."""
+
+    viewer: _Viewer
+    sequence: int
+    x: int
+    y: int
+
+
+@CALLS.add("GET", API)
+def _calls(_site: ColourSite, _call: CallRequest) -> object:
+    """These calls."""
+    return {"calls": CALLS.as_json()}
+
+
+@CALLS.add("GET", f"{API}/source")
+def _source(site: ColourSite, _call: CallRequest) -> object:
+    """The source's name, and the range to begin with."""
+    return {"name": site.source.name, "range": asdict(site.colours)}
+
+
+@CALLS.add(
+    "POST",
+    f"{API}/look",
+    body=LookBody,
+    sample='{"viewer": "me", "range": {"hue": [0, 179], "saturation": [0, 255], "value": [0, 60]}}',
+    about="The next frame as a JPEG and the mask of a range as a PNG, behind JSON with the regions;"
+    ' `"again": true`: of the last frame that this viewer got. The device streams for it.',
+)
+async def _look(site: ColourSite, call: CallRequest) -> web.Response:
+    body: LookBody = call.body
+    colours = body.range.colours()
+    frame = site.kept_frame(body.viewer) if body.again else await site.next_frame(body.viewer)
+    data = await site.work(site.segmented, frame, colours)
+    return web.Response(body=data, content_type="application/octet-stream")
+
+
+@CALLS.add(
+    "POST",
+    f"{API}/around",
+    body=AroundBody,
+    sample='{"viewer": "me", "sequence": 1, "x": 320, "y": 240}',
+    about="The range of the colours around a pixel of a frame that this viewer got just before.",
+)
+async def _around(site: ColourSite, call: CallRequest) -> object:
+    body: AroundBody = call.body
+    frame = site.kept_frame(body.viewer, body.sequence)
+    if not (0 <= body.x < frame.width and 0 <= body.y < frame.height):
+        size = f"{frame.width}x{frame.height}"
+        raise RefusedError(422, f"pixel {shown((body.x, body.y))}", f"one within {size}")
+    colours = await site.work(ColourRange.around, frame, body.x, body.y)
+    return {"range": asdict(colours)}
