@@ -64,7 +64,8 @@ if not TYPE_CHECKING:
             "_cloud": "Cloud",
             "_cloud_files": "load_cloud save_cloud",
             "_colours": "ColourRange ColourRegion find_regions",
-            "_filters": "crop_box pass_through remove_radius_outliers remove_statistical_outliers voxel_grid",
+            "_filters": "crop_box pass_through remove_radius_outliers "
+            "remove_statistical_outliers voxel_grid",
             "_matcher": "Disparity StereoMatcher",
             "_pair": "read_camera_infos",
             "_regions": "RegionDepth equalize_depth region_depth",

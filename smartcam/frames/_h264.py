@@ -215,14 +215,15 @@ class H264Decoder:
 
     def _follow(self, data: bytes) -> int | None:
         """Return how many frames after this one the picture is whole; None: it cannot be told."""
-        if self._missing:
+        if self._missing == 0:
+            return 0
+        key, refresh = entry_point(data)
+        if key:
+            self._missing = 0
+        elif self._missing is not None:
             self._missing -= 1
-        if self._missing is None:
-            key, refresh = entry_point(data)
-            if key:
-                self._missing = 0
-            elif refresh is not None and self._begun:
-                self._missing = refresh
+        elif refresh is not None and self._begun:
+            self._missing = refresh
         return self._missing
 
     def _packet(self, frame: Frame) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import Any, Final
 
 from smartcam.exceptions import MissingExtraError
@@ -23,7 +24,8 @@ def load(name: str) -> Any:
 
     Raises MissingExtraError: it is not installed.
     """
-    if (there := _LOADED.get(name)) is not None:
+    there = sys.modules.get(name)
+    if there is not None and there is _LOADED.get(name):
         return there  # import_module looks for longer than a small picture takes
     try:
         _LOADED[name] = module = importlib.import_module(name)

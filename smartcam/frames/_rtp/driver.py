@@ -12,7 +12,6 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError, LocalProtoco
 from smartcam.frames._codecs import Codecs
 from smartcam.frames._driver import FrameDriver, FrameSink, StreamFormat
 from smartcam.frames._frame import Frame, Moment
-from smartcam.frames._h264 import entry_point
 from smartcam.frames._optional_imports import load
 from smartcam.frames._pixels import find_format
 from smartcam.frames._rtp.parameters import size_in
@@ -267,7 +266,7 @@ class _RtpStream:
             self._over(failed)
 
     async def _decode_all(self) -> None:
-        decoder, whole = self._codecs.h264_decoder(), True
+        decoder = self._codecs.h264_decoder()
         while not self._ended:
             if not self._units:
                 self._came.clear()
@@ -278,11 +277,10 @@ class _RtpStream:
             self._missed += missing
             if unit.begins or self._anew:
                 decoder = self._codecs.h264_decoder()
-            elif missing or (not whole and entry_point(unit.data)[0]):
-                decoder.lost()  # one that waits for the end of a refresh passes by a key frame
+            elif missing:
+                decoder.lost()
             self._skipped, self._anew = 0, False
             picture = await self._decoded(decoder, unit, device_time)
-            whole = picture is not None
             if picture is not None:
                 self._show(picture)
             else:
