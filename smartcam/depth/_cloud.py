@@ -83,8 +83,8 @@ class Cloud:
             matrix: (3, 3), of a camera without distortion, in pixels; the centre of the first
                 pixel is (0, 0).
             colours: (H, W, 3) uint8, red, green, blue; or (H, W) uint8, grey.
-            sigma: (H, W) metres, of the depth along the optical axis. A point's is that along its
-                ray, which is longer off the axis.
+            sigma: (H, W) metres, of the depth along the optical axis; where there is none, anything.
+                A point's is that along its ray, which is longer off the axis.
 
         Raises:
             ConfigurationError: other shapes, a depth that is below 0 or not finite, no matrix of
@@ -106,6 +106,8 @@ class Cloud:
             picked = picture[rows, columns]
         if sigma is not None:
             lengths = np.linalg.norm(rays, axis=1)
+            if np.shape(sigma) == metres.shape:
+                sigma = np.where(metres > 0, sigma, 0)  # of no depth it may be anything
             spread = _floats(sigma, "sigma", metres.shape)[rows, columns] * lengths
         return cls(_as(rays * along[:, None]), picked, None if spread is None else _as(spread))
 

@@ -28,8 +28,8 @@ def open(
 
     Args:
         url: ``v4l2:///dev/video0?format=YUYV&size=640x480&fps=30``, ``gige://HOST``,
-            ``rtsp://...``, ``http://...``, ``synthetic://``, ``insight://...``, or the path of a
-            file.
+            ``rtsp://...``, ``http://...``, ``rtp://...``, ``synthetic://``, ``insight://...``, or
+            the path of a file.
         camera_info: the lens, which every frame gets.
         timeout: seconds that an iteration waits for a frame; None: as long as it takes.
         stall: seconds without a frame after which a streaming device counts as stuck; None: never.

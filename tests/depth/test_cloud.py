@@ -132,3 +132,12 @@ def test_cloud_goes_to_another_process() -> None:
     assert np.array_equal(there.points, POINTS)
     assert np.array_equal(there.colours, COLOURS)
     assert not there.points.flags.writeable
+
+
+def test_sigma_counts_only_where_there_is_a_depth() -> None:
+    depth = np.array([[0.0, 2.0]], np.float32)
+    cloud = Cloud.from_depth(depth, np.eye(3), sigma=np.array([[np.nan, 0.5]]))
+    assert cloud.sigma is not None
+    assert cloud.sigma.tolist() == pytest.approx([0.5 * np.sqrt(2)])
+    with pytest.raises(ConfigurationError, match="sigma"):
+        Cloud.from_depth(depth, np.eye(3), sigma=np.array([[0.5, np.nan]]))
