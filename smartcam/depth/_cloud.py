@@ -83,7 +83,7 @@ class Cloud:
             matrix: (3, 3), of a camera without distortion, in pixels; the centre of the first
                 pixel is (0, 0).
             colours: (H, W, 3) uint8, red, green, blue; or (H, W) uint8, grey.
-            sigma: (H, W) metres, of the depth along the optical axis; where there is none, anything.
+            sigma: (H, W) metres, of the depth along the optical axis, where there is one.
                 A point's is that along its ray, which is longer off the axis.
 
         Raises:
