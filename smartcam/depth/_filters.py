@@ -14,7 +14,7 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 AXES: Final = "xyz"
 
@@ -35,7 +35,8 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
     if not low <= high:
         raise ConfigurationError(f"pass_through: expected low <= high, got {low!r} and {high!r}")
     along = cloud.points[:, AXES.index(axis)]
-    return cloud.taken((along >= np.float64(low)) & (along <= np.float64(high)))
+    ends = _as_points_are((low, high))
+    return cloud.taken((along >= ends[0]) & (along <= ends[1]))
 
 
 def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud:
@@ -47,8 +48,15 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
     corners = [np.asarray(one, np.float64) for one in (low, high)]
     if any(one.shape != (3,) for one in corners) or not (corners[0] <= corners[1]).all():
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
-    inside = np.all((cloud.points >= corners[0]) & (cloud.points <= corners[1]), axis=1)
+    ends = _as_points_are(corners)
+    inside = np.all((cloud.points >= ends[0]) & (cloud.points <= ends[1]), axis=1)
     return cloud.taken(np.asarray(inside))
+
+
+def _as_points_are(ends: ArrayLike) -> NDArray[np.float32]:
+    """Return ends as float32, as points are: 0.1 includes a point that was made of 0.1."""
+    with np.errstate(over="ignore"):  # an end beyond its range is none
+        return np.asarray(ends, np.float64).astype(np.float32)
 
 
 def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
