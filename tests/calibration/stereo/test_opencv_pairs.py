@@ -89,7 +89,7 @@ def test_lens_of_the_left_camera_is_that_of_opencv() -> None:
     np.testing.assert_allclose(found.camera.matrix, matrix, atol=1.0)
 
 
-def test_corners_of_the_tutorial_have_left02_as_a_bad_view() -> None:
+def test_corners_of_the_tutorial_have_bad_points_in_left02() -> None:
     found = calibrate_intrinsics(_tutorial("left"), sheet="exact")
-    assert found.bad_views == ("left02",)
-    assert found.warnings[0].text.startswith("left02: 0.9")
+    assert found.bad_views == ()  # what is left of it is as good as the others
+    assert "0 in left02 (6.3" in found.warnings[0].text
