@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from smartcam.calibration._files.store import replace_file
 from smartcam.depth import _pcd, _ply
 from smartcam.depth._cloud import Cloud
 from smartcam.depth._tables import BadTableError
-from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
+from smartcam.exceptions import (
+    CalibrationError,
+    ConfigurationError,
+    FrameFormatError,
+    FrameSourceError,
+)
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
@@ -81,9 +85,9 @@ def save_cloud(path: str | os.PathLike[str], cloud: Cloud, *, text: bool = False
     path = Path(path)
     data = _format(path).write(cloud, text)
     try:
-        _replace(path, data)
-    except OSError as exc:
-        raise ConfigurationError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+        replace_file(path, data)
+    except CalibrationError as exc:  # the text says which file, and why
+        raise ConfigurationError(str(exc)) from exc
 
 
 def _format(path: Path) -> _CloudFormat:
@@ -93,20 +97,6 @@ def _format(path: Path) -> _CloudFormat:
         raise ConfigurationError(
             f"{path}: expected a name that ends in {' or '.join(FORMATS)}"
         ) from None
-
-
-def _replace(path: Path, data: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with temporary.open("xb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
 
 
 def _cloud(columns: Mapping[str, NDArray[Any]]) -> Cloud:

@@ -58,11 +58,11 @@ class _WholeParameter(NamedTuple):
 
     def check(self, value: object) -> int | None:
         """Return a value as OpenCV takes it; None: it is none of these."""
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not whole or not self.low <= value <= self.high:  # type: ignore[operator]
+        if not isinstance(value, int | np.integer) or isinstance(value, bool):
             return None
-        number = int(value)  # type: ignore[call-overload]
-        return number if (number - self.low) % self.every == 0 else None
+        number = int(value)
+        fits = self.low <= number <= self.high and (number - self.low) % self.every == 0
+        return number if fits else None
 
 
 class _WordParameter(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -57,7 +58,7 @@ class TakenFrame(NamedTuple):
 
 
 @dataclass(eq=False)
-class FrameStream:
+class FrameStream(ABC):
     """A stream of a program.
 
     Attributes:
@@ -81,6 +82,7 @@ class FrameStream:
             self.idle.cancel()
             self.idle = None
 
+    @abstractmethod
     async def take(self, order: FrameOrder) -> list[TakenFrame]:
         """Return what goes next: one frame, or several of H.264.
 
@@ -89,11 +91,10 @@ class FrameStream:
             StopAsyncIteration: it has ended.
             SmartCamError: why it has ended.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def counts(self) -> dict[str, int]:
         """Return what was sent, skipped and lost until now; it is said with what goes now."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """End it. Idempotent."""

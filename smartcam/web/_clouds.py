@@ -14,16 +14,16 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from aiohttp import WSCloseCode, WSMsgType, web
 
 from smartcam.depth import Cloud, voxel_grid
 from smartcam.exceptions import ConfigurationError
 from smartcam.web._errors import RefusedError, shown
 from smartcam.web._routes import CallRequest, Calls
-from smartcam.web._site import API, FAREWELL, Site
+from smartcam.web._site import API, Site
+from smartcam.web._sockets import PageSocket
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from aiohttp import web
 
 _log = logging.getLogger("smartcam.web")
 
@@ -38,9 +38,6 @@ PROTOCOL: Final = "smartcam.cloud"
 
 PART: Final = 1 << 16
 """Bytes of a message: what is written at a time."""
-
-LONGEST_WORD: Final = 64
-"""Bytes of what a page may say: that it wants the next one."""
 
 SLOW: Final = 60.0
 """Seconds within which a page must have taken a cloud and shown it."""
@@ -209,67 +206,21 @@ def thinned(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
     return thin, size
 
 
-class CloudViewer:
+class CloudViewer(PageSocket):
     """One who looks."""
 
-    def __init__(self, site: CloudSite) -> None:
+    def __init__(self, site: CloudSite, request: web.Request) -> None:
+        # one that vanished while nothing was to be sent gives its place back
+        super().__init__(request, PROTOCOL, "cloud", heartbeat=SLOW)
         self._site = site
-        self._socket = web.WebSocketResponse(
-            protocols=(PROTOCOL,),
-            max_msg_size=LONGEST_WORD,
-            timeout=FAREWELL,
-            compress=False,
-            heartbeat=SLOW,  # one that vanished while nothing was to be sent gives its place back
-        )
-        self._shown = asyncio.Event()
-        self._ending = asyncio.Event()
 
-    def end(self) -> None:
-        """Have it end."""
-        self._ending.set()
-
-    async def serve(self, request: web.Request) -> web.WebSocketResponse:
-        """Show clouds until the page goes, is too slow, or :meth:`end` is called.
-
-        Cancellation: ends it.
-        """
+    async def serve(self) -> web.WebSocketResponse:
+        """Show clouds, as any page is shown something."""
         self._site.viewers.add(self)
         try:
-            await self._socket.prepare(request)
-            await self._first(self._listen(), self._show(), self._ending.wait())
-            async with asyncio.timeout(2 * FAREWELL):
-                await self._socket.close(code=WSCloseCode.GOING_AWAY)
-        except TimeoutError:
-            _log.info("= %s: a page that takes no cloud was disconnected", request.remote)
-            if request.transport is not None:
-                request.transport.abort()
-        except ConnectionError:
-            pass  # the page is gone
+            return await super().serve()
         finally:
             self._site.viewers.discard(self)
-        return self._socket
-
-    @staticmethod
-    async def _first(*jobs: Coroutine[Any, Any, object]) -> None:
-        """Run jobs until one is over, and raise what it raised."""
-        tasks = [asyncio.create_task(job) for job in jobs]
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.wait(tasks)
-        for task in done:
-            if not task.cancelled():
-                task.result()
-
-    async def _listen(self) -> None:
-        """Hear that clouds were shown, until the page goes or says something else."""
-        while True:
-            message = await self._socket.receive()
-            if message.type is not WSMsgType.TEXT or message.data != "next":
-                return
-            self._shown.set()
 
     async def _show(self) -> None:
         """Send the newest, and wait until it is shown; TimeoutError: it is not."""
@@ -317,4 +268,4 @@ async def _clouds(site: CloudSite, call: CallRequest) -> web.StreamResponse:
         raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
     if len(site.viewers) >= MAX_VIEWERS:
         raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
-    return await CloudViewer(site).serve(call.request)
+    return await CloudViewer(site, call.request).serve()

@@ -15,8 +15,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
-from aiohttp import WSCloseCode, WSMsgType, web
-
 from smartcam.backoff import Backoff
 from smartcam.exceptions import (
     ConfigurationError,
@@ -28,11 +26,13 @@ from smartcam.exceptions import (
 )
 from smartcam.web._errors import RefusedError, shown
 from smartcam.web._jpeg import jpeg
-from smartcam.web._site import FAREWELL
+from smartcam.web._sockets import PageSocket
 from smartcam.web._streams import SLOW
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable
+    from collections.abc import Callable, Iterable
+
+    from aiohttp import web
 
     from smartcam.exceptions import SmartCamError
     from smartcam.frames import Frame, FrameReader, FrameSource
@@ -53,9 +53,6 @@ MAX_PICTURE: Final = 1 << 24
 
 ACCOUNT_PERIOD: Final = 1.0
 """Seconds without a frame after which the page is told the account all the same."""
-
-LONGEST_WORD: Final = 64
-"""Bytes of what a page may say: that it wants the next one."""
 
 THREADS: Final = 2
 """That make JPEGs; with more they wait for the processor instead."""
@@ -223,7 +220,7 @@ def _seen(made: asyncio.Future[bytes]) -> None:
         made.exception()  # who asked may be gone, and then nobody else asks
 
 
-class Viewer:
+class Viewer(PageSocket):
     """One who looks at a source.
 
     Attributes:
@@ -233,72 +230,24 @@ class Viewer:
     """
 
     def __init__(self, pictures: SitePictures, place: int, request: web.Request) -> None:
+        super().__init__(request, PROTOCOL, "picture")
         self._pictures = pictures
         self._source = pictures.sources[place]
-        self._request = request
         self.place: int = place
         self.address: str = request.remote or ""
-        self._socket = web.WebSocketResponse(
-            protocols=(PROTOCOL,), max_msg_size=LONGEST_WORD, timeout=FAREWELL, compress=False
-        )
-        self._shown = asyncio.Event()  # the page has shown the last picture
         self.gone = asyncio.Event()
-        self._ending = asyncio.Event()
         self._sent = 0
 
-    def end(self) -> None:
-        """Have it end."""
-        self._ending.set()
-
     async def serve(self) -> web.WebSocketResponse:
-        """Show frames until the page goes, is too slow, or :meth:`end` is called.
-
-        Cancellation: ends it.
-        """
+        """Show frames, as any page is shown something."""
         self._pictures.viewers.add(self)
         try:
-            await self._socket.prepare(self._request)
-            await self._first(self._listen(), self._show(), self._ending.wait())
-            await self._close()
-        except TimeoutError:
-            _log.info("= %s: a page that takes no picture was disconnected", self.address)
-            if self._request.transport is not None:
-                self._request.transport.abort()
-        except ConnectionError:
-            pass  # the page is gone
+            return await super().serve()
         finally:
             self._pictures.viewers.discard(self)
             self.gone.set()
             if not any(one.place == self.place for one in self._pictures.viewers):
                 self._pictures.press(self.place).forget()
-        return self._socket
-
-    async def _close(self) -> None:
-        """Say good-bye; TimeoutError: the page does not even read it."""
-        async with asyncio.timeout(2 * FAREWELL):
-            await self._socket.close(code=WSCloseCode.GOING_AWAY)
-
-    @staticmethod
-    async def _first(*jobs: Coroutine[Any, Any, object]) -> None:
-        """Run jobs until one is over, and raise what it raised."""
-        tasks = [asyncio.create_task(job) for job in jobs]
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.wait(tasks)
-        for task in done:
-            if not task.cancelled():
-                task.result()
-
-    async def _listen(self) -> None:
-        """Hear that pictures were shown, until the page goes or says something else."""
-        while True:
-            message = await self._socket.receive()
-            if message.type is not WSMsgType.TEXT or message.data != "next":
-                return
-            self._shown.set()
 
     async def _show(self) -> None:
         """Show frames, and read the source again where it ended.

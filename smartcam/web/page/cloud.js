@@ -1,7 +1,7 @@
 // The page of a cloud: the newest one, one on the way at a time, drawn by WebGL and turned by hand.
 // A page that is not looked at, as in a hidden tab, asks for none.
 
-import { $, setText } from "./base.js";
+import { $, askToken, atGate, headers, live, setText, token } from "./base.js";
 
 const FIELD = Math.PI / 4; // of view, from top to bottom
 const SAMPLE = 20000; // points by which the view's centre is found: what lies far off does not count
@@ -265,11 +265,10 @@ $("reset").addEventListener("click", reset);
 new ResizeObserver(redraw).observe(canvas);
 
 // --- the server
-let [token, socket, pause] = [null, null, 300];
+let [socket, pause] = [null, 300];
 
-function live(mode, text, alarm = "") {
-  $("live").dataset.state = mode;
-  setText("live", text);
+function say(mode, text, alarm = "") {
+  live(mode, text);
   setText("alarm", alarm);
   $("alarm").hidden = !alarm;
 }
@@ -278,9 +277,9 @@ async function connect() {
   if (socket || document.hidden) return;
   socket = "asked for";
   try {
-    const response = await fetch("/api/cloud", { headers: token ? { Authorization: `Bearer ${token}` } : {}, cache: "no-store" });
+    const response = await fetch("/api/cloud", { headers: headers(), cache: "no-store" });
     const answer = await response.json();
-    if (response.status === 401) return askToken(answer);
+    if (response.status === 401) return (socket = null), askToken(answer);
     if (!response.ok) throw new Error(answer.error);
     if (!cloud && !$("main").dataset.up) $("main").dataset.up = $("up").value = answer.up;
     $("main").hidden = false;
@@ -288,16 +287,16 @@ async function connect() {
     listen();
   } catch {
     socket = null;
-    live("lost", "no server", "The page's server does not answer. Is what served it still running?");
+    say("lost", "no server", "The page's server does not answer. Is what served it still running?");
     setTimeout(connect, 1000);
   }
 }
 function listen() {
-  const one = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/clouds`, ["smartcam.cloud", ...(token ? [`bearer.${token}`] : [])]);
+  const one = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/clouds`, ["smartcam.cloud", ...(token() ? [`bearer.${token()}`] : [])]);
   one.binaryType = "arraybuffer";
   socket = one;
   let about, bytes, filled;
-  one.addEventListener("open", () => live("live", "live"));
+  one.addEventListener("open", () => say("live", "live"));
   one.addEventListener("message", ({ data }) => {
     pause = 300;
     if (typeof data === "string") {
@@ -310,42 +309,25 @@ function listen() {
     }
     if (filled < about.bytes) return;
     if (!about.failure) show(about, bytes);
-    live("live", "live", about.failure ? `Cloud ${about.number} cannot be shown: ${about.failure}` : "");
+    say("live", "live", about.failure ? `Cloud ${about.number} cannot be shown: ${about.failure}` : "");
     one.send("next");
   });
   one.addEventListener("close", () => {
     if (socket !== one) return;
     socket = null;
-    live("wait", "not connected");
+    say("wait", "not connected");
     setTimeout(connect, pause);
     pause = Math.min(5000, 2 * pause);
   });
 }
-function askToken(answer) {
-  socket = null;
-  $("gate").hidden = false;
-  $("main").hidden = true;
-  $("gate-error").textContent = token ? `Refused: ${answer.came}` : "";
-  live("lost", "token needed");
-}
-
-$("gate").addEventListener("submit", (event) => {
-  event.preventDefault();
-  token = $("token").value.trim();
-  sessionStorage.setItem("smartcam-token", token);
-  connect();
-});
 document.addEventListener("visibilitychange", () => {
   if (!document.hidden) return connect();
   const one = socket;
   socket = null;
   if (one instanceof WebSocket) one.close();
-  live("wait", "paused");
+  say("wait", "paused");
 });
 
-const given = new URLSearchParams(location.hash.slice(1)).get("token");
-if (given) sessionStorage.setItem("smartcam-token", given);
-token = sessionStorage.getItem("smartcam-token");
-history.replaceState(null, "", location.pathname);
+atGate(connect);
 if (setUp()) connect();
-else live("lost", "cannot draw", "This browser has no WebGL 2, by which clouds are drawn.");
+else say("lost", "cannot draw", "This browser has no WebGL 2, by which clouds are drawn.");

@@ -1,14 +1,13 @@
 // The page of colours: a picture, the mask of a range, and the range. The next picture is asked for
 // when the last one was shown. A page that is not looked at, as in a hidden tab, asks for none.
 
-import { $, make, setText } from "./base.js";
+import { $, askToken, atGate, headers, make, setText } from "./base.js";
 
 const CHANNELS = [["hue", 179], ["saturation", 255], ["value", 255]];
 const OLD_S = 2;
 const REST_MS = 1000; // before it is tried again
 const viewer = Array.from(crypto.getRandomValues(new Uint8Array(12)), (one) => one.toString(16).padStart(2, "0")).join("");
 
-let token = null;
 let range = null; // what the sliders say
 let shown = null; // what is on the page: sequence, size, range, age when it was sent, and when it came
 let ended = false; // whether the source gives nothing more
@@ -18,13 +17,13 @@ class Refused extends Error {
   constructor(status, answer) {
     super(answer.came ?? `HTTP ${status}`);
     this.status = status;
+    this.answer = answer;
   }
 }
 
 async function call(path, body) {
-  const headers = token ? { Authorization: `Bearer ${token}` } : {};
-  if (body) headers["Content-Type"] = "application/json";
-  const response = await fetch(path, { method: body ? "POST" : "GET", headers, cache: "no-store", body: body && JSON.stringify(body) });
+  const more = body ? { "Content-Type": "application/json" } : {};
+  const response = await fetch(path, { method: body ? "POST" : "GET", headers: { ...headers(), ...more }, cache: "no-store", body: body && JSON.stringify(body) });
   if (response.ok) return response;
   throw new Refused(response.status, await response.json());
 }
@@ -221,33 +220,14 @@ async function begin() {
     say(null);
     run();
   } catch (error) {
-    if (error instanceof Refused && error.status === 401) return askToken(error);
+    if (error instanceof Refused && error.status === 401) return askToken(error.answer);
     say(unreachable());
     setTimeout(begin, REST_MS);
   }
 }
 
-function askToken(error) {
-  $("main").hidden = $("alarm").hidden = true;
-  $("gate").hidden = false;
-  $("gate-error").textContent = token ? `Refused: ${error.message}` : "";
-  $("live").dataset.state = "lost";
-  setText("live", "token needed");
-}
-
-$("gate").addEventListener("submit", (event) => {
-  event.preventDefault();
-  token = $("token").value.trim();
-  sessionStorage.setItem("smartcam-token", token);
-  $("gate").hidden = true;
-  begin();
-});
-
 document.addEventListener("visibilitychange", () => !document.hidden && range && run());
 
-const given = new URLSearchParams(location.hash.slice(1)).get("token");
-if (given) sessionStorage.setItem("smartcam-token", given);
-token = sessionStorage.getItem("smartcam-token");
-history.replaceState(null, "", location.pathname);
+atGate(begin);
 setInterval(age, 250);
 begin();

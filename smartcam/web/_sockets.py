@@ -1,0 +1,96 @@
+"""A WebSocket with one thing on its way: the next one goes when the page has shown the last."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Final
+
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from smartcam.web._site import FAREWELL
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+_log = logging.getLogger("smartcam.web")
+
+LONGEST_WORD: Final = 64
+"""Bytes of what a page may say: that it wants the next one."""
+
+
+class PageSocket(ABC):
+    """One who looks.
+
+    Args:
+        request: that asks for the WebSocket.
+        protocol: of it.
+        what: is shown, for the log.
+        heartbeat: seconds between pings, by which one that vanished is noticed; None: none.
+    """
+
+    def __init__(
+        self, request: web.Request, protocol: str, what: str, *, heartbeat: float | None = None
+    ) -> None:
+        self._request = request
+        self._what = what
+        self._socket = web.WebSocketResponse(
+            protocols=(protocol,),
+            max_msg_size=LONGEST_WORD,
+            timeout=FAREWELL,
+            compress=False,
+            heartbeat=heartbeat,
+        )
+        self._shown = asyncio.Event()  # the page has shown the last one
+        self._ending = asyncio.Event()
+
+    def end(self) -> None:
+        """Have it end."""
+        self._ending.set()
+
+    async def serve(self) -> web.WebSocketResponse:
+        """Show what there is until the page goes, is too slow, or :meth:`end` is called.
+
+        Cancellation: ends it.
+        """
+        try:
+            await self._socket.prepare(self._request)
+            await _first(self._listen(), self._show(), self._ending.wait())
+            async with asyncio.timeout(2 * FAREWELL):
+                await self._socket.close(code=WSCloseCode.GOING_AWAY)
+        except TimeoutError:
+            _log.info(
+                "= %s: a page that takes no %s was disconnected", self._request.remote, self._what
+            )
+            if self._request.transport is not None:
+                self._request.transport.abort()
+        except ConnectionError:
+            pass  # the page is gone
+        return self._socket
+
+    @abstractmethod
+    async def _show(self) -> None:
+        """Send one after the other; TimeoutError: the page does not take or show one."""
+
+    async def _listen(self) -> None:
+        """Hear that something was shown, until the page goes or says something else."""
+        while True:
+            message = await self._socket.receive()
+            if message.type is not WSMsgType.TEXT or message.data != "next":
+                return
+            self._shown.set()
+
+
+async def _first(*jobs: Coroutine[object, object, object]) -> None:
+    """Run jobs until one is over, and raise what it raised."""
+    tasks = [asyncio.create_task(job) for job in jobs]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+    for task in done:
+        if not task.cancelled():
+            task.result()
