@@ -184,6 +184,7 @@ def test_doctor_says_what_is_wrong_on_the_way(fleet: str) -> None:
     run("doctor", fleet).failed(2, "names no camera", "smartcam fleet list")
 
 
+@pytest.mark.long
 def test_doctor_leaves_triggers_to_who_has_reserved_the_camera(fleet: str) -> None:
     reserving = (
         "import asyncio, sys, smartcam\n"

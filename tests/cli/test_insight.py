@@ -117,6 +117,7 @@ def test_image_of_a_camera_that_has_none_says_so(tmp_path: Path) -> None:
     assert not (tmp_path / "seen.bmp").exists()
 
 
+@pytest.mark.long
 def test_trigger_without_cells_says_so(online: str) -> None:
     said = "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"
     empty = run("trigger", online)

@@ -69,6 +69,7 @@ def test_help_lists_every_command_by_topic() -> None:
     assert "..." not in out.partition("A camera:")[2]
 
 
+@pytest.mark.long
 def test_completion_knows_commands_and_options() -> None:
     for words, cword, wanted in (
         ("smartcam do", 1, "doctor"),

@@ -79,6 +79,7 @@ def test_watch_counts_while_it_waits_and_leaves_result_lines_whole() -> None:
     assert lines[-1].endswith("\r") or lines[-1] == ""
 
 
+@pytest.mark.long
 def test_watch_says_for_how_long_nothing_came() -> None:
     with ThreadedCamera(active=21, running=True) as emulator:
         text = shown("watch", emulator.url, "--seconds", "2.5")

@@ -167,6 +167,7 @@ async def test_silent_peer_ends_at_the_deadline() -> None:
         assert proxy.open_connections == 1
 
 
+@pytest.mark.long
 async def test_body_of_5_mb_in_segments_is_copied_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that copies what it has with each segment needs minutes for an image."""
     work, size = Work(monkeypatch), 5_000_000

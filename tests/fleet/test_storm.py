@@ -26,6 +26,7 @@ async def test_each_gets_its_own_result_inside_a_process_for_long(seed: int) -> 
     assert figures.restarts > 0
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 async def test_each_gets_its_own_result_over_zenoh() -> None:
     """Two programs, of which one is stopped for a moment; and one that is killed."""

@@ -380,6 +380,7 @@ def test_restate_reads_the_word_of_a_kin_as_its_own() -> None:
     assert CODE.restate(read, B16) == read
 
 
+@pytest.mark.long
 def test_restate_there_and_back_keeps_every_word() -> None:
     for word in range(1 << 16):
         read = m.StatusReport(status=BITS.read(word))

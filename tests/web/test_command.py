@@ -38,6 +38,7 @@ def refused(*options: str) -> str:
     return done.output.splitlines()[-1]
 
 
+@pytest.mark.long
 def test_web_shows_all_cameras_and_ends_with_a_stream_open() -> None:
     with Process("smartcam-emulator", "--web", "--cameras", "2", fresh=True) as emulator:
         page = page_of(emulator)

@@ -100,6 +100,7 @@ def curl_lacks() -> str:
     return "" if b" --json " in done.stdout else "this curl is older than 7.82: it has no --json"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(bool(curl_lacks()), reason=curl_lacks())
 @pytest.mark.real_time
 async def test_curl_lines_are_answered() -> None:

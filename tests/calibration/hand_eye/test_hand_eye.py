@@ -144,6 +144,7 @@ def test_hand_eye_takes_poses_of_a_controller() -> None:
     assert scene("eye-in-hand", poses=5).errors(found.camera_pose)[1] < 1e-6
 
 
+@pytest.mark.long
 def test_hand_eye_finds_the_scale_of_a_print() -> None:
     """A sheet that was printed at 98 %: the robot's motions tell."""
     poses, views = measured("eye-in-hand", 0.1, NOISE, poses=9)

@@ -72,6 +72,7 @@ def test_verdict_of_each_thing_that_is_wrong_says_what_to_do(
         assert judged.chosen(["accept"]) is None
 
 
+@pytest.mark.long
 def test_verdict_holds_for_new_points() -> None:
     """Of calibrations that are called good, 95 of 100 new touches lie within what was promised."""
     random = np.random.default_rng(11)
