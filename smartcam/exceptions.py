@@ -21,6 +21,10 @@
     │   ├── FrameFormatError                   pixels that it has not, or that are none
     │   └── FrameTimeoutError (TimeoutError)   no picture in time
     ├── RecordingError (OSError)               a recording that could not be written, or read
+    ├── RosError                               what another ROS node, or we to one, said
+    │   ├── RosMessageError                    bytes or fields that are no message of their type
+    │   └── ServiceCallError                   a call without a reply: no such service, refused
+    │       └── ServiceTimeoutError (TimeoutError)
     ├── SubscriberOverflowError                a stream's reader was too slow, and wanted to know
     ├── TriggerError                           a trigger that gave no result, and why
     │   ├── OvertriggeredError
@@ -70,6 +74,10 @@ __all__ = [
     "RecordingError",
     "RemoteProtocolError",
     "ResponseTimeoutError",
+    "RosError",
+    "RosMessageError",
+    "ServiceCallError",
+    "ServiceTimeoutError",
     "SmartCamError",
     "SubscriberOverflowError",
     "TriggerError",
@@ -269,6 +277,30 @@ class RecordingError(SmartCamError, OSError):
     What was written before stays and can be read. Or one could not be read, since it unpacks to
     more than any recording.
     """
+
+
+class RosError(SmartCamError):
+    """Something between ROS nodes did not work."""
+
+
+class RosMessageError(RosError):
+    """Bytes, or fields, that are no message of the type that they are said to have."""
+
+
+class ServiceCallError(RosError):
+    """A call of a ROS service had no reply: nobody serves it, or who does refused or failed.
+
+    Attributes:
+        service: its name.
+    """
+
+    def __init__(self, message: str, *, service: str = "") -> None:
+        super().__init__(message)
+        self.service = service
+
+
+class ServiceTimeoutError(ServiceCallError, TimeoutError):
+    """No reply came in time; whether the call was carried out is unknown."""
 
 
 class SubscriberOverflowError(SmartCamError):
