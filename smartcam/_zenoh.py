@@ -18,6 +18,7 @@ import socket
 import struct
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,6 @@ from smartcam.exceptions import ConfigurationError, ConnectFailedError, MissingE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-    from concurrent.futures import ThreadPoolExecutor
     from typing import Self
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -45,6 +45,12 @@ INTERNET = (socket.AF_INET, socket.AF_INET6)
 MOST_WAITING = 1 << 26
 """Bytes that wait for the event loop, or for the thread that says what is long; what comes beyond
 is dropped, and results are asked for again later."""
+
+REPLIERS = 4
+"""Threads that answer queries: who asks and does not read holds up one of them."""
+
+MOST_REPLYING = 4096
+"""Queries whose answers wait for these threads; one beyond gets none."""
 
 TURN = 64
 """Callbacks in one turn of the event loop."""
@@ -195,6 +201,8 @@ class ZenohSession:
         self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
         self._told_dropped = False
+        self._repliers: ThreadPoolExecutor | None = None
+        self._replying = 0
         self._look: asyncio.TimerHandle | None = None  # for connections that linger
 
     # ------------------------------------------------------------------ life
@@ -265,7 +273,8 @@ class ZenohSession:
 
     def _threads(self) -> list[ThreadPoolExecutor]:
         """Return those of whoever stands on it; what they have to say yet is said first."""
-        return []
+        repliers, self._repliers = self._repliers, None
+        return [] if repliers is None else [repliers]
 
     # ------------------------------------------------------------------ to the loop
 
@@ -317,6 +326,29 @@ class ZenohSession:
                 self._bytes,
             )
         return True
+
+    def reply(self, query: Any, replies: list[tuple[str, bytes]], **how: Any) -> None:
+        """Answer a query, and end it; never waits.
+
+        The engine may wait for who has asked, as that one has said in the query; so threads do it.
+
+        Args:
+            query: the engine's.
+            replies: keys and what is said under them.
+            **how: the engine's options of a reply.
+        """
+        if self._session is None or not replies or self._replying >= MOST_REPLYING:
+            quietly(query.drop)
+            return
+        if self._repliers is None:
+            self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
+        with self._lock:
+            self._replying += 1
+        self._repliers.submit(_reply, query, replies, how).add_done_callback(self._replied)
+
+    def _replied(self, _: object) -> None:
+        with self._lock:
+            self._replying -= 1
 
     def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
         """Declare something at the engine; it is closed with this end."""
@@ -403,6 +435,12 @@ class ZenohDeclared:
             self._closed = True
             self._end.forget(self)
             quietly(self._it.undeclare)
+
+
+def _reply(query: Any, replies: list[tuple[str, bytes]], how: dict[str, Any]) -> None:
+    for key, payload in replies:
+        quietly(query.reply, key, payload, express=True, **how)
+    quietly(query.drop)
 
 
 def _end(session: Any, threads: list[ThreadPoolExecutor]) -> None:

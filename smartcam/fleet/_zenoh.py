@@ -35,12 +35,6 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 LONG = 1 << 16
 """Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
 
-REPLIERS = 4
-"""Threads that answer queries: who asks and does not read holds up one of them."""
-
-MOST_REPLYING = 4096
-"""Queries whose answers wait for these threads; one beyond gets none."""
-
 CALM = 0.01
 """Seconds in which a few things are said at once, and many together."""
 
@@ -64,8 +58,6 @@ class ZenohEnd(ZenohSession, Bus):
         self._sending = 0
         self._behind: collections.Counter[str] = collections.Counter()
         self._calm_since, self._said = -CALM, 0
-        self._repliers: ThreadPoolExecutor | None = None
-        self._replying = 0
         zenoh = self._zenoh
         control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
         self._dropping, self._waiting_for_room = (
@@ -82,9 +74,8 @@ class ZenohEnd(ZenohSession, Bus):
         }
 
     def _threads(self) -> list[ThreadPoolExecutor]:
-        threads = [one for one in (self._sender, self._repliers) if one is not None]
-        self._sender = self._repliers = None
-        return threads
+        sender, self._sender = self._sender, None
+        return super()._threads() + ([] if sender is None else [sender])
 
     # ------------------------------------------------------------------ what is said
 
@@ -146,25 +137,6 @@ class ZenohEnd(ZenohSession, Bus):
             self._sending += size
             self._behind[way] += 1
         self._sender.submit(say)
-
-    def reply(self, query: Any, replies: list[tuple[str, bytes]]) -> None:
-        """Answer a query, and end it; never waits.
-
-        The engine may wait for who has asked, as that one has said in the query; so threads do it.
-        """
-        if self._session is None or not replies or self._replying >= MOST_REPLYING:
-            quietly(query.drop)
-            return
-        if self._repliers is None:
-            self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
-        with self._lock:
-            self._replying += 1
-        encoding = self._zenoh.Encoding.APPLICATION_JSON
-        self._repliers.submit(_reply, query, replies, encoding).add_done_callback(self._replied)
-
-    def _replied(self, _: object) -> None:
-        with self._lock:
-            self._replying -= 1
 
     def publisher(
         self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
@@ -332,13 +304,9 @@ class _ZenohQuestion(BusQuestion):
     def close(self) -> None:
         query, self._query = self._query, None
         if query is not None:
-            self._end.reply(query, self._replies)
-
-
-def _reply(query: Any, replies: list[tuple[str, bytes]], encoding: Any) -> None:
-    for key, payload in replies:
-        quietly(query.reply, key, payload, encoding=encoding, express=True)
-    quietly(query.drop)
+            self._end.reply(
+                query, self._replies, encoding=self._end.engine.Encoding.APPLICATION_JSON
+            )
 
 
 def _put(session: Any, key: str, payload: bytes, how: dict[str, Any]) -> None:
