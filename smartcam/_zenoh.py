@@ -337,14 +337,24 @@ class ZenohSession:
             replies: keys and what is said under them.
             **how: the engine's options of a reply.
         """
-        if self._session is None or not replies or self._replying >= MOST_REPLYING:
+        if replies:
+            self._in_replier(query, _reply, query, replies, how)
+        else:
+            quietly(query.drop)
+
+    def refuse(self, query: Any, why: str) -> None:
+        """Answer a query with an error, and end it; never waits."""
+        self._in_replier(query, _refuse, query, why)
+
+    def _in_replier(self, query: Any, call: Callable[..., None], *arguments: Any) -> None:
+        if self._session is None or self._replying >= MOST_REPLYING:
             quietly(query.drop)
             return
         if self._repliers is None:
             self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
         with self._lock:
             self._replying += 1
-        self._repliers.submit(_reply, query, replies, how).add_done_callback(self._replied)
+        self._repliers.submit(call, *arguments).add_done_callback(self._replied)
 
     def _replied(self, _: object) -> None:
         with self._lock:
@@ -352,15 +362,29 @@ class ZenohSession:
 
     def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
         """Declare something at the engine; it is closed with this end."""
-        if self._session is None:
-            raise ConfigurationError(f"{self._what} is not open")
-        made = how(self._session)
+        made = how(self.session)
         self._declared.add(one)
         return made
 
     def forget(self, one: ZenohDeclared) -> None:
         """It is closed."""
         self._declared.discard(one)
+
+    @property
+    def session(self) -> Any:
+        """The engine's session.
+
+        Raises:
+            ConfigurationError: it is not open.
+        """
+        if self._session is None:
+            raise ConfigurationError(f"{self._what} is not open")
+        return self._session
+
+    @property
+    def opened(self) -> bool:
+        """Whether it is open."""
+        return self._session is not None
 
     @property
     def engine(self) -> Any:
@@ -440,6 +464,11 @@ class ZenohDeclared:
 def _reply(query: Any, replies: list[tuple[str, bytes]], how: dict[str, Any]) -> None:
     for key, payload in replies:
         quietly(query.reply, key, payload, express=True, **how)
+    quietly(query.drop)
+
+
+def _refuse(query: Any, why: str) -> None:
+    quietly(query.reply_err, why.encode())
     quietly(query.drop)
 
 
