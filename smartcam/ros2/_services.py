@@ -21,7 +21,7 @@ from smartcam.exceptions import (
 )
 from smartcam.ros2._attachment import Attachment
 from smartcam.ros2._tokens import CLIENT
-from smartcam.ros2._topics import RosEnd
+from smartcam.ros2._topics import RosEnd, said
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -106,7 +106,7 @@ class RosService(RosEnd):
         try:
             async with asyncio.timeout(self._timeout):
                 reply = await self._handler(request)
-            data = self.type.response.encode(self.type.response.of(reply, {}))
+            data = self.type.response.encode(said(reply, {}))
         except asyncio.CancelledError:
             self._refuse(query, RosError("the call was given up"))
             raise
@@ -228,7 +228,7 @@ class RosClient(RosEnd):
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout
-        data = self.type.request.encode(self.type.request.of(request, fields))
+        data = self.type.request.encode(said(request, fields))
         await self.wait_served(timeout)
         self._number += 1
         attachment = Attachment(self._number, time.time_ns(), self.entity.gid)
@@ -280,7 +280,6 @@ class RosClient(RosEnd):
             zenoh.in_loop(end, 0)
 
         self._querier.get(
-            "",
             zenoh.engine.handlers.Callback(on_reply, on_end, indirect=False),
             payload=data,
             attachment=attachment.encode(),

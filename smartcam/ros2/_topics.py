@@ -38,6 +38,13 @@ HEARTBEAT = 0.5
 """Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
 
 
+def said(message: object, fields: dict[str, Any]) -> object:
+    """Return what is to be said: a message, or the fields of one."""
+    if message is not None and fields:
+        raise RosMessageError("expected a message or its fields, got both")
+    return fields if message is None else message
+
+
 class RosEnd:
     """An end of a topic or a service, with its token, until it is closed.
 
@@ -161,7 +168,7 @@ class RosPublisher(RosEnd):
             RosMessageError: it is no message of the type.
             RosError: the publisher is closed.
         """
-        self.publish_encoded(self.type.encode(self.type.of(message, fields)))
+        self.publish_encoded(self.type.encode(said(message, fields)))
 
     def publish_encoded(self, data: bytes) -> None:
         """Publish bytes that are a message of the type already; never waits.
