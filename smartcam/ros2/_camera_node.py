@@ -107,17 +107,20 @@ class CameraNode(Server):
     ) -> None:
         self.camera, self.node = camera, node
         self.options: CameraNodeOptions = options or CameraNodeOptions()
-        self.lifecycle: CameraLifecycle = CameraLifecycle(
-            camera,
-            node,
-            application=self.options.application,
-            autostart=self.options.autostart,
-        )
-        self.status: CameraStatus = CameraStatus(
-            camera, node, self.options, lambda: self.lifecycle.state.label
-        )
+        self.lifecycle: CameraLifecycle
+        self.status: CameraStatus
+        self._renew()
         self._stack: contextlib.AsyncExitStack | None = None
         self._turn = asyncio.Lock()
+
+    def _renew(self) -> None:
+        options = self.options
+        self.lifecycle = CameraLifecycle(
+            self.camera, self.node, application=options.application, autostart=options.autostart
+        )
+        self.status = CameraStatus(
+            self.camera, self.node, options, lambda: self.lifecycle.state.label
+        )
 
     @property
     def frame_id(self) -> str:
@@ -135,6 +138,8 @@ class CameraNode(Server):
         async with self._turn:
             if self._stack is not None:
                 return
+            if self.lifecycle.closed:
+                self._renew()
             async with contextlib.AsyncExitStack() as stack:
                 await stack.enter_async_context(self.node)
                 for make in PARTS:
