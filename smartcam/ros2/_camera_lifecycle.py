@@ -6,6 +6,7 @@ Services and topic are those of rcl_lifecycle (``com_interface.c``).
 from __future__ import annotations
 
 import asyncio
+import inspect
 import logging
 import time
 from typing import TYPE_CHECKING, Any
@@ -107,7 +108,7 @@ class CameraLifecycle(Lifecycle):
         async def answer(_request: object) -> Any:
             return what()
 
-        handler = what if asyncio.iscoroutinefunction(what) else answer
+        handler = what if inspect.iscoroutinefunction(what) else answer
         self._ends.append(self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler))
 
     async def _on_change_state(self, request: Any) -> dict[str, Any]:
