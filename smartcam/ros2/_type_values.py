@@ -12,7 +12,7 @@ import numpy as np
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import RosMessageError
 from smartcam.ros2._type_codec import MisfitError, counted, packed, text_bytes
-from smartcam.ros2._type_definitions import INTEGERS, NUMBERS, Definition, Field
+from smartcam.ros2._type_definitions import INTEGERS, NUMBERS, Definition, MessageField
 
 if TYPE_CHECKING:
     from smartcam.ros2._types import MessageType
@@ -78,7 +78,7 @@ def message_class(definition: Definition) -> type[RosMessage]:
     )
 
 
-def zero(kind: MessageType, field: Field) -> Any:
+def zero(kind: MessageType, field: MessageField) -> Any:
     """Return what a field is when nothing is said: its default, or zero."""
     default = field.default
     if field.shape:
@@ -98,8 +98,15 @@ def zero(kind: MessageType, field: Field) -> Any:
     return False if field.type == "bool" else 0 if field.type in INTEGERS else 0.0
 
 
-def fitting(kind: MessageType, field: Field, value: Any, where: str = "") -> Any:
+def fitting(kind: MessageType, field: MessageField, value: Any, where: str) -> Any:
     """Return a field's value as it is kept: mappings become messages.
+
+    Args:
+        kind: the type that has the field.
+        field: which.
+        value: what it is to be.
+        where: how the error text begins: type and place of the message, such as
+            ``sensor_msgs/msg/Image: header.``.
 
     Raises:
         RosMessageError: it does not fit.
@@ -115,19 +122,19 @@ def fitting(kind: MessageType, field: Field, value: Any, where: str = "") -> Any
         counted(value, least, field.size)
     except (MisfitError, struct.error, KeyError, TypeError, ValueError, OverflowError) as exc:
         raise RosMessageError(
-            f"{kind.name}: {where}: expected {field}, got {_shown(value):.80} ({exc})"
+            f"{where}: expected {field}, got {_shown(value):.80} ({exc})"
         ) from exc
     one = field._replace(shape="", size=0, name="")
     return [fitting(kind, one, item, f"{where}[{place}]") for place, item in enumerate(value)]
 
 
-def _one(kind: MessageType, field: Field, value: Any, where: str) -> Any:
+def _one(kind: MessageType, field: MessageField, value: Any, where: str) -> Any:
     if field.nested:
         nested = kind.nested[field.type]
         if isinstance(value, Mapping):
-            return filled(nested, value, f"{where}.", kind)
+            return filled(nested, value, f"{where}.")
         if getattr(value, "__msgtype__", None) != nested.name:
-            raise MisfitError(type(value).__name__)
+            raise MisfitError(f"a {type(value).__name__}")
         return value
     if field.type == "string":
         text_bytes(value, field.limit)
@@ -144,19 +151,18 @@ def _one(kind: MessageType, field: Field, value: Any, where: str) -> Any:
     return value
 
 
-def filled(
-    kind: MessageType, fields: Mapping[str, Any], where: str = "", outer: MessageType | None = None
-) -> Any:
+def filled(kind: MessageType, fields: Mapping[str, Any], where: str = "") -> Any:
     """Return a message of these fields, zero elsewhere.
 
     Raises:
         RosMessageError: a field is not of the type, or does not fit.
     """
+    where = where or f"{kind.name}: "
     known = {field.attribute: field for field in kind.fields}
     for name in fields:
         if name not in known:
             raise RosMessageError(
-                f"{(outer or kind).name}: {where}{name}: {kind.name} has no such field, expected "
+                f"{where}{name}: {kind.name} has no such field, expected "
                 f"{', '.join(known) or 'none'}{did_you_mean(str(name), known)}"
             )
     return kind.cls(
@@ -173,13 +179,14 @@ def check(kind: MessageType, message: Any, where: str = "") -> None:
     Raises:
         RosMessageError: a field is missing or does not fit.
     """
+    where = where or f"{kind.name}: "
     for field in kind.fields:
         try:
             value = getattr(message, field.attribute)
         except AttributeError:
             raise RosMessageError(
-                f"{kind.name}: {where}{field.name}: expected {field}, got none: "
-                f"{type(message).__name__} has no such field"
+                f"{where}{field.name}: expected {field}, got none: a {type(message).__name__} has "
+                "no such field"
             ) from None
         fitting(kind, field, value, where)
         if field.nested:

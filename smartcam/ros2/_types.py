@@ -14,7 +14,7 @@ from smartcam.ros2._definitions import MESSAGES, SERVICES
 from smartcam.ros2._type_codec import HEAD, MisfitError, decoder, encoder
 from smartcam.ros2._type_definitions import (
     Definition,
-    Field,
+    MessageField,
     parse_message,
     parse_service,
     split_name,
@@ -65,7 +65,7 @@ class MessageType:
     ) -> None:
         self.name = definition.name
         self.dds = dds_name(definition.name)
-        self.fields: tuple[Field, ...] = definition.fields
+        self.fields: tuple[MessageField, ...] = definition.fields
         self.constants = dict(definition.constants)
         self.nested = nested
         self.cls: type[RosMessage] = message_class(definition)
@@ -157,14 +157,12 @@ class ServiceType:
         response: the type of its responses.
     """
 
-    def __init__(
-        self, name: str, request: MessageType, response: MessageType, get_hash: Callable[[], str]
-    ) -> None:
+    def __init__(self, name: str, types: RosTypes) -> None:
         self.name = name
         self.dds = dds_name(name)
-        self.request = request
-        self.response = response
-        self._get_hash = get_hash
+        self.request = types.message_of(f"{name}_Request")
+        self.response = types.message_of(f"{name}_Response")
+        self._types = types
 
     def __repr__(self) -> str:
         return f"<ServiceType {self.name}>"
@@ -172,7 +170,16 @@ class ServiceType:
     @functools.cached_property
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
-        return self._get_hash()
+        return self._types.hash_of(service_of(self.name))
+
+    @functools.cached_property
+    def event(self) -> MessageType:
+        """What introspection publishes.
+
+        Raises:
+            ConfigurationError: the distribution has no introspection.
+        """
+        return self._types.message_of(f"{self.name}_Event")
 
 
 class RosTypes:
@@ -235,12 +242,7 @@ class RosTypes:
             if (made := self._services.get(name)) is None:
                 for definition in (*parse_service(name, text), event_of(name)):
                     self._definitions[definition.name] = definition
-                made = self._services[name] = ServiceType(
-                    name,
-                    self.message_of(f"{name}_Request"),
-                    self.message_of(f"{name}_Response"),
-                    functools.partial(self._hash, service_of(name)),
-                )
+                made = self._services[name] = ServiceType(name, self)
         return made
 
     def add(self, name: str, text: str) -> None:
@@ -290,6 +292,7 @@ class RosTypes:
         return made
 
     def message_of(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
+        """Return a message's type; for this module, as what follows."""
         if (made := self._messages.get(name)) is not None:
             return made
         if self._shared is not None and name not in self._added and name not in self._definitions:
@@ -302,7 +305,7 @@ class RosTypes:
                 nested = {
                     one: self.message_of(one, (*within, name)) for one in sorted(definition.needs())
                 }
-                get_hash = functools.partial(self._hash, definition)
+                get_hash = functools.partial(self.hash_of, definition)
                 made = self._messages[name] = MessageType(definition, nested, get_hash)
         return made
 
@@ -311,7 +314,8 @@ class RosTypes:
             return self._added[name]
         return None if name in LACKING.get(self.distribution, ()) else SERVICES.get(name)
 
-    def _hash(self, definition: Definition) -> str:
+    def hash_of(self, definition: Definition) -> str:
+        """Return a type's hash."""
         if self.distribution in WITHOUT_HASHES:
             return NOT_SUPPORTED
         return type_hash(definition, self.definition)
