@@ -165,9 +165,14 @@ class ResultMessages:
             made.append(cls.Localization(one.feature_id, one.quality, one.photo_index, pose))
         return made
 
-    def result(self, result: Result) -> Any:
-        """Return a result as it came and as it was read."""
-        parts = localizations_of(result.value)
+    def result(self, result: Result, parts: Sequence[Localization] | None) -> Any:
+        """Return a result as it came and as it was read.
+
+        Args:
+            result: it.
+            parts: its localizations; None where they are none, or not in metres: then its value is
+                said as JSON.
+        """
         try:
             frame_id = self.frame_of(result)
         except RosMessageError:  # each part says its own
