@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from smartcam._client.interpretation import without_poses
 from smartcam.interpreters._base import resolve
 from smartcam.layout._text import UNITS
+from smartcam.ros2._messages import localizations_of
 
 if TYPE_CHECKING:
     from smartcam.camera import Camera
     from smartcam.interpreters._base import Interpreter
+    from smartcam.models import Localization, Result
 
 
 def own_interpreter(camera: Camera[Any], application: int | None) -> Interpreter | None:
@@ -36,15 +39,21 @@ def calibrated(camera: Camera[Any], application: int) -> bool:
     return given is not None
 
 
-def says_metres(camera: Camera[Any], application: int, spec: object = None) -> bool:
-    """Return whether localizations of an application are in metres.
+def localizations_in_metres(
+    camera: Camera[Any], result: Result[Any], spec: object = None
+) -> list[Localization] | None:
+    """Return a result's localizations; None where it has none, or has them in pixels.
 
     Args:
         camera: whose.
-        application: its id.
-        spec: how they are read; None: as the camera's always are.
+        result: of it.
+        spec: how it was read; None: as the camera's always are.
     """
-    if calibrated(camera, application):
-        return True
-    reader = own_interpreter(camera, application) if spec is None else resolve(spec)
-    return not in_pixels(reader)
+    parts = localizations_of(result.value)
+    if parts is None or calibrated(camera, result.application):
+        return parts
+    reader = own_interpreter(camera, result.application) if spec is None else resolve(spec)
+    if in_pixels(reader):
+        return None
+    other = not parts and reader is not None and without_poses(reader) is not None
+    return None if other else parts  # an empty list may be of texts, or of records

@@ -13,13 +13,13 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, SmartCamError
-from smartcam.ros2._camera_reading import says_metres
-from smartcam.ros2._messages import DETECTIONS, POSES, RESULT, ResultMessages, localizations_of
+from smartcam.ros2._camera_reading import localizations_in_metres
+from smartcam.ros2._messages import DETECTIONS, POSES, RESULT, ResultMessages
 from smartcam.ros2._qos import DRIVER, QoS
 
 if TYPE_CHECKING:
     from smartcam.camera import Camera
-    from smartcam.models import Localization, Result
+    from smartcam.models import Result
     from smartcam.streams import Subscription
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
@@ -147,13 +147,30 @@ class CameraResults:
             raise ConfigurationError(
                 f"{self._camera.name}: queue_size {queue_size}: expected 1 to {MOST_QUEUED}"
             )
-        outlet = None
-        if topic:
-            publisher = self._node.publisher(topic, RESULT, qos=QoS(depth=queue_size))
-            outlet = _Outlet(publisher, min_delay, queue_size)
-        before, self._outlet = self._outlet, outlet
+        before, self._outlet = self._outlet, None
+        if before is not None and before.topic == topic:
+            self._outlet = before.heir(min_delay, queue_size)
+            return
+        try:
+            if topic:
+                publisher = self._other_topic(topic, queue_size)
+                self._outlet = _Outlet(topic, publisher, min_delay, queue_size)
+        except BaseException:
+            self._outlet = before
+            raise
         if before is not None:
             before.close()
+
+    def _other_topic(self, topic: str, depth: int) -> Any:
+        publisher = self._node.publisher(topic, RESULT, qos=QoS(depth=depth))
+        own = self._publishers.get("results")
+        if own is not None and _name(publisher) == _name(own):
+            publisher.close()
+            raise ConfigurationError(
+                f"{self._camera.name}: {_name(own)} has its results already: expected another "
+                "topic, or none"
+            )
+        return publisher
 
     # ------------------------------------------------------------------ what comes
 
@@ -176,10 +193,7 @@ class CameraResults:
         if not self.active:
             return
         self.taken += 1
-        parts = localizations_of(result.value)
-        if parts is not None and not says_metres(self._camera, result.application):
-            parts = None
-        make = self._messages
+        parts, make = localizations_in_metres(self._camera, result), self._messages
         if parts is not None:
             self._say("localizations", lambda: make.poses(result, parts))
             self._say("detections", lambda: make.detections(result, parts))
@@ -214,6 +228,13 @@ class CameraResults:
             self.refused += 1
             level = logging.DEBUG if self.refused > 1 else logging.WARNING
             logger.log(level, "%s ! a result was not published: %s", self._node.full_name, exc)
+        except Exception:
+            self.refused += 1
+            logger.exception("%s ! a result was not published", self._node.full_name)
+
+
+def _name(publisher: Any) -> str:
+    return str(getattr(publisher, "name", "") or publisher.topic)
 
 
 class _Made(NamedTuple):
@@ -231,7 +252,8 @@ class _Outlet:
         dropped: results that found no room, or were left when it was closed.
     """
 
-    def __init__(self, publisher: Any, min_delay: float, queue_size: int) -> None:
+    def __init__(self, topic: str, publisher: Any, min_delay: float, queue_size: int) -> None:
+        self.topic = topic
         self.dropped: int = 0
         self._publisher, self._min_delay, self._queue_size = publisher, min_delay, queue_size
         self._queue: collections.deque[_Made] = collections.deque()
@@ -262,9 +284,20 @@ class _Outlet:
         self._timer = None
         self._go_on(put)
 
-    def close(self) -> None:
+    def heir(self, min_delay: float, queue_size: int) -> _Outlet:
+        """Return one that goes on with the same publisher; what waited here is dropped."""
+        self._end()
+        made = _Outlet(self.topic, self._publisher, min_delay, queue_size)
+        made.dropped = self.dropped
+        return made
+
+    def _end(self) -> None:
         self.dropped += len(self._queue)
         self._queue.clear()
         if self._timer is not None:
             self._timer.cancel()
+
+    def close(self) -> None:
+        """Say nothing more; what waits is dropped."""
+        self._end()
         self._publisher.close()

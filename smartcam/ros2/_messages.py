@@ -33,7 +33,7 @@ MOST_ERROR = 1000
 
 
 def localizations_of(value: object) -> list[Localization] | None:
-    """Return a result's value where it is a list of localizations, which may be empty; else None."""
+    """Return a value where it is a list of localizations, which may be empty; else None."""
     if not isinstance(value, list):
         return None
     found: list[Any] = value
@@ -58,12 +58,14 @@ class ResultMessages:
         types: of the node that says them.
         camera: the camera's name, as poses have it that no calibration has touched.
         frame_id: what that frame is called in ROS.
-        calibrated: what the frame of results without a part is called, by application; None for
-            those that no calibration touches.
+        calibration: as the camera's settings have it; it names the frame of a result in which
+            nothing was found.
     """
 
-    def __init__(self, types: RosTypes, camera: str, frame_id: str, calibrated: Any = None) -> None:
-        self._camera, self._frame_id, self._calibration = camera, frame_id, calibrated
+    def __init__(
+        self, types: RosTypes, camera: str, frame_id: str, calibration: Any = None
+    ) -> None:
+        self._camera, self._frame_id, self._calibration = camera, frame_id, calibration
         cls = {
             name: types.message(name).cls
             for name in (
@@ -85,7 +87,9 @@ class ResultMessages:
                 DETECTIONS,
             )
         }
-        self._cls: Any = type("Classes", (), {name.rpartition("/")[2]: one for name, one in cls.items()})
+        self._cls: Any = type(
+            "Classes", (), {name.rpartition("/")[2]: one for name, one in cls.items()}
+        )
         self._no_covariance = np.zeros(36)
         self._no_covariance.flags.writeable = False
 
@@ -152,7 +156,9 @@ class ResultMessages:
                 cls.ObjectHypothesis(one.feature_id, one.quality),
                 cls.PoseWithCovariance(pose, self._no_covariance),
             )
-            found.append(cls.Detection3D(header, [hypothesis], cls.BoundingBox3D(pose, no_size), ""))
+            found.append(
+                cls.Detection3D(header, [hypothesis], cls.BoundingBox3D(pose, no_size), "")
+            )
         return cls.Detection3DArray(header, found)
 
     def localizations(self, parts: Sequence[Localization]) -> list[Any]:
