@@ -13,6 +13,8 @@ from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.ros2._camera_lifecycle import CameraLifecycle
 from smartcam.ros2._camera_parameters import CameraParameters
+from smartcam.ros2._camera_results import CameraResults
+from smartcam.ros2._camera_services import CameraServices
 from smartcam.ros2._camera_status import CameraStatus
 
 if TYPE_CHECKING:
@@ -80,6 +82,8 @@ class CameraNodeOptions:
 PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
     lambda one: CameraParameters.of(one.camera, one.node, one.options, one.status),
     lambda one: one.status,
+    lambda one: one.results,
+    lambda one: one.services,
     lambda one: one.lifecycle,
 )
 """What a node is made of, in the order in which it starts; the life cycle is the last, so that what
@@ -100,6 +104,8 @@ class CameraNode(Server):
     Attributes:
         lifecycle: whether it publishes results.
         status: what it says of the camera.
+        results: its results.
+        services: what others can have it do.
     """
 
     def __init__(
@@ -109,23 +115,30 @@ class CameraNode(Server):
         self.options: CameraNodeOptions = options or CameraNodeOptions()
         self.lifecycle: CameraLifecycle
         self.status: CameraStatus
+        self.results: CameraResults
+        self.services: CameraServices
         self._renew()
         self._stack: contextlib.AsyncExitStack | None = None
         self._turn = asyncio.Lock()
 
     def _renew(self) -> None:
-        options = self.options
+        camera, node, options = self.camera, self.node, self.options
         self.lifecycle = CameraLifecycle(
-            self.camera, self.node, application=options.application, autostart=options.autostart
+            camera, node, application=options.application, autostart=options.autostart
         )
-        self.status = CameraStatus(
-            self.camera, self.node, options, lambda: self.lifecycle.state.label
-        )
+        self.status = CameraStatus(camera, node, options, lambda: self.lifecycle.state.label)
+        self.results = CameraResults(camera, node, frame_id=self.frame_id)
+        self.results.active = False
+        self.services = CameraServices(camera, node, self.results, self.lifecycle)
+        self.lifecycle.listen(self._on_transition)
 
     @property
     def frame_id(self) -> str:
         """The frame of what it sees."""
         return self.options.frame_id or self.camera.name
+
+    def _on_transition(self, _: object) -> None:
+        self.results.active = self.lifecycle.active
 
     async def start(self) -> None:
         """Open the node, and begin with all that it is made of.
