@@ -123,13 +123,8 @@ class CameraLifecycle(Lifecycle):
     def _say(self, transition: LifecycleTransition) -> None:
         self._event.publish({"timestamp": time.time_ns(), **transition.fields})
 
-    async def change(self, label: str = "", number: int = 0) -> None:
-        """Make a transition; see :meth:`Lifecycle.change`. It no longer starts by itself then."""
-        self._find(label, number)
-        self._give_up_starting()
-        await super().change(label, number)
-
-    def _give_up_starting(self) -> None:
+    def _begins(self) -> None:
+        """It no longer starts by itself where others have taken over."""
         starting = self._starting
         if starting is not None and starting is not asyncio.current_task():
             starting.cancel()

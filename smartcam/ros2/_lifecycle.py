@@ -145,20 +145,43 @@ class Lifecycle:
         self._heard.append(heard)
         return lambda: self._heard.remove(heard) if heard in self._heard else None
 
-    async def change(self, label: str = "", number: int = 0) -> None:
-        """Make a transition; its label counts where both are given, as in rclcpp_lifecycle.
+    async def settled(self) -> None:
+        """Wait until no transition is under way.
 
         Raises:
-            RosError: it does not begin at the present state, or one is under way.
+            RosError: one is, for longer than it may take.
+        """
+        try:
+            async with asyncio.timeout(self._timeout):
+                while self._task is not None and not self._task.done():
+                    await asyncio.wait((self._task,))
+        except TimeoutError as exc:
+            text = f"{self.name}: other transitions took {self._timeout:g} s"
+            raise RosError(text) from exc
+
+    async def change(self, label: str = "", number: int = 0) -> None:
+        """Make a transition, once none is under way.
+
+        Args:
+            label: of it; where there is one the number does not count, as in rclcpp_lifecycle.
+            number: its id.
+
+        Raises:
+            RosError: it does not begin at the present state.
             SmartCamError: it failed, which is how.
 
-        Cancellation: it goes on.
+        Cancellation: once it has begun it goes on.
         """
+        await self.settled()
         transition = self._find(label, number)
+        self._begins()
         self._enter(transition)
         self._task = asyncio.get_running_loop().create_task(self._finish(transition))
         self._task.add_done_callback(_seen)
         await asyncio.shield(self._task)
+
+    def _begins(self) -> None:
+        """A transition that was asked for begins."""
 
     async def configure(self) -> None:
         """From Unconfigured to Inactive; as :meth:`change`."""

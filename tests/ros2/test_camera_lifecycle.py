@@ -1,0 +1,339 @@
+"""The life cycle: its states and transitions, its services, and what they mean for a camera."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import smartcam
+from smartcam.exceptions import CommandRejectedError, RosError, SmartCamError
+from smartcam.ros2._lifecycle import STATES, TRANSITIONS, Lifecycle
+from tests.ros2.camerakit import COUNTER, FAST, NAME, OTHER, TYPES, NotedNode, box, seen, until
+
+WAYS = {
+    "unconfigured": [],
+    "inactive": ["configure"],
+    "active": ["configure", "activate"],
+    "finalized": ["shutdown"],
+}
+"""How to come to each state."""
+
+GOALS = {
+    ("unconfigured", "configure"): "inactive",
+    ("unconfigured", "shutdown"): "finalized",
+    ("inactive", "cleanup"): "unconfigured",
+    ("inactive", "activate"): "active",
+    ("inactive", "shutdown"): "finalized",
+    ("active", "deactivate"): "inactive",
+    ("active", "shutdown"): "finalized",
+}
+"""Of all transitions that can be asked for, as the design article has them."""
+
+LABELS = ["configure", "cleanup", "activate", "deactivate", "shutdown", "create", "destroy"]
+LABELS += ["transition_success", "transition_failure", "transition_error", "Configure", "x" * 99]
+
+
+async def _in_state(state: str, work: Any = None, timeout: float = 5.0) -> Lifecycle:
+    life = Lifecycle("/cam3", work or {}, timeout)
+    for label in WAYS[state]:
+        await life.change(label)
+    assert life.state.label == state
+    return life
+
+
+# ---------------------------------------------------------------------- the states
+
+
+def test_ids_are_those_of_lifecycle_msgs() -> None:
+    state, transition = (TYPES.message(f"lifecycle_msgs/msg/{one}").new() for one in ("State", "Transition"))
+    for one in STATES:
+        kind = "PRIMARY" if one.id < 10 else "TRANSITION"
+        assert getattr(state, f"{kind}_STATE_{one.label.upper()}") == one.id
+    for one in TRANSITIONS:
+        name = one.label.removeprefix("transition_").upper()
+        at = one.start.label
+        work = {"cleaningup": "CLEANUP", "shuttingdown": "SHUTDOWN", "errorprocessing": "ERROR"}
+        if one.id >= 10:
+            stem = work.get(at, at.upper().replace("ING", "E").replace("CONFIGURE", "CONFIGURE"))
+            name = f"ON_{stem}_{name}"
+        elif name == "SHUTDOWN":
+            name = f"{at.upper()}_SHUTDOWN"
+        assert getattr(transition, f"TRANSITION_{name}") == one.id
+    assert len({one.id for one in TRANSITIONS}) == len(TRANSITIONS) == 25
+
+
+@pytest.mark.parametrize("label", LABELS)
+@pytest.mark.parametrize("state", WAYS)
+async def test_a_transition_leads_where_it_should_or_is_refused(state: str, label: str) -> None:
+    life = await _in_state(state)
+    steps: list[str] = []
+    life.listen(lambda one: steps.append(one.goal.label))
+    goal = GOALS.get((state, label))
+    if goal is None:
+        with pytest.raises(RosError, match=rf"{label[:40]}.*it is {state}"):
+            await life.change(label)
+        assert (life.state.label, steps) == (state, [])
+        return
+    await life.change(label)
+    assert life.state.label == goal
+    assert len(steps) == 2
+    assert steps[1] == goal
+    assert life.active == (goal == "active")
+
+
+@pytest.mark.parametrize("number", range(100))
+async def test_ids_ask_for_the_same_as_labels(number: int) -> None:
+    for state in WAYS:
+        life = await _in_state(state)
+        own = [one for one in TRANSITIONS if one.id == number and one.start.label == state]
+        goal = GOALS.get((state, own[0].label)) if own else None
+        if goal is None:
+            with pytest.raises(RosError, match=f"transition {number}: it is {state}"):
+                await life.change(number=number)
+        else:
+            await life.change(number=number)
+        assert life.state.label == (goal or state)
+
+
+async def test_a_label_counts_before_an_id() -> None:
+    life = await _in_state("inactive")
+    await life.change("activate", 2)
+    assert life.active
+    with pytest.raises(RosError, match="cleanup"):
+        await life.change("cleanup", 4)
+    assert life.active
+
+
+@pytest.mark.parametrize(
+    ("error", "back", "steps"),
+    [
+        (SmartCamError("away"), "unconfigured", ["configuring", "unconfigured"]),
+        (ValueError("odd"), "unconfigured", ["configuring", "errorprocessing", "unconfigured"]),
+    ],
+)
+async def test_a_transition_that_fails_leads_back(
+    error: Exception, back: str, steps: list[str]
+) -> None:
+    async def fail() -> None:
+        raise error
+
+    life = Lifecycle("/cam3", {"configure": fail}, 5.0)
+    told: list[str] = []
+    life.listen(lambda one: told.append(one.goal.label))
+    with pytest.raises(SmartCamError, match=str(error)):
+        await life.configure()
+    assert (life.state.label, told) == (back, steps)
+
+
+async def test_a_transition_has_an_end() -> None:
+    life = Lifecycle("/cam3", {"configure": asyncio.Event().wait}, 5.0)  # type: ignore[dict-item]
+    begun = asyncio.get_running_loop().time()
+    with pytest.raises(smartcam.ResponseTimeoutError, match="configure: it took more than 5 s"):
+        await life.configure()
+    assert asyncio.get_running_loop().time() - begun == pytest.approx(5.0, abs=0.01)
+    assert life.state.label == "unconfigured"
+
+
+async def test_one_transition_at_a_time() -> None:
+    gate, running = asyncio.Event(), 0
+
+    async def work() -> None:
+        nonlocal running
+        running += 1
+        assert running == 1
+        await gate.wait()
+        running -= 1
+
+    life = Lifecycle("/cam3", {"configure": work, "cleanup": work}, 5.0)
+    tasks = [asyncio.create_task(life.configure()) for _ in range(3)]
+    cleanup = asyncio.create_task(life.cleanup())
+    await asyncio.sleep(1.0)
+    assert life.state.label == "configuring"
+    gate.set()
+    outcomes = await asyncio.gather(*tasks, cleanup, return_exceptions=True)
+    assert outcomes[0] is None
+    assert all(isinstance(one, RosError) for one in outcomes[1:3])
+    assert outcomes[3] is None
+    assert life.state.label == "unconfigured"
+
+
+async def test_who_gives_up_does_not_end_a_transition() -> None:
+    gate = asyncio.Event()
+    life = Lifecycle("/cam3", {"configure": gate.wait}, 5.0)  # type: ignore[dict-item]
+    asking = asyncio.create_task(life.configure())
+    await asyncio.sleep(0.1)
+    asking.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asking
+    assert life.state.label == "configuring"
+    gate.set()
+    await life.settled()
+    assert life.state.label == "inactive"
+
+
+async def test_closing_gives_up_what_is_under_way() -> None:
+    life = Lifecycle("/cam3", {"configure": asyncio.Event().wait}, 5.0)  # type: ignore[dict-item]
+    told: list[str] = []
+    life.listen(lambda one: told.append(one.goal.label))
+    asking = asyncio.create_task(life.configure())
+    waiting = asyncio.create_task(life.shutdown())
+    await asyncio.sleep(0.1)
+    await life.close()
+    await life.close()
+    assert told == ["configuring", "unconfigured", "shuttingdown", "finalized"]
+    with pytest.raises(asyncio.CancelledError):
+        await asking
+    with pytest.raises(RosError, match="it is closed"):
+        await waiting
+
+
+async def test_who_is_told_may_fail_and_may_leave(caplog: pytest.LogCaptureFixture) -> None:
+    life = Lifecycle("/cam3", {}, 5.0)
+    told: list[str] = []
+
+    def fail(_: object) -> None:
+        raise ValueError("mine")
+
+    life.listen(fail)
+    leave = life.listen(lambda one: told.append(one.goal.label))
+    await life.configure()
+    leave()
+    leave()
+    await life.activate()
+    assert told == ["configuring", "inactive"]
+    assert "mine" in caplog.text
+    assert life.active
+
+
+# ---------------------------------------------------------------------- of a camera
+
+
+async def test_services_tell_the_states_and_the_ways_between_them() -> None:
+    async with seen(autostart=False) as one:
+        call = one.node.services
+        state = (await call["~/get_state"].call()).current_state
+        assert (state.id, state.label) == (1, "unconfigured")
+        states = (await call["~/get_available_states"].call()).available_states
+        assert [(each.id, each.label) for each in states] == list(STATES)
+        graph = (await call["~/get_transition_graph"].call()).available_transitions
+        assert [each.transition.id for each in graph] == [each.id for each in TRANSITIONS]
+        ways = (await call["~/get_available_transitions"].call()).available_transitions
+        assert [(each.transition.id, each.transition.label) for each in ways] == [
+            (1, "configure"),
+            (5, "shutdown"),
+        ]
+        assert await one.node.change("configure")
+        assert await one.node.change(number=3)
+        assert not await one.node.change("configure")
+        assert one.seen.lifecycle.active
+        assert one.node.steps() == [
+            ("unconfigured", "configuring"),
+            ("configuring", "inactive"),
+            ("inactive", "activating"),
+            ("activating", "active"),
+        ]
+        event = one.node.last("~/transition_event")
+        assert (event.transition.id, event.transition.label) == (30, "transition_success")
+        assert event.timestamp > 0
+
+
+async def test_it_becomes_active_by_itself() -> None:
+    async with seen() as one:
+        await until(lambda: one.seen.lifecycle.active)
+        assert one.node.steps()[-1] == ("activating", "active")
+        assert await one.node.change("deactivate")
+        await asyncio.sleep(3600)
+        assert one.state == "inactive"  # it is somebody's wish
+
+
+async def test_it_waits_for_a_camera_that_is_away() -> None:
+    emulated = box()
+    async with emulated:
+        async with smartcam.connect(emulated.url, name=NAME, reconnect=FAST) as camera:
+            emulated.inject({"kind": "refuse", "seconds": 500})
+            emulated.inject({"kind": "close"})
+            await until(lambda: not camera.connected)
+            node = NotedNode()
+            async with smartcam.ros2._camera_node.CameraNode(camera, node) as made:
+                await asyncio.sleep(400)
+                assert node.steps() == []  # it asks for nothing in vain
+                await until(lambda: made.lifecycle.active, 200)
+                assert len(node.steps()) == 4
+
+
+async def test_who_takes_over_has_it() -> None:
+    """What starts by itself ends where somebody asks for something."""
+    async with seen() as one:
+        one.box.inject({"kind": "refuse", "seconds": 60}, {"kind": "close"})
+        await until(lambda: not one.camera.connected)
+    emulated = box()
+    async with seen(emulated, client={"connect_timeout": 2.0}, autostart=True) as one:
+        emulated.inject({"kind": "refuse", "seconds": 60}, {"kind": "close"})
+        await until(lambda: not one.camera.connected)
+        while one.state != "unconfigured":
+            assert await one.node.change("deactivate" if one.seen.lifecycle.active else "cleanup")
+        begun = asyncio.get_running_loop().time()
+        assert not await one.node.change("configure")
+        assert asyncio.get_running_loop().time() - begun == pytest.approx(2.0, abs=0.1)
+        await asyncio.sleep(200)
+        assert one.camera.connected
+        assert one.state == "unconfigured"
+
+
+async def test_configure_has_the_application_running_and_ready() -> None:
+    async with seen(box(running=False), application=OTHER, autostart=False) as one:
+        assert one.camera.active_application == COUNTER
+        await one.seen.lifecycle.configure()
+        assert one.camera.active_application == OTHER
+        assert smartcam.Status.RUNNING in one.camera.status
+        sent = one.camera.statistics().frames_sent
+        await one.seen.lifecycle.cleanup()
+        await one.seen.lifecycle.configure()
+        assert one.camera.statistics().frames_sent - sent <= 2  # nothing is switched again
+
+
+async def test_an_application_that_is_refused_is_not_tried_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Each try would stop a camera that others use."""
+    async with seen(application=99) as one:
+        await asyncio.sleep(3600)
+        assert one.node.steps() == [
+            ("unconfigured", "configuring"),
+            ("configuring", "unconfigured"),
+        ]
+        assert "refused to switch to application 99" in caplog.text
+        assert not await one.node.change("configure")
+        with pytest.raises(CommandRejectedError):
+            await one.seen.lifecycle.configure()
+
+
+async def test_a_camera_that_stays_busy_fails_in_time() -> None:
+    async with seen(application=OTHER, autostart=False, client={"switch_timeout": 3.0}) as one:
+        one.box.inject({"kind": "busy_for_ever"})
+        with pytest.raises(smartcam.ResponseTimeoutError):
+            await one.seen.lifecycle.configure()
+        assert one.state == "unconfigured"
+
+
+async def test_a_camera_that_is_lost_leaves_it_active() -> None:
+    async with seen() as one:
+        await until(lambda: one.seen.lifecycle.active)
+        one.box.inject({"kind": "reset"})
+        await until(lambda: one.camera.statistics().reconnects == 1)
+        assert one.seen.lifecycle.active
+        for label in ("deactivate", "cleanup", "shutdown"):
+            assert await one.node.change(label)
+        assert one.camera.connected  # the camera is its owner's
+        assert one.state == "finalized"
+
+
+async def test_a_node_of_ros_1_has_a_life_cycle_without_services() -> None:
+    async with seen(node=NotedNode(ros1=True)) as one:
+        await until(lambda: one.seen.lifecycle.active)
+        assert not [name for name in one.node.services if name.endswith("_state")]
+        assert "~/transition_event" not in one.node.topics
+        await one.seen.lifecycle.deactivate()
+        assert one.state == "inactive"
