@@ -167,6 +167,7 @@ async def seen(
         smartcam.connect(one.url, **settings) as camera,
         CameraNode(camera, node, options=CameraNodeOptions(**options)) as made,
     ):
+        await until(lambda: node.topics["/diagnostics"].said)
         yield Seen(one, camera, node, made)
 
 
@@ -174,4 +175,17 @@ async def until(true: Callable[[], object], seconds: float = 60.0) -> None:
     """Wait until something is true."""
     async with asyncio.timeout(seconds):
         while not true():  # noqa: ASYNC110 - of what nothing tells
-            await asyncio.sleep(0.001)
+            await asyncio.sleep(0.02)
+
+
+@contextlib.asynccontextmanager
+async def away(seconds: float, **options: Any) -> AsyncIterator[Seen]:
+    """Give a camera that is seen in ROS while it is away, for so long."""
+    node, retry = NotedNode(), Backoff(initial=5.0, maximum=5.0, jitter=0.0)
+    settings: dict[str, Any] = {"name": NAME, "reconnect": retry, "connect_timeout": 2.0}
+    async with box() as emulated, smartcam.connect(emulated.url, **settings) as camera:
+        emulated.inject({"kind": "refuse", "seconds": seconds}, {"kind": "close"})
+        await until(lambda: not camera.connected)
+        async with CameraNode(camera, node, options=CameraNodeOptions(**options)) as made:
+            await until(lambda: node.topics["/diagnostics"].said)
+            yield Seen(emulated, camera, node, made)
