@@ -66,7 +66,7 @@ async def test_a_plant_is_seen_and_used_from_ros() -> None:
             message = await soon(anext(poses))
             assert message.header.frame_id == "line_1_cam2"
             assert [(one.position.x, one.position.y) for one in message.poses] == [
-                pytest.approx((one.pose.x, one.pose.y)) for one in result.value
+                pytest.approx((one.pose.position.x, one.pose.position.y)) for one in result.value
             ]
         assert not others.statistics().offered
 
