@@ -169,11 +169,12 @@ class CameraLifecycle(Lifecycle):
 
     async def close(self) -> None:
         """End it; others are told, and then it serves no more. Idempotent."""
+        self.closed = True
         starting, self._starting = self._starting, None
-        if starting is not None:
-            starting.cancel()
-            await asyncio.wait((starting,))
         try:
+            if starting is not None:
+                starting.cancel()
+                await asyncio.wait((starting,))
             await super().close()
         finally:
             ends, self._ends = self._ends, []
