@@ -86,5 +86,6 @@ def _field(name: str, said: Any) -> MessageField:
         said, size = said[1]
     if said[0] == _NAME:
         return MessageField(name, said[1], shape, size)
+    kind: str
     kind, limit = said[1]
     return MessageField(name, OTHER_NAMES.get(kind, kind), shape, size, limit)

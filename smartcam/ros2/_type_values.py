@@ -25,7 +25,7 @@ class RosMessage:
     ``uint8[]``.
     """
 
-    __slots__ = ()
+    __slots__: tuple[str, ...] = ()
     __msgtype__: ClassVar[str] = ""
     __hash__ = None  # type: ignore[assignment]
 
