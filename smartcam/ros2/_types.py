@@ -21,7 +21,14 @@ from smartcam.ros2._type_definitions import (
 )
 from smartcam.ros2._type_hash import NOT_SUPPORTED, event_of, service_of, type_hash
 from smartcam.ros2._type_stores import LACKING, WITHOUT_HASHES, read_stored, stored
-from smartcam.ros2._type_values import check, filled, message_class
+from smartcam.ros2._type_values import (
+    LocatedError,
+    check,
+    filled,
+    message_class,
+    rule_of,
+    zero_maker,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,7 +64,8 @@ class MessageType:
         fields: name, type, shape, bounds and default of each field.
         constants: by name; attributes of ``cls``, too.
         nested: the types of the messages within by name.
-        cls: the class of its messages, made with all fields in their order.
+        cls: the class of its messages, made with all fields in their order and looked at when they
+            are encoded: the fastest way.
     """
 
     def __init__(
@@ -80,6 +88,16 @@ class MessageType:
         return self._get_hash()
 
     @functools.cached_property
+    def zero(self) -> Callable[[], RosMessage]:
+        """The function that makes a message of defaults and zeros."""
+        return zero_maker(self)
+
+    @functools.cached_property
+    def rules(self) -> dict[str, tuple[MessageField, Callable[[Any], Any]]]:
+        """Each field by its name in Python, and what a value for it has to stand."""
+        return {field.attribute: (field, rule_of(self, field)) for field in self.fields}
+
+    @functools.cached_property
     def _encode(self) -> Callable[[Any], bytes]:
         return encoder(self)
 
@@ -95,7 +113,7 @@ class MessageType:
         Raises:
             RosMessageError: there is no such field, or a value does not fit.
         """
-        return filled(self, fields)
+        return self._filled(fields)
 
     def encode(self, message: Any) -> bytes:
         """Return a message, or a mapping of its fields, in CDR: little-endian, with encapsulation.
@@ -104,15 +122,27 @@ class MessageType:
             RosMessageError: it is of another type, or a field does not fit.
         """
         if isinstance(message, Mapping):
-            message = filled(self, message)
+            message = self._filled(message)
         elif getattr(message, "__msgtype__", None) != self.name:
             got = getattr(message, "__msgtype__", type(message).__name__)
             raise RosMessageError(f"{self.name}: expected a message of this type, got {got}")
         try:
             return self._encode(message)
         except _MISFITS as exc:
+            raise RosMessageError(f"{self.name}: {self._reason(message) or exc}") from exc
+
+    def _filled(self, fields: Mapping[str, Any]) -> Any:
+        try:
+            return filled(self, fields)
+        except LocatedError as exc:
+            raise RosMessageError(f"{self.name}: {exc}") from exc
+
+    def _reason(self, message: Any) -> str:
+        try:
             check(self, message)
-            raise RosMessageError(f"{self.name}: a field does not fit: {exc}") from exc
+        except LocatedError as exc:
+            return str(exc)
+        return ""
 
     def decode(self, data: bytes | bytearray | memoryview) -> Any:
         """Return the message of CDR, little- or big-endian.
