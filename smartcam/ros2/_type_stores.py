@@ -76,7 +76,8 @@ def read_stored(name: str, said: Any) -> Definition:
             if isinstance(default, str):
                 default = constants.get(default)
             fields.append(_field(one, kind)._replace(default=default))
-    return Definition(name, tuple(fields), constants)
+    kinds = {one: OTHER_NAMES.get(kind, kind) for one, kind, _ in said[0]}
+    return Definition(name, tuple(fields), constants, kinds)
 
 
 def _field(name: str, said: Any) -> MessageField:

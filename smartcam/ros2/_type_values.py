@@ -38,6 +38,10 @@ class RosMessage:
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
+_LONG = 16
+"""What is longer is not shown whole."""
+
+
 def _same(one: Any, other: Any) -> bool:
     if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
         if isinstance(one, bytes | bytearray | memoryview):
@@ -50,10 +54,10 @@ def _same(one: Any, other: Any) -> bool:
 
 def _shown(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        text = ", ".join(map(str, value[:4].tolist()))
-        return f"[{text}{f', ... {len(value)}' if len(value) > 4 else ''}]"
-    if isinstance(value, bytes | bytearray | memoryview) and len(value) > 16:
-        return f"<{len(value)} bytes>"
+        text = ", ".join(map(str, value[:_LONG].tolist()))
+        return f"[{text}{f', ... of {len(value)}' if len(value) > _LONG else ''}]"
+    if isinstance(value, bytes | bytearray | memoryview | list | tuple) and len(value) > _LONG:
+        return f"<{type(value).__name__} of {len(value)}>"
     return repr(value)
 
 
@@ -229,9 +233,9 @@ def _flag(value: Any) -> bool:
 
 def _integer(code: str) -> Callable[[Any], int]:
     def rule(value: Any) -> int:
-        value = operator.index(value)
-        pack(value)
-        return value
+        number = operator.index(value)
+        pack(number)
+        return number
 
     pack = struct.Struct(f"<{code}").pack
     return rule

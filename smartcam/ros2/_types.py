@@ -19,7 +19,13 @@ from smartcam.ros2._type_definitions import (
     parse_service,
     split_name,
 )
-from smartcam.ros2._type_hash import NOT_SUPPORTED, event_of, service_of, type_hash
+from smartcam.ros2._type_hash import (
+    NOT_SUPPORTED,
+    description,
+    event_of,
+    hash_of_description,
+    service_of,
+)
 from smartcam.ros2._type_stores import LACKING, WITHOUT_HASHES, read_stored, stored
 from smartcam.ros2._type_values import (
     LocatedError,
@@ -69,7 +75,7 @@ class MessageType:
     """
 
     def __init__(
-        self, definition: Definition, nested: Mapping[str, MessageType], get_hash: Callable[[], str]
+        self, definition: Definition, nested: Mapping[str, MessageType], types: RosTypes
     ) -> None:
         self.name = definition.name
         self.dds = dds_name(definition.name)
@@ -77,7 +83,8 @@ class MessageType:
         self.constants = dict(definition.constants)
         self.nested = nested
         self.cls: type[RosMessage] = message_class(definition)
-        self._get_hash = get_hash
+        self._definition = definition
+        self._types = types
 
     def __repr__(self) -> str:
         return f"<MessageType {self.name}>"
@@ -85,7 +92,23 @@ class MessageType:
     @functools.cached_property
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
-        return self._get_hash()
+        return self._types.hash_of(self._definition)
+
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(self._definition, self._types.definition)
+
+    @functools.cached_property
+    def text(self) -> str:
+        """Its definition and those of all messages within, as recordings have it (``ros2msg``)."""
+        within = description(self._definition, self._types.definition)
+        parts = [self._definition.text()]
+        for one in within["referenced_type_descriptions"]:
+            name: str = one["type_name"]
+            head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
+            parts.append(head + self._types.definition(name).text())
+        return "".join(parts)
 
     @functools.cached_property
     def zero(self) -> Callable[[], RosMessage]:
@@ -201,6 +224,11 @@ class ServiceType:
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
         return self._types.hash_of(service_of(self.name))
+
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(service_of(self.name), self._types.definition)
 
     @functools.cached_property
     def event(self) -> MessageType:
@@ -335,8 +363,7 @@ class RosTypes:
                 nested = {
                     one: self.message_of(one, (*within, name)) for one in sorted(definition.needs())
                 }
-                get_hash = functools.partial(self.hash_of, definition)
-                made = self._messages[name] = MessageType(definition, nested, get_hash)
+                made = self._messages[name] = MessageType(definition, nested, self)
         return made
 
     def _service_text(self, name: str) -> str | None:
@@ -348,7 +375,7 @@ class RosTypes:
         """Return a type's hash."""
         if self.distribution in WITHOUT_HASHES:
             return NOT_SUPPORTED
-        return type_hash(definition, self.definition)
+        return hash_of_description(description(definition, self.definition))
 
     def _unknown(self, name: str) -> ConfigurationError:
         close = did_you_mean(name, self.names())

@@ -165,5 +165,5 @@ def test_fields_of_services_are_the_thesis() -> None:
         ("string", "feature_id"),
         ("float32", "quality"),
         ("int32", "photo_index"),
-        ("geometry_msgs/msg/PoseStamped", "pose"),
+        ("geometry_msgs/PoseStamped", "pose"),
     ]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from smartcam.ros2._types import MessageType, RosTypes
-from tests.ros2.typekit import ASCII, add_test_msgs, drawn, text_of
+from tests.ros2.typekit import ASCII, add_test_msgs, drawn
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,7 +68,7 @@ def judge(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def judged(folder: Path, cases: list[tuple[MessageType, bytes]]) -> list[dict[str, str]]:
     """Return what the judge makes of each."""
     asked = [
-        json.dumps({"text": text_of(kind), "bytes": base64.b64encode(data).decode()})
+        json.dumps({"text": kind.text, "bytes": base64.b64encode(data).decode()})
         for kind, data in cases
     ]
     got = tool("node")(str(JUDGE), str(folder), text="\n".join(asked) + "\n")
