@@ -76,7 +76,7 @@ def read_stored(name: str, said: Any) -> Definition:
             if isinstance(default, str):
                 default = constants.get(default)
             fields.append(_field(one, kind)._replace(default=default))
-    kinds = {one: OTHER_NAMES.get(kind, kind) for one, kind, _ in said[0]}
+    kinds: dict[str, str] = {one: str(OTHER_NAMES.get(kind, kind)) for one, kind, _ in said[0]}
     return Definition(name, tuple(fields), constants, kinds)
 
 
