@@ -185,7 +185,7 @@ class RosClient(RosEnd):
     @property
     def served(self) -> bool:
         """Whether somebody serves it, as far as is known."""
-        return not self._closed and bool(self._querier.matching_status)
+        return not self._closed and bool(self._querier.matching_status.matching)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
         """Wait until somebody serves it.
