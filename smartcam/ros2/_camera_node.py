@@ -13,6 +13,8 @@ from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.ros2._camera_lifecycle import CameraLifecycle
 from smartcam.ros2._camera_parameters import CameraParameters
+from smartcam.ros2._camera_results import CameraResults
+from smartcam.ros2._camera_services import CameraServices
 from smartcam.ros2._camera_status import CameraStatus
 
 if TYPE_CHECKING:
@@ -80,6 +82,8 @@ class CameraNodeOptions:
 PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
     lambda one: CameraParameters.of(one.camera, one.node, one.options, one.status),
     lambda one: one.status,
+    lambda one: one.results,
+    lambda one: one.services,
     lambda one: one.lifecycle,
 )
 """What a node is made of, in the order in which it starts; the life cycle is the last, so that what
@@ -116,6 +120,10 @@ class CameraNode(Server):
         self.status: CameraStatus = CameraStatus(
             camera, node, self.options, lambda: self.lifecycle.state.label
         )
+        self.results: CameraResults = CameraResults(camera, node, frame_id=self.frame_id)
+        self.results.active = False
+        self.services: CameraServices = CameraServices(camera, node, self.results, self.lifecycle)
+        self.lifecycle.listen(self._on_transition)
         self._stack: contextlib.AsyncExitStack | None = None
         self._turn = asyncio.Lock()
 
@@ -123,6 +131,9 @@ class CameraNode(Server):
     def frame_id(self) -> str:
         """The frame of what it sees."""
         return self.options.frame_id or self.camera.name
+
+    def _on_transition(self, _: object) -> None:
+        self.results.active = self.lifecycle.active
 
     async def start(self) -> None:
         """Open the node, and begin with all that it is made of.
