@@ -13,7 +13,7 @@ from smartcam.exceptions import RosError
 from smartcam.ros2._qos import QoS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from smartcam.ros2._node import Node
     from smartcam.ros2._topics import RosPublisher
@@ -143,7 +143,7 @@ class _Handler(logging.Handler):
         with _inside():
             try:
                 self._take(record)
-            except Exception:
+            except Exception:  # noqa: BLE001 - as handlers of logging do
                 self.handleError(record)
 
 
@@ -151,7 +151,7 @@ _here = threading.local()
 
 
 @contextlib.contextmanager
-def _inside():  # noqa: ANN202
+def _inside() -> Iterator[None]:
     before = getattr(_here, "inside", False)
     _here.inside = True
     try:
@@ -166,7 +166,7 @@ _formatter: Final = logging.Formatter()
 def _text(record: logging.LogRecord) -> str:
     try:
         return _formatter.format(record)
-    except Exception as exc:  # what was logged is somebody else's
+    except Exception as exc:  # noqa: BLE001 - what was logged is somebody else's
         return f"{record.msg!s} ({type(exc).__name__}: {exc})"
 
 
