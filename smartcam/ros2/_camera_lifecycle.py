@@ -23,7 +23,6 @@ from smartcam.ros2._lifecycle import (
 )
 
 if TYPE_CHECKING:
-
     from smartcam.camera import Camera
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")

@@ -157,4 +157,4 @@ class CameraParameters:
         if not camera.connected or await camera.query_application() != application:
             await camera.switch_application(application, timeout=limit)
         else:
-            await camera.wait_ready(limit)
+            await camera.wait_status(lambda status: not status.loading, limit)

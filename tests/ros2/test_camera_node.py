@@ -28,8 +28,9 @@ LIFE = "lifecycle_msgs/srv/"
 
 
 class Meeting(NamedTuple):
-    """A camera in ROS, and a node of somebody else."""
+    """A camera in ROS, and a node of somebody else, who listens at ``place``."""
 
+    place: str
     box: Any
     camera: Any
     seen: CameraNode
@@ -58,7 +59,7 @@ async def meeting(**options: Any) -> AsyncIterator[Meeting]:
         node = Node("cam3", namespace="/line1", connect=place, domain=7)
         made = CameraNode(one, node, options=CameraNodeOptions(**options))
         async with Node("viewer", listen=place, domain=7) as viewer, made:
-            yield Meeting(emulated, one, made, viewer)
+            yield Meeting(place, emulated, one, made, viewer)
 
 
 @pytest.mark.real_time
@@ -117,9 +118,11 @@ async def test_nothing_of_it_stays_in_the_graph() -> None:
         await until(lambda: not graph.of_node(FULL))
         await one.seen.stop()
         assert one.camera.connected
-        await one.seen.start()  # and again
-        await until(lambda: one.seen.lifecycle.active)
-        assert await one.state() == "active"
+        again = Node("cam3", namespace="/line1", connect=one.place, domain=7)
+        async with CameraNode(one.camera, again) as made:
+            await until(lambda: made.lifecycle.active)
+            assert await one.state() == "active"
+        await until(lambda: not graph.of_node(FULL))
 
 
 @pytest.mark.real_time
