@@ -6,7 +6,6 @@ Services and topic are those of rcl_lifecycle (``com_interface.c``).
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 import time
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,8 @@ from smartcam.ros2._lifecycle import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from smartcam.camera import Camera
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
@@ -79,36 +80,38 @@ class CameraLifecycle(Lifecycle):
         limit = settings.connect_timeout + 2 * settings.switch_timeout + settings.request_timeout
         super().__init__(node.full_name, {"configure": self._have_camera}, limit)
 
-    def start(self) -> None:
+    async def start(self) -> None:
         """Serve, and go to Active by itself where that is wanted."""
         if is_managed(self._node):
-            self._declare()
+            await self._declare()
         if self._autostart:
             self._starting = asyncio.get_running_loop().create_task(self._start_up())
 
-    def _declare(self) -> None:
-        self._event = self._node.publisher(
-            "~/transition_event", "lifecycle_msgs/msg/TransitionEvent"
-        )
-        self._ends.append(self._event)
+    async def _declare(self) -> None:
+        event = self._node.publisher("~/transition_event", "lifecycle_msgs/msg/TransitionEvent")
+        self._ends.append(event)
+        self._event = event
         self.listen(self._say)
-        self._serve("ChangeState", "change_state", self._on_change_state)
-        self._serve("GetState", "get_state", lambda: {"current_state": self.state._asdict()})
-        self._serve(
-            "GetAvailableStates",
-            "get_available_states",
-            lambda: {"available_states": [one._asdict() for one in STATES]},
-        )
+        for name, (kind, handler) in self._services().items():
+            self._ends.append(self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler))
+            await asyncio.sleep(0)  # to declare takes the engine a while
+
+    def _services(self) -> dict[str, tuple[str, Callable[[Any], Awaitable[Any]]]]:
+        def told(fields: Callable[[], dict[str, Any]]) -> Callable[[Any], Awaitable[Any]]:
+            async def answer(_request: object) -> dict[str, Any]:
+                return fields()
+
+            return answer
+
+        states = {"available_states": [one._asdict() for one in STATES]}
         ways = "GetAvailableTransitions"
-        self._serve(ways, "get_available_transitions", lambda: _described(self.available))
-        self._serve(ways, "get_transition_graph", lambda: _described(TRANSITIONS))
-
-    def _serve(self, kind: str, name: str, what: Any) -> None:
-        async def answer(_request: object) -> Any:
-            return what()
-
-        handler = what if inspect.iscoroutinefunction(what) else answer
-        self._ends.append(self._node.serve(f"~/{name}", f"lifecycle_msgs/srv/{kind}", handler))
+        return {
+            "change_state": ("ChangeState", self._on_change_state),
+            "get_state": ("GetState", told(lambda: {"current_state": self.state._asdict()})),
+            "get_available_states": ("GetAvailableStates", told(lambda: states)),
+            "get_available_transitions": (ways, told(lambda: _described(self.available))),
+            "get_transition_graph": (ways, told(lambda: _described(TRANSITIONS))),
+        }
 
     async def _on_change_state(self, request: Any) -> dict[str, Any]:
         wanted = request.transition

@@ -111,7 +111,8 @@ class CameraNode(Server):
     def __init__(
         self, camera: Camera[Any], node: Any, *, options: CameraNodeOptions | None = None
     ) -> None:
-        self.camera, self.node = camera, node
+        self.camera: Camera[Any] = camera
+        self.node: Any = node
         self.options: CameraNodeOptions = options or CameraNodeOptions()
         self.lifecycle: CameraLifecycle
         self.status: CameraStatus
@@ -162,6 +163,7 @@ class CameraNode(Server):
                         begun = part.start()
                         if inspect.isawaitable(begun):
                             await begun
+                        await asyncio.sleep(0)  # to declare takes the engine a while
                 self._stack = stack.pop_all()
 
     async def stop(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import smartcam
 from smartcam.exceptions import CommandRejectedError, RosError, SmartCamError
-from smartcam.ros2._lifecycle import STATES, TRANSITIONS, Lifecycle
+from smartcam.ros2._lifecycle import PRIVATE, STATES, TRANSITIONS, Lifecycle
 from tests.ros2.camerakit import COUNTER, OTHER, TYPES, NotedNode, away, box, seen, until
 
 WAYS = {
@@ -32,6 +32,16 @@ GOALS = {
 }
 """Of all transitions that can be asked for, as the design article has them."""
 
+STEMS = {
+    "configuring": "CONFIGURE",
+    "cleaningup": "CLEANUP",
+    "activating": "ACTIVATE",
+    "deactivating": "DEACTIVATE",
+    "shuttingdown": "SHUTDOWN",
+    "errorprocessing": "ERROR",
+}
+"""What lifecycle_msgs calls that which follows these states."""
+
 LABELS = ["configure", "cleanup", "activate", "deactivate", "shutdown", "create", "destroy"]
 LABELS += ["transition_success", "transition_failure", "transition_error", "Configure", "x" * 99]
 
@@ -48,22 +58,18 @@ async def _in_state(state: str, work: Any = None, timeout: float = 5.0) -> Lifec
 
 
 def test_ids_are_those_of_lifecycle_msgs() -> None:
-    state, transition = (
-        TYPES.message(f"lifecycle_msgs/msg/{one}").new() for one in ("State", "Transition")
-    )
-    for one in STATES:
-        kind = "PRIMARY" if one.id < 10 else "TRANSITION"
-        assert getattr(state, f"{kind}_STATE_{one.label.upper()}") == one.id
+    states = TYPES.message("lifecycle_msgs/msg/State").new()
+    for state in STATES:
+        kind = "PRIMARY" if state.id < PRIVATE else "TRANSITION"
+        assert getattr(states, f"{kind}_STATE_{state.label.upper()}") == state.id
+    transitions = TYPES.message("lifecycle_msgs/msg/Transition").new()
     for one in TRANSITIONS:
         name = one.label.removeprefix("transition_").upper()
-        at = one.start.label
-        work = {"cleaningup": "CLEANUP", "shuttingdown": "SHUTDOWN", "errorprocessing": "ERROR"}
-        if one.id >= 10:
-            stem = work.get(at, at.upper().replace("ING", "E").replace("CONFIGURE", "CONFIGURE"))
-            name = f"ON_{stem}_{name}"
+        if one.id >= PRIVATE:
+            name = f"ON_{STEMS[one.start.label]}_{name}"
         elif name == "SHUTDOWN":
-            name = f"{at.upper()}_SHUTDOWN"
-        assert getattr(transition, f"TRANSITION_{name}") == one.id
+            name = f"{one.start.label.upper()}_SHUTDOWN"
+        assert getattr(transitions, f"TRANSITION_{name}") == one.id
     assert len({one.id for one in TRANSITIONS}) == len(TRANSITIONS) == 25
 
 

@@ -43,6 +43,12 @@ class Meeting(NamedTuple):
         finally:
             client.close()
 
+    async def lose(self, seconds: float) -> None:
+        """Have the camera away for so long."""
+        self.box.inject({"kind": "refuse", "seconds": seconds}, {"kind": "close"})
+        with pytest.raises(SmartCamError):
+            await self.camera.query_application()
+
     async def state(self) -> str:
         reply = await self.call("get_state", f"{LIFE}GetState")
         return str(reply.current_state.label)
@@ -128,8 +134,7 @@ async def test_nothing_of_it_stays_in_the_graph() -> None:
 @pytest.mark.real_time
 async def test_a_client_that_is_gone_in_the_middle_of_a_transition() -> None:
     async with meeting(autostart=False) as one:
-        one.box.inject({"kind": "refuse", "seconds": 60.0}, {"kind": "close"})
-        await until(lambda: not one.camera.connected)
+        await one.lose(60.0)
         client = one.viewer.client(f"{FULL}/change_state", f"{LIFE}ChangeState")
         asking = asyncio.create_task(client.call(transition={"label": "configure"}, timeout=60))
         await until(lambda: one.seen.lifecycle.state.label == "configuring")
@@ -144,8 +149,7 @@ async def test_a_client_that_is_gone_in_the_middle_of_a_transition() -> None:
 @pytest.mark.real_time
 async def test_closing_in_the_middle_of_a_transition() -> None:
     async with meeting(autostart=False) as one:
-        one.box.inject({"kind": "refuse", "seconds": 60.0}, {"kind": "close"})
-        await until(lambda: not one.camera.connected)
+        await one.lose(60.0)
         asking = asyncio.create_task(one.change("configure"))
         await until(lambda: one.seen.lifecycle.state.label == "configuring")
         await one.seen.stop()
