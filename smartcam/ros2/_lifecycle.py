@@ -220,7 +220,7 @@ class Lifecycle:
         for one in possible:
             if not self.closed and (one.label == label if label else one.id == number):
                 return one
-        wanted = label[:40] or f"transition {number}"
+        wanted = repr(label[:40]) if label else f"transition {number}"
         ways = ", ".join(f"{one.label} ({one.id})" for one in possible) or "nothing"
         state = "closed" if self.closed else self.state.label
         raise RosError(f"{self.name}: {wanted}: it is {state}, where {ways} can be asked for")
@@ -254,6 +254,8 @@ class Lifecycle:
 
     def _enter(self, transition: LifecycleTransition) -> None:
         self.state = transition.goal
+        if self.state.id < PRIVATE:
+            logger.info("%s = %s", self.name, self.state.label)
         for heard in tuple(self._heard):
             try:
                 heard(transition)

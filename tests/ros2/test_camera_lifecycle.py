@@ -7,6 +7,8 @@ import itertools
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import CommandRejectedError, RosError, SmartCamError
@@ -213,6 +215,55 @@ async def test_who_is_told_may_fail_and_may_leave(caplog: pytest.LogCaptureFixtu
     assert told == ["configuring", "inactive"]
     assert "mine" in caplog.text
     assert life.active
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(LABELS[:5]),
+            st.sampled_from([0.0, 0.5, 1.5]),  # when it is asked for, after the one before
+            st.sampled_from([None, 0.2, 1.2]),  # when who asks gives up
+            st.sampled_from(["done", "refused", "broken", "endless"]),
+        ),
+        max_size=8,
+    )
+)
+async def test_whatever_is_asked_for_it_goes_step_by_step(asked: list[Any]) -> None:
+    outcomes = iter([one[3] for one in asked])
+    running = 0
+
+    async def work() -> None:
+        nonlocal running
+        assert running == 0
+        running = 1
+        try:
+            outcome = next(outcomes)
+            await asyncio.sleep(100 if outcome == "endless" else 1.0)
+            if outcome == "refused":
+                raise SmartCamError("no")
+            if outcome == "broken":
+                raise ValueError("odd")
+        finally:
+            running = 0
+
+    life = Lifecycle("/cam3", dict.fromkeys(LABELS[:5], work), 3.0)
+    steps: list[Any] = []
+    life.listen(steps.append)
+    tasks = []
+    for label, pause, patience, _ in asked:
+        await asyncio.sleep(pause)
+        task = asyncio.create_task(life.change(label))
+        if patience is not None:
+            asyncio.get_running_loop().call_later(patience, task.cancel)
+        tasks.append(task)
+    await asyncio.gather(*tasks, return_exceptions=True)
+    await life.settled()
+    assert life.state.id < PRIVATE
+    assert all(before.goal is after.start for before, after in itertools.pairwise(steps))
+    assert set(steps) <= set(TRANSITIONS)
+    assert life.state is (steps[-1].goal if steps else STATES[1])
+    await life.close()
+    assert life.state.label == "finalized"
 
 
 # ---------------------------------------------------------------------- of a camera

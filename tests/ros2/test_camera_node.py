@@ -310,6 +310,22 @@ async def test_a_camera_of_a_fleet_whose_agent_goes_and_comes() -> None:
             await until(lambda: node.last("~/status").ready)
 
 
+async def test_an_application_waits_for_who_has_reserved_the_camera() -> None:
+    async with Plant() as plant, plant.cameras(2, switch_timeout=1.0) as (ours, theirs):
+        made = CameraNode(ours, NotedNode(), options=CameraNodeOptions(application=1))
+        async with theirs.reserve():
+            await theirs.switch_application(2)
+            await made.start()
+            await asyncio.sleep(30)
+            with pytest.raises(smartcam.ResponseTimeoutError, match="reserved"):
+                await made.lifecycle.configure()
+            assert made.lifecycle.state.label == "unconfigured"
+            assert await theirs.query_application() == 2
+        await made.lifecycle.configure()
+        assert ours.active_application == 1
+        await made.stop()
+
+
 async def test_a_node_does_not_disconnect_other_programs() -> None:
     async with Plant() as plant, plant.cameras(2) as (ours, theirs):
         made = CameraNode(ours, NotedNode())
