@@ -1,0 +1,302 @@
+"""What goes into a bag of each thing that a client saw, or that a recording holds."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.models import (
+    ApplicationChanged,
+    CameraEvent,
+    Connected,
+    Disconnected,
+    Localization,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+)
+from smartcam.observers import TraceEntry
+from smartcam.recording._bag import Topic
+from smartcam.recording._bag_messages import (
+    DETECTIONS,
+    DIAGNOSTICS,
+    ERROR,
+    OK,
+    POSE_ARRAY,
+    RESULT,
+    STATUS,
+    WARN,
+    detections,
+    diagnostics,
+    localizations,
+    parts_of,
+    result_fields,
+    ros_name,
+    status_fields,
+)
+from smartcam.recording._form import RecordedError, nanoseconds
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from datetime import datetime
+
+_DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS)
+
+_CONTAINERS = 64
+"""Containers that are kept until what became of them is told: many came in one burst."""
+
+UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
+"""Errors that say why a container could not be read."""
+
+_FAULTS = Status.OVERHEAT | Status.SYSTEM_ERROR
+
+
+class BagCounts(NamedTuple):
+    """What a bag holds.
+
+    Attributes:
+        messages: all of them.
+        results: results, each on the topic ``results``; those that could not be read, too.
+        unread: of these, the ones that could not be read; their messages say why.
+        localizations: of these, the ones that are localizations, which two more topics have.
+        errors: other errors, on ``/diagnostics``.
+    """
+
+    messages: int = 0
+    results: int = 0
+    unread: int = 0
+    localizations: int = 0
+    errors: int = 0
+
+
+class BagMessage(NamedTuple):
+    """A message for a bag: where, when (nanoseconds since 1970, UTC), and its fields."""
+
+    topic: Topic
+    at: int
+    fields: Mapping[str, Any]
+
+
+class ReadResult(NamedTuple):
+    """A result as it goes into the bag; ``error``: why it could not be read, else ""."""
+
+    result: Result
+    error: str = ""
+
+
+@dataclass(eq=False)
+class BagItems:
+    """Makes messages of items, in order; knows the state of each camera."""
+
+    _cameras: dict[str, _Camera] = field(default_factory=dict[str, "_Camera"])
+
+    def __post_init__(self) -> None:
+        self.counts: BagCounts = BagCounts()
+
+    def describe(self, facts: Mapping[str, str]) -> None:
+        """Take facts about a camera, as a recorder is told them."""
+        if "localizations" in facts.get("interpret_as", ""):
+            self._of(facts["camera"]).locates = True
+
+    def messages(self, item: object) -> Iterator[BagMessage]:
+        """Yield what an item comes to; nothing of frames and of what else ROS has no message for.
+
+        Args:
+            item: of a recording, or a :class:`ReadResult`.
+        """
+        for message in self._messages(item):
+            self._count(messages=1)
+            yield message
+
+    def _messages(self, item: object) -> Iterator[BagMessage]:
+        match item:
+            case ReadResult(result, error):
+                yield from self._result(self._of(result.camera), result, error)
+            case Result():
+                yield from self._result(self._of(item.camera), item, "")
+            case TraceEntry():
+                self._of(item.camera).see_frame(item)
+            case RecordedError():
+                yield from self._error(self._of(item.camera), item)
+            case CameraEvent():
+                camera = self._of(item.camera)
+                camera.see_event(item)
+                yield from camera.state(item.at)
+            case _:
+                pass
+
+    def _of(self, name: str) -> _Camera:
+        known = self._cameras.get(name)
+        if known is None:
+            base = title = ros_name(name)
+            taken, number = {one.title for one in self._cameras.values()}, 2
+            while title in taken:
+                title, number = f"{base}_{number}", number + 1
+            known = self._cameras[name] = _Camera(name, title)
+        return known
+
+    def _result(self, camera: _Camera, result: Result, error: str) -> Iterator[BagMessage]:
+        camera.settle(result.raw)
+        at, stamp = nanoseconds(result.received_at), result.received_at
+        parts = None if error else parts_of(result.value)
+        if parts:
+            camera.locates = True
+        elif not camera.locates:  # an empty list may be anything's
+            parts = None
+        frame = camera.name if not parts else parts[0].pose.header.frame_id
+        self._count(results=1, unread=bool(error), localizations=parts is not None)
+        yield BagMessage(camera.results, at, result_fields(result, frame, stamp, error))
+        if parts is not None:
+            yield BagMessage(camera.localizations, at, localizations(parts, frame, stamp))
+            yield BagMessage(camera.detections, at, detections(parts, frame, stamp))
+
+    def _error(self, camera: _Camera, item: RecordedError) -> Iterator[BagMessage]:
+        if item.error in UNREADABLE:
+            application, raw = camera.unread()
+            result = Result(
+                item.camera, application, None, 0, item.triggered_at, item.at, None, raw, None
+            )
+            yield from self._result(camera, result, f"{item.error}: {item.text}")
+            return
+        self._count(errors=1)
+        told = diagnostics(
+            camera.title,
+            camera.url,
+            item.at,
+            WARN,
+            f"{item.error}: {item.text}",
+            triggered_at=item.triggered_at,
+        )
+        yield BagMessage(_DIAGNOSTICS, nanoseconds(item.at), told)
+
+    def _count(self, **more: int) -> None:
+        now = {name: getattr(self.counts, name) + more[name] for name in more}
+        self.counts = self.counts._replace(**now)
+
+
+@dataclass(eq=False)
+class _Camera:
+    """One camera: its topics, its state as far as it was told, and containers on their way."""
+
+    name: str
+    title: str  # for topics
+    url: str = ""
+    connected: bool = False
+    status: Status | None = None
+    application: int | None = None
+    why: str = ""  # it is not connected
+    locates: bool = False  # its results are localizations, as far as is known
+
+    def __post_init__(self) -> None:
+        self.results = Topic(f"/{self.title}/results", RESULT)
+        self.localizations = Topic(f"/{self.title}/localizations", POSE_ARRAY)
+        self.detections = Topic(f"/{self.title}/detections", DETECTIONS)
+        self._status = Topic(f"/{self.title}/status", STATUS, latched=True)
+        self._containers: deque[tuple[int, bytes]] = deque(maxlen=_CONTAINERS)
+
+    def see_event(self, event: CameraEvent) -> None:
+        """Keep what an event tells."""
+        match event:
+            case Connected() | Reconnected():
+                self.connected, self.url, self.why = True, event.url, ""
+            case Disconnected():
+                self.connected, self.status = False, None
+                self.why = event.reason
+            case StatusChanged():
+                self.status = event.status
+            case ApplicationChanged():
+                self.application = event.application
+            case _:
+                pass
+
+    def state(self, at: datetime) -> Iterator[BagMessage]:
+        """Yield the state for its topic and for the diagnostics."""
+        when = nanoseconds(at)
+        names = [] if self.status is None else self.status.names
+        yield BagMessage(
+            self._status,
+            when,
+            status_fields(
+                frame_id=self.name,
+                stamp=at,
+                connected=self.connected,
+                url=self.url,
+                status=self.status,
+                application=self.application,
+                message=self.why,
+            ),
+        )
+        level, text = OK, "connected"
+        if not self.connected:
+            level, text = ERROR, f"not connected: {self.why}"
+        elif self.status is not None and self.status & _FAULTS:
+            level, text = ERROR, " ".join(names)
+        told = diagnostics(
+            self.title,
+            self.url,
+            at,
+            level,
+            text,
+            application=self.application,
+            status=" ".join(names),
+        )
+        yield BagMessage(_DIAGNOSTICS, when, told)
+
+    # ------------------------------------------------------------------ containers
+
+    def see_frame(self, entry: TraceEntry) -> None:
+        """Keep a container until it is told what became of it."""
+        if entry.direction == "<" and entry.message == "ResultContainer" and entry.fields:
+            data, application = entry.fields.get("data"), entry.fields.get("application", 0)
+            if isinstance(data, str) and isinstance(application, int):
+                self._containers.append((application, bytes.fromhex(data)))
+
+    def settle(self, raw: bytes) -> None:
+        """A container was read: forget it and those before it."""
+        for place, (_, data) in enumerate(self._containers):
+            if data == raw:
+                for _ in range(place + 1):
+                    self._containers.popleft()
+                return
+
+    def unread(self) -> tuple[int, bytes]:
+        """Return application and bytes of the container that an error means.
+
+        Where several came of which nothing was told, it is not known which: -1 and no bytes.
+        """
+        known = self._containers.pop() if len(self._containers) == 1 else (-1, b"")
+        self._containers.clear()
+        return known
+
+
+def parts_from_json(value: object) -> list[Localization] | None:
+    """Return what a recording has of localizations as localizations, None where it is none."""
+    from smartcam.models import Header, Pose, Position, Quaternion
+    from smartcam.recording._form import _time
+
+    if not isinstance(value, list):
+        return None
+    parts: list[Localization] = []
+    one: Any
+    for one in value:
+        try:
+            pose = one["pose"]
+            header = pose["header"]
+            part = Localization(
+                one["feature_id"],
+                float(one["quality"]),
+                one["photo_index"],
+                Pose(
+                    Header(header["seq"], _time(header["stamp"]), header["frame_id"]),
+                    Position(*(float(pose["position"][name]) for name in "xyz")),
+                    Quaternion(*(float(pose["orientation"][name]) for name in "xyzw")),
+                ),
+            )
+        except (KeyError, TypeError, ValueError):
+            return None
+        if len(one) != len(Localization._fields):
+            return None
+        parts.append(part)
+    return parts

@@ -1,0 +1,184 @@
+"""A bag of a recording: its results as they were, or read again."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client.interpretation import Interpretation
+from smartcam.exceptions import (
+    ConfigurationError,
+    InterpretationError,
+    RecordingError,
+    RosMessageError,
+    UnsupportedError,
+)
+from smartcam.models import Result
+from smartcam.observers import TraceEntry
+from smartcam.protocols._bvs import BVS
+from smartcam.protocols.messages import ResultContainer
+from smartcam.recording._bag import remove_folder
+from smartcam.recording._bag_items import BagCounts, BagItems, ReadResult, parts_from_json
+from smartcam.recording._bag_recorder import open_bag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.recording._reader import RecordedCamera, Recording
+
+FLUSH = 1 << 20
+"""Bytes of messages that wait for the disk."""
+
+
+def write_bag(
+    recording: Recording,
+    path: str | Path,
+    *,
+    camera: str | None = None,
+    interpret_as: Any = None,
+    y_down: bool | None = None,
+    calibration: Any = None,
+    overwrite: bool = False,
+) -> BagCounts:
+    """Make a rosbag2 of a recording, in its order and with its times.
+
+    Without ``interpret_as`` and ``calibration`` the values are the recorded ones. With one of them
+    each result's bytes are read again; those that do not fit go in with why, and are counted.
+
+    Args:
+        recording: where from.
+        path: the bag's folder.
+        camera: whose; default all cameras'.
+        interpret_as: how to read results, as :func:`smartcam.connect` takes it; default what was
+            recorded of it, or localizations where there is a calibration.
+        y_down: the camera's y axis points down; default as recorded.
+        calibration: brings localizations into the robot's frame, as :func:`smartcam.connect` has
+            it.
+        overwrite: take the place of a bag that is there.
+
+    Returns:
+        What is in the bag.
+
+    Raises:
+        ConfigurationError: no such camera, an option that cannot work, or the folder is there
+            already or cannot be made.
+        UnsupportedError: a camera whose results cannot be read again from their bytes.
+        RecordingError: it cannot be written to its end; nothing is left of it.
+        MissingExtraError: a library is not installed.
+    """
+    conversion = BagConversion(
+        recording, Path(path), camera, interpret_as, y_down, calibration, overwrite
+    )
+    for _ in conversion.steps():
+        pass
+    return conversion.counts
+
+
+@dataclass(eq=False)
+class BagConversion:
+    """Makes a bag of a recording in steps of one item; the fields are :func:`write_bag`'s."""
+
+    recording: Recording
+    folder: Path
+    camera: str | None
+    interpret_as: Any
+    y_down: bool | None
+    calibration: Any
+    overwrite: bool
+    _items: BagItems = field(init=False, default_factory=BagItems)
+
+    def __post_init__(self) -> None:
+        cameras = self.recording.cameras
+        chosen = [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
+        again = self.interpret_as is not None or self.calibration is not None
+        self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
+        for one in chosen:
+            self._items.describe({**one.facts, "camera": one.name})
+
+    @property
+    def counts(self) -> BagCounts:
+        """What is in the bag."""
+        return self._items.counts
+
+    def steps(self) -> Iterator[None]:
+        """Write the bag, an item a step; when this is closed early, nothing is left of it.
+
+        Raises as :func:`write_bag`.
+        """
+        writer = open_bag(self.folder, overwrite=self.overwrite)
+        try:
+            with contextlib.closing(writer):
+                writer.start()
+                for item in self.recording.items(self.camera):
+                    for message in self._items.messages(self._read(item)):
+                        writer.add(*message)
+                    yield
+                writer.finish()
+        except BaseException as exc:
+            with contextlib.suppress(OSError):
+                remove_folder(self.folder)
+            if isinstance(exc, (OSError, RosMessageError)):
+                reason = getattr(exc, "strerror", None) or exc
+                raise RecordingError(f"bag {self.folder}: {reason}") from exc
+            raise
+
+    def _reader(self, camera: RecordedCamera) -> _Reader:
+        if camera.dialect not in BVS.dialects and camera.protocol != "bvs":
+            raise UnsupportedError(
+                f"bag: camera {camera.name!r} is one of {camera.protocol or 'no known protocol'} "
+                f"(dialect {camera.dialect}): only results of bvs can be read again; without "
+                "interpret_as and calibration the recorded values are taken"
+            )
+        spec = self.interpret_as
+        if spec is None:
+            spec = camera.interpret_as or "localizations"
+        y_down = camera.facts.get("y_down") == "True" if self.y_down is None else self.y_down
+        reading = Interpretation(spec, lenient=False, y_down=y_down, calibration=self.calibration)
+        endian = camera.facts.get("endian", "0")
+        if endian not in {"0", "1"}:
+            raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
+        return _Reader(reading, int(endian))
+
+    def _read(self, item: object) -> object:
+        """Return an item as it goes into the bag."""
+        if isinstance(item, TraceEntry):
+            if item.message == "StatusReport" and item.camera in self._readers:
+                self._readers[item.camera].see_status(item)
+            return item
+        if not isinstance(item, Result):
+            return item
+        if self._readers:
+            return self._readers[item.camera].read(item)
+        parts = parts_from_json(item.value)
+        return item if parts is None else item._replace(value=parts)
+
+
+@dataclass(eq=False)
+class _Reader:
+    """Reads one camera's results again."""
+
+    _interpretation: Interpretation
+    _endian: int
+
+    def see_status(self, entry: TraceEntry) -> None:
+        """Keep the byte order that a status tells."""
+        endian = (entry.fields or {}).get("endian")
+        if isinstance(endian, int):
+            self._endian = endian
+
+    def read(self, result: Result) -> ReadResult:
+        """Return the result with what its bytes hold, or why that cannot be told."""
+        container = ResultContainer(application=result.application, data=result.raw)
+        try:
+            value, sequence, _ = self._interpretation(
+                container,
+                self._endian,
+                camera=result.camera,
+                number=result.number,
+                at=result.received_at,
+            )
+        except InterpretationError as exc:
+            return ReadResult(result, f"{type(exc).__name__}: {exc}")
+        return ReadResult(result._replace(value=value, sequence=sequence))
