@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import RosMessageError
-from smartcam.recording._bag import BagWriter, load_yaml, make_folder
+from smartcam.recording._bag import BagWriter, load_yaml, make_folder, remove_folder
 from smartcam.recording._bag_items import BagCounts, BagItems
 from smartcam.recording._bag_messages import DEFINITIONS
 from smartcam.recording._bag_types import BagTypes
@@ -62,6 +62,11 @@ class BagRecorder(Recorder):
     def bag_counts(self) -> BagCounts:
         """What was written so far."""
         return self._file.items.counts if isinstance(self._file, _BagFile) else BagCounts()
+
+    def remove(self) -> None:
+        """Remove what was written; call it when it is closed."""
+        if self._file is not None:
+            remove_folder(self.path)
 
     def _make_file(self) -> _BagFile:
         return _BagFile(open_bag(self.path, overwrite=self._overwrite))
