@@ -12,18 +12,19 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import re
 import stat
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import smartcam
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 from smartcam.recording._form import load_extra
-from smartcam.recording._recorder import CHUNK, _opened
+from smartcam.recording._recorder import CHUNK, opened
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from smartcam.recording._bag_types import BagTypes
 
@@ -76,9 +77,9 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
     try:
         made = _made(folder, what, overwrite=overwrite)
         try:
-            stream = _opened(folder / f"{folder.name}_0.mcap", overwrite=overwrite)
+            stream = opened(mcap_of(folder), overwrite=overwrite)
             for old in folder.iterdir():
-                if old.name != Path(stream.name).name:
+                if old.name != mcap_of(folder).name:
                     old.unlink()
         except BaseException:
             if made:
@@ -103,7 +104,7 @@ def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
             ) from exc
         if not folder.is_dir():
             raise ConfigurationError(f"{what}: this is no folder") from exc
-        other = [one.name for one in folder.iterdir() if not _is_of_a_bag(one)]
+        other = [one.name for one in folder.iterdir() if not _is_of_bag(folder, one)]
         if other:
             raise ConfigurationError(
                 f"{what}: the folder holds {other[0]!r:.80}, which is no part of a bag: it is left "
@@ -113,15 +114,21 @@ def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
     return True
 
 
-def _is_of_a_bag(path: Path) -> bool:
-    ours = path.name in {METADATA, _HALF} or path.suffix == ".mcap"
-    return ours and not path.is_dir()
+def mcap_of(folder: Path) -> Path:
+    """Return the place of a bag's MCAP file: rosbag2 names it after the folder."""
+    return folder / f"{folder.resolve().name}_0.mcap"
+
+
+def _is_of_bag(folder: Path, path: Path) -> bool:
+    """Return whether a file may be a bag's own: other recordings are not taken for one."""
+    own = re.fullmatch(re.escape(folder.resolve().name) + r"(_\d+)?\.mcap", path.name)
+    return (own is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
 
 
 def remove_folder(folder: Path) -> None:
     """Remove a bag of ours, which nobody writes any more."""
-    for name in (METADATA, _HALF, f"{folder.name}_0.mcap"):
-        (folder / name).unlink(missing_ok=True)
+    for path in (folder / METADATA, folder / _HALF, mcap_of(folder)):
+        path.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # somebody has put something there
         folder.rmdir()
 
@@ -239,7 +246,7 @@ class BagWriter:
         self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
 
     def _metadata(self) -> dict[str, Any]:
-        count, name = self.count, Path(self.stream.name).name
+        count, name = self.count, mcap_of(self.folder).name
         starting_time = {"nanoseconds_since_epoch": self._first if count else 0}
         duration = {"nanoseconds": self._last - self._first if count else 0}
         return {

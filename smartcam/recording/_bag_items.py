@@ -26,6 +26,7 @@ from smartcam.recording._bag_messages import (
     OK,
     POSE_ARRAY,
     RESULT,
+    STALE,
     STATUS,
     WARN,
     detections,
@@ -194,6 +195,7 @@ class _Camera:
         self.localizations = Topic(f"/{self.title}/localizations", POSE_ARRAY)
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS)
         self._status = Topic(f"/{self.title}/status", STATUS, latched=True)
+        self._told: object = None  # of the last diagnostics
         self._containers: deque[tuple[int, bytes]] = deque(maxlen=_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
@@ -212,9 +214,8 @@ class _Camera:
                 pass
 
     def state(self, at: datetime) -> Iterator[BagMessage]:
-        """Yield the state for its topic and for the diagnostics."""
+        """Yield the state for its topic, and for the diagnostics what is new to them."""
         when = nanoseconds(at)
-        names = [] if self.status is None else self.status.names
         yield BagMessage(
             self._status,
             when,
@@ -230,19 +231,13 @@ class _Camera:
         )
         level, text = OK, "connected"
         if not self.connected:
-            level, text = ERROR, f"not connected: {self.why}"
+            level, text = (ERROR, f"not connected: {self.why}") if self.why else (STALE, "starting")
         elif self.status is not None and self.status & _FAULTS:
-            level, text = ERROR, " ".join(names)
-        told = diagnostics(
-            self.title,
-            self.url,
-            at,
-            level,
-            text,
-            application=self.application,
-            status=" ".join(names),
-        )
-        yield BagMessage(_DIAGNOSTICS, when, told)
+            level, text = ERROR, " ".join((self.status & _FAULTS).names)
+        if (level, text, self.application) != self._told:
+            self._told = (level, text, self.application)
+            told = diagnostics(self.title, self.url, at, level, text, application=self.application)
+            yield BagMessage(_DIAGNOSTICS, when, told)
 
     # ------------------------------------------------------------------ containers
 

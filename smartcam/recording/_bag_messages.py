@@ -10,15 +10,14 @@ import math
 import re
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from smartcam.models import Localization, Pose, Status, jsonable
+from smartcam.models import Localization, jsonable
+from smartcam.recording._form import nanoseconds
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from datetime import datetime
 
-    from smartcam.models import Result
+    from smartcam.models import Pose, Result, Status
 
 POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 DETECTIONS = "vision_msgs/msg/Detection3DArray"
@@ -27,18 +26,6 @@ STATUS = "smartcam_msgs/msg/CameraStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 DEFINITIONS: Mapping[str, str] = {
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
-    "vision_msgs/msg/ObjectHypothesisWithPose": (
-        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
-    ),
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
-    "vision_msgs/msg/Detection3D": (
-        "std_msgs/Header header\n"
-        "vision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox3D bbox\n"
-        "string id\n"
-    ),
-    DETECTIONS: "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n",
     RESULT: (
         "std_msgs/Header header\n"
         "int64 application\n"
@@ -63,20 +50,20 @@ DEFINITIONS: Mapping[str, str] = {
         "string message\n"
     ),
 }
-"""Definitions of the types that no distribution brings by itself."""
+"""Definitions of the types that are nowhere else."""
 
-OK, WARN, ERROR = 0, 1, 2
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of a diagnostic status."""
-
-_COVARIANCE = np.zeros(36)
-_SIZE = {"x": 0.0, "y": 0.0, "z": 0.0}
 
 
 def ros_name(camera: str) -> str:
-    """Return a camera's name as names of topics can have it: letters, digits, ``_`` and ``/``."""
-    parts = [re.sub(r"[^A-Za-z0-9_]", "_", part) for part in camera.split("/")]
-    parts = [f"_{part}" if part[0].isdigit() else part for part in parts if part]
-    return re.sub(r"_{2,}", "_", "/".join(parts)) or "camera"
+    """Return a camera's name as names of topics can have it: ``camera_10_0_0_7`` of 10.0.0.7.
+
+    Letters, digits and ``_``, none twice, nor at an end, in parts divided by ``/``.
+    """
+    parts = [re.sub(r"[^A-Za-z0-9]+", "_", part).strip("_") for part in camera.split("/")]
+    named = [f"camera_{part}" if part[0].isdigit() else part for part in parts if part]
+    return "/".join(named) or "camera"
 
 
 def parts_of(value: object) -> list[Localization] | None:
@@ -101,18 +88,19 @@ def detections(parts: Sequence[Localization], frame_id: str, stamp: datetime) ->
             "results": [
                 {
                     "hypothesis": {"class_id": part.feature_id, "score": float(part.quality)},
-                    "pose": {"pose": _pose(part.pose), "covariance": _COVARIANCE},
+                    "pose": {"pose": _pose(part.pose)},
                 }
             ],
-            "bbox": {"center": _pose(part.pose), "size": _SIZE},
-            "id": "",
+            "bbox": {"center": _pose(part.pose)},
         }
         for part in parts
     ]
     return {"header": header, "detections": found}
 
 
-def result_fields(result: Result, frame_id: str, stamp: datetime, error: str = "") -> dict[str, Any]:
+def result_fields(
+    result: Result, frame_id: str, stamp: datetime, error: str = ""
+) -> dict[str, Any]:
     """Return a ``smartcam_msgs/msg/Result``; ``error``: why its value could not be read."""
     triggered = result.triggered_at
     return {
@@ -125,7 +113,7 @@ def result_fields(result: Result, frame_id: str, stamp: datetime, error: str = "
         "triggered_at": time_fields(triggered),
         "received_at": time_fields(result.received_at),
         "latency": math.nan if result.latency is None else float(result.latency),
-        "raw": np.frombuffer(result.raw, np.uint8),
+        "raw": result.raw,
         "value": "" if error else json.dumps(jsonable(result.value), separators=(",", ":")),
         "error": error,
     }
@@ -171,8 +159,6 @@ def diagnostics(
 
 def time_fields(at: datetime | None) -> dict[str, int]:
     """Return a ``builtin_interfaces/msg/Time``; 0 for no time."""
-    from smartcam.recording._form import nanoseconds
-
     seconds, rest = divmod(0 if at is None else nanoseconds(at), 1_000_000_000)
     return {"sec": seconds, "nanosec": rest}
 

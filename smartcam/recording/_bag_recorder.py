@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from smartcam.exceptions import RosMessageError
 from smartcam.recording._bag import BagWriter, load_yaml, make_folder, remove_folder
 from smartcam.recording._bag_items import BagCounts, BagItems
-from smartcam.recording._bag_messages import DEFINITIONS
 from smartcam.recording._bag_types import BagTypes
 from smartcam.recording._form import load_extra
 from smartcam.recording._recorder import Description, Recorder
@@ -27,7 +26,7 @@ def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
         ConfigurationError: it cannot be made.
         MissingExtraError: a library is not installed.
     """
-    types = BagTypes(DEFINITIONS)
+    types = BagTypes()
     load_extra("mcap.writer")
     load_yaml()
     return BagWriter(folder, make_folder(folder, overwrite=overwrite), types)

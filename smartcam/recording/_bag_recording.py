@@ -91,7 +91,9 @@ class BagConversion:
 
     def __post_init__(self) -> None:
         cameras = self.recording.cameras
-        chosen = [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
+        chosen = (
+            [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
+        )
         again = self.interpret_as is not None or self.calibration is not None
         self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
         for one in chosen:
@@ -107,6 +109,10 @@ class BagConversion:
 
         Raises as :func:`write_bag`.
         """
+        if self.recording.path.resolve().parent == self.folder.resolve():
+            raise ConfigurationError(
+                f"bag {self.folder}: the recording {self.recording.path} is in this folder"
+            )
         writer = open_bag(self.folder, overwrite=self.overwrite)
         try:
             with contextlib.closing(writer):

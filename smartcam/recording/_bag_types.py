@@ -1,10 +1,17 @@
-"""The message types of a bag: their definitions, hashes and bytes."""
+"""The message types of a bag: their bytes and hashes, and their definitions as texts."""
 
 from __future__ import annotations
 
+import functools
+import importlib
+import importlib.util
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import MissingExtraError
+from smartcam.recording._bag_messages import DEFINITIONS
+from smartcam.ros2._definitions import MESSAGES
+from smartcam.ros2._types import RosTypes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -20,7 +27,7 @@ class BagType(NamedTuple):
         name: such as ``geometry_msgs/msg/PoseArray``.
         hash: of its description, ``RIHS01_...``.
         definition: its text and that of every type in it, as ``ros2msg`` has it.
-        encode: makes the bytes of a message's fields: CDR, little endian.
+        encode: makes the bytes of a message's fields: CDR, little endian; raises RosMessageError.
     """
 
     name: str
@@ -29,51 +36,44 @@ class BagType(NamedTuple):
     encode: Callable[[Mapping[str, Any]], bytes]
 
 
+@dataclass(eq=False)
 class BagTypes:
-    """The types by name, made when they are asked for first.
-
-    Args:
-        texts: definitions of types that the distribution does not bring, by name.
+    """The types by name, made when they are asked for first, which takes a tenth of a second.
 
     Raises:
         MissingExtraError: rosbags is not installed.
     """
 
-    def __init__(self, texts: Mapping[str, str]) -> None:
-        try:
-            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-        except ImportError as exc:
+    distribution: str = DISTRIBUTION
+    _known: dict[str, BagType] = field(init=False, default_factory=dict[str, BagType])
+
+    def __post_init__(self) -> None:
+        if importlib.util.find_spec("rosbags") is None:
             raise MissingExtraError(
                 'bags need rosbags: pip install "smartcam[ros2,record]"', extra="ros2"
-            ) from exc
-        self.distribution: str = DISTRIBUTION
-        self._store: Any = get_typestore(Stores.ROS2_JAZZY)
-        for name, text in texts.items():
-            self._store.register(get_types_from_msg(text, name))
-        self._known: dict[str, BagType] = {}
+            )
+
+    @functools.cached_property
+    def _types(self) -> RosTypes:
+        types = RosTypes(self.distribution)
+        for name, text in DEFINITIONS.items():
+            types.add(name, text)
+        return types
+
+    @functools.cached_property
+    def _texts(self) -> Any:
+        """rosbags' own store of types, which writes definitions."""
+        typesys = importlib.import_module("rosbags.typesys")
+        store = typesys.get_typestore(typesys.Stores(f"ros2_{self.distribution}"))
+        for name, text in {**MESSAGES, **DEFINITIONS}.items():
+            if name not in store.types:
+                store.register(typesys.get_types_from_msg(text, name))
+        return store
 
     def __getitem__(self, name: str) -> BagType:
         known = self._known.get(name)
         if known is None:
-            store = self._store
-            text, _ = store.generate_msgdef(name, ros_version=2)
-
-            def encode(fields: Mapping[str, Any]) -> bytes:
-                return bytes(store.serialize_cdr(self._made(name, fields), name))
-
-            known = BagType(name, store.hash_rihs01(name), text, encode)
-            self._known[name] = known
+            kind = self._types.message(name)
+            text, _ = self._texts.generate_msgdef(name, ros_version=2)
+            known = self._known[name] = BagType(name, kind.hash, text, kind.encode)
         return known
-
-    def _made(self, name: str, fields: Mapping[str, Any]) -> Any:
-        """Return a message of rosbags; fields that are messages are made, too."""
-        made: dict[str, Any] = {}
-        for field, (_, told) in self._store.fielddefs[name][1]:
-            value = fields[field]
-            if isinstance(told, str):
-                made[field] = self._made(told, value)
-            elif isinstance(told[0], tuple) and isinstance(told[0][1], str):
-                made[field] = [self._made(told[0][1], one) for one in value]
-            else:
-                made[field] = value
-        return self._store.types[name](**made)

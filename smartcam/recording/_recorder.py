@@ -155,7 +155,7 @@ class Recorder(Observer):
         """Make the file; raises as :meth:`open`."""
         writer = load_extra("mcap.writer")
         try:
-            stream = _opened(self.path, overwrite=self._overwrite)
+            stream = opened(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
             raise ConfigurationError(
                 f"recording {self.path}: the file is there already; overwrite (--force) takes its "
@@ -307,7 +307,7 @@ class Recorder(Observer):
         return over
 
 
-def _opened(path: Path, *, overwrite: bool) -> IO[bytes]:
+def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
     """Open a file for one recorder; what was in it is gone when it is ours, not before.
 
     Raises:
