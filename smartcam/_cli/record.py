@@ -28,8 +28,8 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet import FleetCamera
 from smartcam.recording import BagRecorder, Recorder, load_recording, write_pcap
-from smartcam.recording._bag_recording import BagConversion
 from smartcam.recording import replay as replay_camera
+from smartcam.recording._bag_recording import BagConversion
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -92,7 +92,8 @@ async def _record(
     facts = {name: getattr(options, name) for name in ("interpret_as", "application", "y_down")}
     try:
         for recorder in recorders:
-            opened.append(recorder.open())
+            recorder.open()
+            opened.append(recorder)
         options.remark(unopened)
         _describe(recorders, unopened.name, **{name: fact for name, fact in facts.items() if fact})
         # subscribed, so that every container is interpreted

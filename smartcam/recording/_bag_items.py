@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.models import (
@@ -11,7 +13,11 @@ from smartcam.models import (
     CameraEvent,
     Connected,
     Disconnected,
+    Header,
     Localization,
+    Pose,
+    Position,
+    Quaternion,
     Reconnected,
     Result,
     Status,
@@ -40,8 +46,7 @@ from smartcam.recording._bag_messages import (
 from smartcam.recording._form import RecordedError, nanoseconds
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from datetime import datetime
+    from collections.abc import Callable, Iterator, Mapping
 
 _DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS)
 
@@ -81,20 +86,30 @@ class BagMessage(NamedTuple):
 
 
 class ReadResult(NamedTuple):
-    """A result as it goes into the bag; ``error``: why it could not be read, else ""."""
+    """A result as it goes into the bag; ``error``: why it could not be read, else "".
+
+    ``again``: it was read anew, so that an earlier error says nothing any more.
+    """
 
     result: Result
     error: str = ""
+    again: bool = False
 
 
 @dataclass(eq=False)
 class BagItems:
-    """Makes messages of items, in order; knows the state of each camera."""
+    """Makes messages of items, in order; knows the state of each camera.
 
-    _cameras: dict[str, _Camera] = field(default_factory=dict[str, "_Camera"])
+    Args:
+        read: what each result goes through; default as it is.
+    """
+
+    _read: Callable[[Result], ReadResult] = ReadResult
+    _cameras: dict[str, _Camera] = field(init=False, default_factory=dict[str, "_Camera"])
 
     def __post_init__(self) -> None:
         self.counts: BagCounts = BagCounts()
+        self._titles: set[str] = set()
 
     def describe(self, facts: Mapping[str, str]) -> None:
         """Take facts about a camera, as a recorder is told them."""
@@ -102,21 +117,17 @@ class BagItems:
             self._of(facts["camera"]).locates = True
 
     def messages(self, item: object) -> Iterator[BagMessage]:
-        """Yield what an item comes to; nothing of frames and of what else ROS has no message for.
-
-        Args:
-            item: of a recording, or a :class:`ReadResult`.
-        """
+        """Yield what an item comes to; nothing of frames, which ROS has no message for."""
         for message in self._messages(item):
             self._count(messages=1)
             yield message
 
     def _messages(self, item: object) -> Iterator[BagMessage]:
         match item:
-            case ReadResult(result, error):
-                yield from self._result(self._of(result.camera), result, error)
             case Result():
-                yield from self._result(self._of(item.camera), item, "")
+                camera = self._of(item.camera)
+                camera.settle(item.raw)
+                yield from self._result(camera, *self._read(item)[:2])
             case TraceEntry():
                 self._of(item.camera).see_frame(item)
             case RecordedError():
@@ -132,14 +143,14 @@ class BagItems:
         known = self._cameras.get(name)
         if known is None:
             base = title = ros_name(name)
-            taken, number = {one.title for one in self._cameras.values()}, 2
-            while title in taken:
+            number = 2
+            while title in self._titles:
                 title, number = f"{base}_{number}", number + 1
+            self._titles.add(title)
             known = self._cameras[name] = _Camera(name, title)
         return known
 
     def _result(self, camera: _Camera, result: Result, error: str) -> Iterator[BagMessage]:
-        camera.settle(result.raw)
         at, stamp = nanoseconds(result.received_at), result.received_at
         parts = None if error else parts_of(result.value)
         if parts:
@@ -155,11 +166,13 @@ class BagItems:
 
     def _error(self, camera: _Camera, item: RecordedError) -> Iterator[BagMessage]:
         if item.error in UNREADABLE:
-            application, raw = camera.unread()
+            application, raw, at = camera.unread() or (-1, b"", item.at)
             result = Result(
-                item.camera, application, None, 0, item.triggered_at, item.at, None, raw, None
+                item.camera, application, None, 0, item.triggered_at, at, None, raw, None
             )
-            yield from self._result(camera, result, f"{item.error}: {item.text}")
+            found = self._read(result) if raw else ReadResult(result)
+            error = found.error if found.again else f"{item.error}: {item.text}"
+            yield from self._result(camera, found.result, error)
             return
         self._count(errors=1)
         told = diagnostics(
@@ -196,7 +209,7 @@ class _Camera:
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS)
         self._status = Topic(f"/{self.title}/status", STATUS, latched=True)
         self._told: object = None  # of the last diagnostics
-        self._containers: deque[tuple[int, bytes]] = deque(maxlen=_CONTAINERS)
+        self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
         """Keep what an event tells."""
@@ -244,54 +257,63 @@ class _Camera:
     def see_frame(self, entry: TraceEntry) -> None:
         """Keep a container until it is told what became of it."""
         if entry.direction == "<" and entry.message == "ResultContainer" and entry.fields:
-            data, application = entry.fields.get("data"), entry.fields.get("application", 0)
+            data, application = entry.fields.get("data"), entry.fields.get("application", -1)
             if isinstance(data, str) and isinstance(application, int):
-                self._containers.append((application, bytes.fromhex(data)))
+                with contextlib.suppress(ValueError):
+                    self._containers.append((application, bytes.fromhex(data), entry.at))
 
     def settle(self, raw: bytes) -> None:
         """A container was read: forget it and those before it."""
-        for place, (_, data) in enumerate(self._containers):
+        for place, (_, data, _) in enumerate(self._containers):
             if data == raw:
                 for _ in range(place + 1):
                     self._containers.popleft()
                 return
 
-    def unread(self) -> tuple[int, bytes]:
-        """Return application and bytes of the container that an error means.
+    def unread(self) -> tuple[int, bytes, datetime] | None:
+        """Return application, bytes and time of the container that an error means.
 
-        Where several came of which nothing was told, it is not known which: -1 and no bytes.
+        Where several came of which nothing was told, it is not known which: None.
         """
-        known = self._containers.pop() if len(self._containers) == 1 else (-1, b"")
+        known = self._containers.pop() if len(self._containers) == 1 else None
         self._containers.clear()
         return known
 
 
 def parts_from_json(value: object) -> list[Localization] | None:
     """Return what a recording has of localizations as localizations, None where it is none."""
-    from smartcam.models import Header, Pose, Position, Quaternion
-    from smartcam.recording._form import _time
-
     if not isinstance(value, list):
         return None
-    parts: list[Localization] = []
-    one: Any
-    for one in value:
-        try:
-            pose = one["pose"]
-            header = pose["header"]
-            part = Localization(
-                one["feature_id"],
-                float(one["quality"]),
-                one["photo_index"],
-                Pose(
-                    Header(header["seq"], _time(header["stamp"]), header["frame_id"]),
-                    Position(*(float(pose["position"][name]) for name in "xyz")),
-                    Quaternion(*(float(pose["orientation"][name]) for name in "xyzw")),
-                ),
-            )
-        except (KeyError, TypeError, ValueError):
-            return None
-        if len(one) != len(Localization._fields):
-            return None
-        parts.append(part)
-    return parts
+    said: list[Any] = value
+    try:
+        return [_part(one) for one in said]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def _part(said: Mapping[str, Any]) -> Localization:
+    """Return a localization of JSON; raises where it is none."""
+    if set(said) != set(Localization._fields):
+        raise ValueError("these are not its fields")
+    pose, feature, photo = said["pose"], said["feature_id"], said["photo_index"]
+    header = pose["header"]
+    if not (isinstance(feature, str) and isinstance(header["frame_id"], str)):
+        raise TypeError("no text")
+    if type(photo) is not int:
+        raise TypeError("no index")
+    return Localization(
+        feature,
+        _number(said["quality"]),
+        photo,
+        Pose(
+            Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
+            Position(*(_number(pose["position"][name]) for name in "xyz")),
+            Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
+        ),
+    )
+
+
+def _number(said: object) -> float:
+    if isinstance(said, bool) or not isinstance(said, (int, float)):
+        raise TypeError("no number")
+    return float(said)

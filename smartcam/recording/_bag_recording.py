@@ -15,7 +15,6 @@ from smartcam.exceptions import (
     RosMessageError,
     UnsupportedError,
 )
-from smartcam.models import Result
 from smartcam.observers import TraceEntry
 from smartcam.protocols._bvs import BVS
 from smartcam.protocols.messages import ResultContainer
@@ -24,12 +23,11 @@ from smartcam.recording._bag_items import BagCounts, BagItems, ReadResult, parts
 from smartcam.recording._bag_recorder import open_bag
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Generator
 
+    from smartcam.models import Result
+    from smartcam.recording._form import Item
     from smartcam.recording._reader import RecordedCamera, Recording
-
-FLUSH = 1 << 20
-"""Bytes of messages that wait for the disk."""
 
 
 def write_bag(
@@ -87,7 +85,7 @@ class BagConversion:
     y_down: bool | None
     calibration: Any
     overwrite: bool
-    _items: BagItems = field(init=False, default_factory=BagItems)
+    _items: BagItems = field(init=False)
 
     def __post_init__(self) -> None:
         cameras = self.recording.cameras
@@ -96,6 +94,7 @@ class BagConversion:
         )
         again = self.interpret_as is not None or self.calibration is not None
         self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
+        self._items = BagItems(self._read)
         for one in chosen:
             self._items.describe({**one.facts, "camera": one.name})
 
@@ -104,7 +103,7 @@ class BagConversion:
         """What is in the bag."""
         return self._items.counts
 
-    def steps(self) -> Iterator[None]:
+    def steps(self) -> Generator[None, None, None]:
         """Write the bag, an item a step; when this is closed early, nothing is left of it.
 
         Raises as :func:`write_bag`.
@@ -118,7 +117,8 @@ class BagConversion:
             with contextlib.closing(writer):
                 writer.start()
                 for item in self.recording.items(self.camera):
-                    for message in self._items.messages(self._read(item)):
+                    self._see(item)
+                    for message in self._items.messages(item):
                         writer.add(*message)
                     yield
                 writer.finish()
@@ -147,18 +147,16 @@ class BagConversion:
             raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
         return _Reader(reading, int(endian))
 
-    def _read(self, item: object) -> object:
-        """Return an item as it goes into the bag."""
-        if isinstance(item, TraceEntry):
-            if item.message == "StatusReport" and item.camera in self._readers:
-                self._readers[item.camera].see_status(item)
-            return item
-        if not isinstance(item, Result):
-            return item
+    def _see(self, item: Item) -> None:
+        if isinstance(item, TraceEntry) and item.message == "StatusReport" and self._readers:
+            self._readers[item.camera].see_status(item)
+
+    def _read(self, result: Result) -> ReadResult:
+        """Return a result as it goes into the bag."""
         if self._readers:
-            return self._readers[item.camera].read(item)
-        parts = parts_from_json(item.value)
-        return item if parts is None else item._replace(value=parts)
+            return self._readers[result.camera].read(result)
+        parts = parts_from_json(result.value)
+        return ReadResult(result if parts is None else result._replace(value=parts))
 
 
 @dataclass(eq=False)
@@ -186,5 +184,5 @@ class _Reader:
                 at=result.received_at,
             )
         except InterpretationError as exc:
-            return ReadResult(result, f"{type(exc).__name__}: {exc}")
-        return ReadResult(result._replace(value=value, sequence=sequence))
+            return ReadResult(result, f"{type(exc).__name__}: {exc}", again=True)
+        return ReadResult(result._replace(value=value, sequence=sequence), again=True)

@@ -62,7 +62,7 @@ class BagTypes:
 
     @functools.cached_property
     def _texts(self) -> Any:
-        """rosbags' own store of types, which writes definitions."""
+        """The store of rosbags, which writes definitions."""
         typesys = importlib.import_module("rosbags.typesys")
         store = typesys.get_typestore(typesys.Stores(f"ros2_{self.distribution}"))
         for name, text in {**MESSAGES, **DEFINITIONS}.items():
