@@ -10,7 +10,7 @@ import hashlib
 import json
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.ros2._type_definitions import Definition, Field
+from smartcam.ros2._type_definitions import EMPTY, Definition, Field
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,8 +25,6 @@ _IDS: Final = {
 }  # fmt: skip
 _BOUNDED_STRING: Final = 21
 _ARRAY, _BOUNDED, _SEQUENCE = 48, 96, 144
-EMPTY: Final = Field("structure_needs_at_least_one_member", "uint8")
-"""What a message without fields has in its description and its bytes."""
 
 
 def _field(field: Field) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import operator
 import struct
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ import numpy as np
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import RosMessageError
-from smartcam.ros2._type_codec import Misfit, counted, packed, text_bytes
+from smartcam.ros2._type_codec import MisfitError, counted, packed, text_bytes
 from smartcam.ros2._type_definitions import INTEGERS, NUMBERS, Definition, Field
 
 if TYPE_CHECKING:
@@ -53,8 +52,8 @@ def _same(one: Any, other: Any) -> bool:
 def _shown(value: Any) -> str:
     if isinstance(value, np.ndarray):
         text = ", ".join(map(str, value[:4].tolist()))
-        return f"[{text}{f', ... {len(value)}' if len(value) > 4 else ''}]"  # noqa: PLR2004
-    if isinstance(value, bytes | bytearray | memoryview) and len(value) > 16:  # noqa: PLR2004
+        return f"[{text}{f', ... {len(value)}' if len(value) > 4 else ''}]"
+    if isinstance(value, bytes | bytearray | memoryview) and len(value) > 16:
         return f"<{len(value)} bytes>"
     return repr(value)
 
@@ -114,7 +113,7 @@ def fitting(kind: MessageType, field: Field, value: Any, where: str = "") -> Any
             packed(value, NUMBERS[field.type], least, field.size)
             return value
         counted(value, least, field.size)
-    except (Misfit, struct.error, KeyError, TypeError, ValueError, OverflowError) as exc:
+    except (MisfitError, struct.error, KeyError, TypeError, ValueError, OverflowError) as exc:
         raise RosMessageError(
             f"{kind.name}: {where}: expected {field}, got {_shown(value):.80} ({exc})"
         ) from exc
@@ -128,24 +127,20 @@ def _one(kind: MessageType, field: Field, value: Any, where: str) -> Any:
         if isinstance(value, Mapping):
             return filled(nested, value, f"{where}.", kind)
         if getattr(value, "__msgtype__", None) != nested.name:
-            raise Misfit(type(value).__name__)
+            raise MisfitError(type(value).__name__)
         return value
     if field.type == "string":
         text_bytes(value, field.limit)
     elif field.type == "bool":
         if value not in (True, False):
-            raise Misfit("neither True nor False")
+            raise MisfitError("neither True nor False")
         return bool(value)
     elif field.type in INTEGERS:
-        if isinstance(value, bool):
-            raise Misfit("a flag is no number")
         value = operator.index(value)
         struct.pack(f"<{NUMBERS[field.type]}", value)
     else:
-        if isinstance(value, bool | str):
-            raise Misfit("no number")
         struct.pack(f"<{NUMBERS[field.type]}", value)
-        value = math.nan if value != value else float(value)  # noqa: PLR0124
+        value = float(value)
     return value
 
 
