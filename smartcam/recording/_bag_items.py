@@ -65,7 +65,7 @@ class BagCounts(NamedTuple):
     Attributes:
         messages: all of them.
         results: results, each on the topic ``results``; those that could not be read, too.
-        unread: of these, the ones that could not be read; their messages say why.
+        unread: of these, the ones that could not be read; ``/diagnostics`` says why.
         localizations: of these, the ones that are localizations, which two more topics have.
         errors: other errors, on ``/diagnostics``.
     """
@@ -113,8 +113,8 @@ class BagItems:
 
     def describe(self, facts: Mapping[str, str]) -> None:
         """Take facts about a camera, as a recorder is told them."""
-        if "localizations" in facts.get("interpret_as", ""):
-            self._of(facts["camera"]).locates = True
+        camera = self._of(facts["camera"])
+        camera.spec = facts.get("interpret_as", camera.spec)
 
     def messages(self, item: object) -> Iterator[BagMessage]:
         """Yield what an item comes to; nothing of frames, which ROS has no message for."""
@@ -152,38 +152,28 @@ class BagItems:
 
     def _result(self, camera: _Camera, result: Result, error: str) -> Iterator[BagMessage]:
         at, stamp = nanoseconds(result.received_at), result.received_at
-        parts = None if error else parts_of(result.value)
-        if parts:
-            camera.locates = True
-        elif not camera.locates:  # an empty list may be anything's
-            parts = None
-        frame = camera.name if not parts else parts[0].pose.header.frame_id
+        parts = None if error else camera.parts(result)
         self._count(results=1, unread=bool(error), localizations=parts is not None)
-        yield BagMessage(camera.results, at, result_fields(result, frame, stamp, error))
+        how = "" if error else camera.interpreter(result)
+        yield BagMessage(camera.results, at, result_fields(result, camera.name, stamp, how))
+        if error:  # its message has no field for that
+            facts = {"application_id": result.application, "result_id": result.number}
+            yield camera.warning(stamp, error, **facts)
         if parts is not None:
+            frame = parts[0].pose.header.frame_id if parts else camera.name
             yield BagMessage(camera.localizations, at, localizations(parts, frame, stamp))
             yield BagMessage(camera.detections, at, detections(parts, frame, stamp))
 
     def _error(self, camera: _Camera, item: RecordedError) -> Iterator[BagMessage]:
-        if item.error in UNREADABLE:
-            application, raw, at = camera.unread() or (-1, b"", item.at)
-            result = Result(
-                item.camera, application, None, 0, item.triggered_at, at, None, raw, None
-            )
-            found = self._read(result) if raw else ReadResult(result)
-            error = found.error if found.again else f"{item.error}: {item.text}"
-            yield from self._result(camera, found.result, error)
+        text = f"{item.error}: {item.text}"
+        if item.error not in UNREADABLE:
+            self._count(errors=1)
+            yield camera.warning(item.at, text, triggered_at=item.triggered_at)
             return
-        self._count(errors=1)
-        told = diagnostics(
-            camera.title,
-            camera.url,
-            item.at,
-            WARN,
-            f"{item.error}: {item.text}",
-            triggered_at=item.triggered_at,
-        )
-        yield BagMessage(_DIAGNOSTICS, nanoseconds(item.at), told)
+        application, raw, at = camera.unread() or (-1, b"", item.at)
+        result = Result(item.camera, application, None, 0, item.triggered_at, at, None, raw, None)
+        found = self._read(result) if raw else ReadResult(result)
+        yield from self._result(camera, found.result, found.error if found.again else text)
 
     def _count(self, **more: int) -> None:
         now = {name: getattr(self.counts, name) + more[name] for name in more}
@@ -201,7 +191,7 @@ class _Camera:
     status: Status | None = None
     application: int | None = None
     why: str = ""  # it is not connected
-    locates: bool = False  # its results are localizations, as far as is known
+    spec: str = ""  # how its results are read, as far as is known
 
     def __post_init__(self) -> None:
         self.results = Topic(f"/{self.title}/results", RESULT)
@@ -209,6 +199,7 @@ class _Camera:
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS)
         self._status = Topic(f"/{self.title}/status", STATUS, latched=True)
         self._told: object = None  # of the last diagnostics
+        self._locating: set[int] = set()  # applications whose results are localizations
         self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
@@ -233,13 +224,12 @@ class _Camera:
             self._status,
             when,
             status_fields(
-                frame_id=self.name,
-                stamp=at,
+                self.name,
+                at,
                 connected=self.connected,
-                url=self.url,
                 status=self.status,
                 application=self.application,
-                message=self.why,
+                error=self.why,
             ),
         )
         level, text = OK, "connected"
@@ -252,7 +242,28 @@ class _Camera:
             told = diagnostics(self.title, self.url, at, level, text, application=self.application)
             yield BagMessage(_DIAGNOSTICS, when, told)
 
-    # ------------------------------------------------------------------ containers
+    def warning(self, at: datetime, text: str, **values: object) -> BagMessage:
+        """Return a message of the diagnostics about something that went wrong once."""
+        told = diagnostics(self.title, self.url, at, WARN, text, **values)
+        return BagMessage(_DIAGNOSTICS, nanoseconds(at), told)
+
+    # ------------------------------------------------------------------ results
+
+    def parts(self, result: Result) -> list[Localization] | None:
+        """Return a result's localizations; None where it has none, and where [] may be anything."""
+        parts = parts_of(result.value)
+        if parts:
+            self._locating.add(result.application)
+        known = result.application in self._locating or self.spec.startswith("localizations")
+        return parts if known else None
+
+    def interpreter(self, result: Result) -> str:
+        """Return how a result was read, "" where its value is nothing but its bytes."""
+        value = result.value
+        if value is None or isinstance(value, bytes) or value_is_hex(value, result.raw):
+            return ""
+        known = "localizations" if result.application in self._locating else "unknown"
+        return self.spec or known
 
     def see_frame(self, entry: TraceEntry) -> None:
         """Keep a container until it is told what became of it."""
@@ -278,6 +289,11 @@ class _Camera:
         known = self._containers.pop() if len(self._containers) == 1 else None
         self._containers.clear()
         return known
+
+
+def value_is_hex(value: object, raw: bytes) -> bool:
+    """Return whether a recorded value is the bytes as a recording shows them."""
+    return isinstance(value, str) and value == raw.hex()
 
 
 def parts_from_json(value: object) -> list[Localization] | None:

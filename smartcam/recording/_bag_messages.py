@@ -6,51 +6,23 @@ Each function gives the fields of one message as nested mappings, with the names
 from __future__ import annotations
 
 import json
-import math
 import re
 from typing import TYPE_CHECKING, Any
 
-from smartcam.models import Localization, jsonable
+from smartcam.models import Localization, Status, jsonable
 from smartcam.recording._form import nanoseconds
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from datetime import datetime
 
-    from smartcam.models import Pose, Result, Status
+    from smartcam.models import Pose, Result
 
 POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 DETECTIONS = "vision_msgs/msg/Detection3DArray"
 RESULT = "smartcam_msgs/msg/Result"
 STATUS = "smartcam_msgs/msg/CameraStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-
-DEFINITIONS: Mapping[str, str] = {
-    RESULT: (
-        "std_msgs/Header header\n"
-        "int64 application\n"
-        "bool has_sequence\n"
-        "int64 sequence\n"
-        "uint64 number\n"
-        "bool was_triggered\n"
-        "builtin_interfaces/Time triggered_at\n"
-        "builtin_interfaces/Time received_at\n"
-        "float64 latency\n"
-        "uint8[] raw\n"
-        "string value\n"
-        "string error\n"
-    ),
-    STATUS: (
-        "std_msgs/Header header\n"
-        "bool connected\n"
-        "string url\n"
-        "string[] status\n"
-        "bool has_application\n"
-        "int64 application\n"
-        "string message\n"
-    ),
-}
-"""Definitions of the types that are nowhere else."""
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of a diagnostic status."""
@@ -99,45 +71,44 @@ def detections(parts: Sequence[Localization], frame_id: str, stamp: datetime) ->
 
 
 def result_fields(
-    result: Result, frame_id: str, stamp: datetime, error: str = ""
+    result: Result, frame_id: str, stamp: datetime, interpreter: str = ""
 ) -> dict[str, Any]:
-    """Return a ``smartcam_msgs/msg/Result``; ``error``: why its value could not be read."""
-    triggered = result.triggered_at
+    """Return a ``smartcam_msgs/msg/Result``; ``interpreter``: how it was read, "" where not."""
+    text = json.dumps(jsonable(result.value), separators=(",", ":")) if interpreter else ""
     return {
         "header": _header(frame_id, stamp),
-        "application": result.application,
-        "has_sequence": result.sequence is not None,
-        "sequence": result.sequence or 0,
-        "number": result.number,
-        "was_triggered": triggered is not None,
-        "triggered_at": time_fields(triggered),
-        "received_at": time_fields(result.received_at),
-        "latency": math.nan if result.latency is None else float(result.latency),
-        "raw": result.raw,
-        "value": "" if error else json.dumps(jsonable(result.value), separators=(",", ":")),
-        "error": error,
+        "camera_name": result.camera,
+        "application_id": max(0, result.application),  # one may have no name
+        "result_id": result.number,
+        "interpreter": interpreter,
+        "json": text,
+        "data": result.raw,
     }
 
 
 def status_fields(
-    *,
-    frame_id: str,
+    camera: str,
     stamp: datetime,
+    *,
     connected: bool,
-    url: str,
     status: Status | None,
     application: int | None,
-    message: str,
+    error: str,
 ) -> dict[str, Any]:
-    """Return a ``smartcam_msgs/msg/CameraStatus``."""
+    """Return a ``smartcam_msgs/msg/CameraStatus``; ``error``: why it is not connected."""
+    bits = Status(0) if status is None else status
+    busy, running = Status.BUSY in bits, Status.RUNNING in bits
     return {
-        "header": _header(frame_id, stamp),
+        "header": _header(camera, stamp),
+        "camera_name": camera,
         "connected": connected,
-        "url": url,
-        "status": [] if status is None else list(status.names),
-        "has_application": application is not None,
-        "application": application or 0,
-        "message": message,
+        "ready": connected and running and not busy and Status.SYSTEM_ERROR not in bits,
+        "busy": busy,
+        "running": running,
+        "application_id": max(0, application or 0),
+        "status": bits.value,
+        "status_names": list(bits.names),
+        "error": error,
     }
 
 
@@ -157,14 +128,13 @@ def diagnostics(
     return {"header": _header("", stamp), "status": [status]}
 
 
-def time_fields(at: datetime | None) -> dict[str, int]:
-    """Return a ``builtin_interfaces/msg/Time``; 0 for no time."""
-    seconds, rest = divmod(0 if at is None else nanoseconds(at), 1_000_000_000)
+def _time(at: datetime) -> dict[str, int]:
+    seconds, rest = divmod(nanoseconds(at), 1_000_000_000)
     return {"sec": seconds, "nanosec": rest}
 
 
 def _header(frame_id: str, stamp: datetime) -> dict[str, Any]:
-    return {"stamp": time_fields(stamp), "frame_id": frame_id}
+    return {"stamp": _time(stamp), "frame_id": frame_id}
 
 
 def _pose(pose: Pose) -> dict[str, Any]:

@@ -96,7 +96,8 @@ class BagConversion:
         self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
         self._items = BagItems(self._read)
         for one in chosen:
-            self._items.describe({**one.facts, "camera": one.name})
+            said = {"interpret_as": str(self._spec(one))} if again else one.facts
+            self._items.describe({**said, "camera": one.name})
 
     @property
     def counts(self) -> BagCounts:
@@ -130,6 +131,12 @@ class BagConversion:
                 raise RecordingError(f"bag {self.folder}: {reason}") from exc
             raise
 
+    def _spec(self, camera: RecordedCamera) -> Any:
+        """Return how a camera's results are read again."""
+        if self.interpret_as is not None:
+            return self.interpret_as
+        return camera.interpret_as or "localizations"
+
     def _reader(self, camera: RecordedCamera) -> _Reader:
         if camera.dialect not in BVS.dialects and camera.protocol != "bvs":
             raise UnsupportedError(
@@ -137,10 +144,8 @@ class BagConversion:
                 f"(dialect {camera.dialect}): only results of bvs can be read again; without "
                 "interpret_as and calibration the recorded values are taken"
             )
-        spec = self.interpret_as
-        if spec is None:
-            spec = camera.interpret_as or "localizations"
         y_down = camera.facts.get("y_down") == "True" if self.y_down is None else self.y_down
+        spec = self._spec(camera)
         reading = Interpretation(spec, lenient=False, y_down=y_down, calibration=self.calibration)
         endian = camera.facts.get("endian", "0")
         if endian not in {"0", "1"}:

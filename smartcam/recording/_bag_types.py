@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import MissingExtraError
-from smartcam.recording._bag_messages import DEFINITIONS
 from smartcam.ros2._definitions import MESSAGES
 from smartcam.ros2._types import RosTypes
 
@@ -55,25 +54,29 @@ class BagTypes:
 
     @functools.cached_property
     def _types(self) -> RosTypes:
-        types = RosTypes(self.distribution)
-        for name, text in DEFINITIONS.items():
-            types.add(name, text)
-        return types
-
-    @functools.cached_property
-    def _texts(self) -> Any:
-        """The store of rosbags, which writes definitions."""
-        typesys = importlib.import_module("rosbags.typesys")
-        store = typesys.get_typestore(typesys.Stores(f"ros2_{self.distribution}"))
-        for name, text in {**MESSAGES, **DEFINITIONS}.items():
-            if name not in store.types:
-                store.register(typesys.get_types_from_msg(text, name))
-        return store
+        return RosTypes(self.distribution)
 
     def __getitem__(self, name: str) -> BagType:
         known = self._known.get(name)
         if known is None:
             kind = self._types.message(name)
-            text, _ = self._texts.generate_msgdef(name, ros_version=2)
+            text = _definition(self.distribution, name)
             known = self._known[name] = BagType(name, kind.hash, text, kind.encode)
         return known
+
+
+@functools.cache
+def _definition(distribution: str, name: str) -> str:
+    """Return a definition as rosbags writes it."""
+    text: str = _store(distribution).generate_msgdef(name, ros_version=2)[0]
+    return text
+
+
+@functools.cache
+def _store(distribution: str) -> Any:
+    typesys = importlib.import_module("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores(f"ros2_{distribution}"))
+    for name, text in MESSAGES.items():
+        if name not in store.types:
+            store.register(typesys.get_types_from_msg(text, name))
+    return store
