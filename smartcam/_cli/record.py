@@ -308,7 +308,7 @@ async def bag(
     if counts.unread:
         click.echo(
             f"smartcam: note: {counts.unread} of {counts.results} results could not be read: "
-            "their messages say why",
+            "/diagnostics says why",
             err=True,
         )
     _show_bag(output, counts, options)

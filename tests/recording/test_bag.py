@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
-import random
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -603,6 +603,7 @@ def on_a_full_disk(folder: Path) -> Path:
 
 
 @needs_full
+@pytest.mark.real_time
 async def test_bag_on_a_full_disk_ends_with_its_reason(tmp_path: Path) -> None:
     bag = BagRecorder(on_a_full_disk(tmp_path / "bag"), overwrite=True).open()
     assert str(await bag.wait_failed()) == f"recording {tmp_path / 'bag'}: No space left on device"
@@ -646,7 +647,7 @@ def test_bag_recorder_says_which_message_cannot_be(tmp_path: Path) -> None:
 
 
 def test_bag_of_a_recording_can_be_left_and_leaves_nothing(tmp_path: Path) -> None:
-    noise = random.Random(1).randbytes(1 << 19)
+    noise = hashlib.shake_256(b"noise").digest(1 << 19)
     items = [result(number, None, noise) for number in range(12)]
     recording = write(tmp_path / "run.mcap", items)
     conversion = BagConversion(recording, tmp_path / "bag", None, None, None, None, False)
