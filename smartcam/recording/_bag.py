@@ -204,9 +204,7 @@ class BagWriter:
         self.stream.flush()
         if self._on_disk:
             os.fsync(self.stream.fileno())
-        text = self._yaml.safe_dump(
-            {"rosbag2_bagfile_information": self._metadata()}, sort_keys=False, allow_unicode=True
-        )
+        text = self._text({"rosbag2_bagfile_information": self._metadata()})
         half = self.folder / _HALF
         with half.open("w", encoding="utf-8") as stream:
             stream.write(text)
@@ -225,7 +223,7 @@ class BagWriter:
             self._schemas[kind.name] = self._writer.register_schema(
                 kind.name, "ros2msg", kind.definition.encode()
             )
-        qos = self._yaml.safe_dump([_qos(latched=topic.latched)], sort_keys=False).strip()
+        qos = self._text([_qos(latched=topic.latched)]).strip()
         number: int = self._writer.register_channel(
             topic.name,
             "cdr",
@@ -242,8 +240,13 @@ class BagWriter:
         return _Channel(number, told)
 
     def _write_metadata_record(self) -> None:
-        text = self._yaml.safe_dump(self._metadata(), sort_keys=False, allow_unicode=True)
-        self._writer.add_metadata("rosbag2", {"serialized_metadata": text})
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": self._text(self._metadata())})
+
+    def _text(self, value: object) -> str:
+        """Return a value as YAML; by libyaml where PyYAML has it."""
+        dumper = getattr(self._yaml, "CSafeDumper", self._yaml.SafeDumper)
+        text: str = self._yaml.dump(value, Dumper=dumper, sort_keys=False, allow_unicode=True)
+        return text
 
     def _metadata(self) -> dict[str, Any]:
         count, name = self.count, mcap_of(self.folder).name

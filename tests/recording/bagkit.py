@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Read(NamedTuple):
-    """A message that rosbags read."""
+    """A message as rosbags decodes it."""
 
     topic: str
     at: int
@@ -24,22 +24,32 @@ class Read(NamedTuple):
 _STORE = get_typestore(Stores.EMPTY)
 
 
-def read(path: Path) -> list[Read]:
-    """Return what rosbags reads of a bag, or of its MCAP file, by what these say of the types."""
-    found: list[Read] = []
-    with Reader(path) as reader:
-        for one, at, data in reader.messages():
-            if one.msgtype not in _STORE.types:
-                made = get_types_from_msg(one.msgdef.data, one.msgtype)
-                _STORE.register({name: what for name, what in made.items() if not _known(name)})
-            assert one.digest in {"", _STORE.hash_rihs01(one.msgtype)}
-            message = _STORE.deserialize_cdr(data, one.msgtype)
-            found.append(Read(one.topic, at, bytes(data), message))
-    return found
+def decoded(topic: str, at: int, data: bytes, kind: str, definition: str, digest: str) -> Read:
+    """Return a message, decoded by nothing but its definition, which has that hash."""
+    if kind not in _STORE.types:
+        made = get_types_from_msg(definition, kind)
+        _STORE.register({name: what for name, what in made.items() if name not in _STORE.types})
+    assert digest == _STORE.hash_rihs01(kind)
+    return Read(topic, at, data, _STORE.deserialize_cdr(data, kind))
 
 
-def _known(name: str) -> bool:
-    return name in _STORE.types
+def read_by_rosbags(folder: Path) -> list[Read]:
+    """Return what the reader of rosbags reads of a bag, in the order of time."""
+    with Reader(folder) as reader:
+        return [
+            decoded(one.topic, at, bytes(data), one.msgtype, one.msgdef.data, one.digest)
+            for one, at, data in reader.messages()
+        ]
+
+
+def read(folder: Path) -> list[Read]:
+    """Return what is in a bag, in its order; in a tenth of the time."""
+    return [
+        decoded(
+            one.topic, one.at, one.data, one.schema, one.definition, one.metadata["topic_type_hash"]
+        )
+        for one in read_raw(folder / f"{folder.name}_0.mcap")
+    ]
 
 
 def on(topic: str, messages: list[Read]) -> list[Read]:
@@ -53,6 +63,7 @@ class Raw(NamedTuple):
     at: int
     data: bytes
     schema: str
+    definition: str
     encodings: tuple[str, str]  # of the schema, of the message
     metadata: dict[str, str]
 
@@ -66,6 +77,7 @@ def read_raw(path: Path) -> list[Raw]:
                 message.log_time,
                 message.data,
                 schema.name,
+                schema.data.decode(),
                 (schema.encoding, channel.message_encoding),
                 channel.metadata,
             )

@@ -43,7 +43,7 @@ from smartcam.recording import BagCounts, BagRecorder, Recorder, load_recording,
 from smartcam.recording._bag_messages import ros_name
 from smartcam.recording._bag_recording import BagConversion
 from smartcam.recording._form import nanoseconds as recorded_time
-from tests.recording.bagkit import nanoseconds, on, read, read_raw
+from tests.recording.bagkit import nanoseconds, on, read, read_by_rosbags, read_raw
 from tests.recording.recordingkit import COUNTER, URL, at, container, containers, write
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def result(seconds: float, value: object, raw: bytes = b"\1\2", **fields: Any) -
 async def test_bag_has_what_the_recorder_had(tmp_path: Path) -> None:
     counts = await both(tmp_path)
     recording = load_recording(tmp_path / "run.mcap")
-    results, messages = list(recording.results()), read(tmp_path / "live")
+    results, messages = list(recording.results()), read_by_rosbags(tmp_path / "live")
 
     assert counts == BagCounts(len(messages), 3, 0, 3, 0)
     assert len(results) == 3
@@ -588,7 +588,7 @@ def test_bag_that_was_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
         names.extend(type(record).__name__ for record in StreamReader(stream).records)
     assert names.count("Message") == 15
     with pytest.raises(ReaderError, match="File end magic is invalid"):
-        read(cut)  # so docs/bags.md names what gives it an end
+        read_by_rosbags(cut)  # so docs/bags.md names what gives it an end
 
 
 needs_full = pytest.mark.skipif(

@@ -20,7 +20,7 @@ from smartcam.calibration import fit_plane
 from smartcam.recording import load_recording
 from tests.cli.commandline import closed_port, emulators, run
 from tests.processes import PATIENCE, Process
-from tests.recording.bagkit import on, read, read_raw
+from tests.recording.bagkit import on, read, read_by_rosbags, read_raw
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -43,7 +43,7 @@ def recorded(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     first, file, bag = done.lines
     assert first == {"url": url, "file": to[1], "bag": to[3]}
     assert file["file"] == to[1]
-    messages = read(folder / "bag")
+    messages = read_by_rosbags(folder / "bag")
     found = len(on("/table/results", messages))
     assert bag == {
         "bag": to[3],
