@@ -54,7 +54,7 @@ class Topic(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Channel:
+class _BagChannel:
     """A topic as it stands in the file, and how many messages it has."""
 
     id: int
@@ -150,7 +150,9 @@ class BagWriter:
     stream: IO[bytes]
     types: BagTypes
     _schemas: dict[str, int] = field(init=False, default_factory=dict[str, int])
-    _channels: dict[Topic, _Channel] = field(init=False, default_factory=dict[Topic, _Channel])
+    _channels: dict[Topic, _BagChannel] = field(
+        init=False, default_factory=dict[Topic, _BagChannel]
+    )
     _first: int = field(init=False, default=(1 << 63) - 1)
     _last: int = field(init=False, default=0)
 
@@ -217,7 +219,7 @@ class BagWriter:
         with contextlib.suppress(OSError):
             self.stream.close()
 
-    def _new_channel(self, topic: Topic) -> _Channel:
+    def _new_channel(self, topic: Topic) -> _BagChannel:
         kind = self.types[topic.type]
         if kind.name not in self._schemas:
             self._schemas[kind.name] = self._writer.register_schema(
@@ -237,7 +239,7 @@ class BagWriter:
             "offered_qos_profiles": qos,
             "type_description_hash": kind.hash,
         }
-        return _Channel(number, told)
+        return _BagChannel(number, told)
 
     def _write_metadata_record(self) -> None:
         self._writer.add_metadata("rosbag2", {"serialized_metadata": self._text(self._metadata())})

@@ -105,7 +105,7 @@ class BagItems:
     """
 
     _read: Callable[[Result], ReadResult] = ReadResult
-    _cameras: dict[str, _Camera] = field(init=False, default_factory=dict[str, "_Camera"])
+    _cameras: dict[str, _BagCamera] = field(init=False, default_factory=dict[str, "_BagCamera"])
 
     def __post_init__(self) -> None:
         self.counts: BagCounts = BagCounts()
@@ -139,7 +139,7 @@ class BagItems:
             case _:
                 pass
 
-    def _of(self, name: str) -> _Camera:
+    def _of(self, name: str) -> _BagCamera:
         known = self._cameras.get(name)
         if known is None:
             base = title = ros_name(name)
@@ -147,10 +147,10 @@ class BagItems:
             while title in self._titles:
                 title, number = f"{base}_{number}", number + 1
             self._titles.add(title)
-            known = self._cameras[name] = _Camera(name, title)
+            known = self._cameras[name] = _BagCamera(name, title)
         return known
 
-    def _result(self, camera: _Camera, result: Result, error: str) -> Iterator[BagMessage]:
+    def _result(self, camera: _BagCamera, result: Result, error: str) -> Iterator[BagMessage]:
         at, stamp = nanoseconds(result.received_at), result.received_at
         parts = None if error else camera.parts(result)
         self._count(results=1, unread=bool(error), localizations=parts is not None)
@@ -164,7 +164,7 @@ class BagItems:
             yield BagMessage(camera.localizations, at, localizations(parts, frame, stamp))
             yield BagMessage(camera.detections, at, detections(parts, frame, stamp))
 
-    def _error(self, camera: _Camera, item: RecordedError) -> Iterator[BagMessage]:
+    def _error(self, camera: _BagCamera, item: RecordedError) -> Iterator[BagMessage]:
         text = f"{item.error}: {item.text}"
         if item.error not in UNREADABLE:
             self._count(errors=1)
@@ -181,7 +181,7 @@ class BagItems:
 
 
 @dataclass(eq=False)
-class _Camera:
+class _BagCamera:
     """One camera: its topics, its state as far as it was told, and containers on their way."""
 
     name: str

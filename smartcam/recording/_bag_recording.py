@@ -137,7 +137,7 @@ class BagConversion:
             return self.interpret_as
         return camera.interpret_as or "localizations"
 
-    def _reader(self, camera: RecordedCamera) -> _Reader:
+    def _reader(self, camera: RecordedCamera) -> _ResultReader:
         if camera.dialect not in BVS.dialects and camera.protocol != "bvs":
             raise UnsupportedError(
                 f"bag: camera {camera.name!r} is one of {camera.protocol or 'no known protocol'} "
@@ -150,7 +150,7 @@ class BagConversion:
         endian = camera.facts.get("endian", "0")
         if endian not in {"0", "1"}:
             raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
-        return _Reader(reading, int(endian))
+        return _ResultReader(reading, int(endian))
 
     def _see(self, item: Item) -> None:
         if isinstance(item, TraceEntry) and item.message == "StatusReport" and self._readers:
@@ -165,7 +165,7 @@ class BagConversion:
 
 
 @dataclass(eq=False)
-class _Reader:
+class _ResultReader:
     """Reads one camera's results again."""
 
     _interpretation: Interpretation

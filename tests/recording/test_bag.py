@@ -28,6 +28,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.models import (
+    CameraEvent,
     Connected,
     Disconnected,
     Header,
@@ -255,7 +256,8 @@ def test_bag_status_tells_what_the_camera_is_doing(tmp_path: Path) -> None:
         )
         for one in on("/left/status", messages)
     ]
-    no, running = (0, []), (0xC0, ["0x40", "RUNNING"])
+    no: tuple[int, list[str]] = (0, [])
+    running = (0xC0, ["0x40", "RUNNING"])
     assert told == [
         ((True, False, False, False), 0, no, ""),
         ((True, True, True, False), 0, running, ""),
@@ -489,7 +491,8 @@ def test_bag_of_one_camera_has_nothing_of_the_other(tmp_path: Path) -> None:
 
 def test_bag_of_another_protocol_is_not_read_again(tmp_path: Path) -> None:
     url = "insight://192.168.0.10"
-    items = [Connected(camera="left", at=at(0), url=url), result(1, {"A1": 3})]
+    items: list[CameraEvent | Result] = [Connected(camera="left", at=at(0), url=url)]
+    items.append(result(1, {"A1": 3}))
     recording = write(tmp_path / "run.mcap", items)
     with pytest.raises(UnsupportedError, match="only results of bvs can be read again"):
         write_bag(recording, tmp_path / "bag", interpret_as="n: int32")
