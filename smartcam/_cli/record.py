@@ -17,6 +17,7 @@ from smartcam.backoff import Backoff
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     CameraFaultError,
+    ConfigurationError,
     ConnectionClosedError,
     ConnectionLostError,
     ConnectionTakenError,
@@ -74,15 +75,23 @@ async def record(
     options: Options,
 ) -> None:
     """Record a camera."""
+    recorders = _recorders(output, bag, force=force)
+    with options.camera(url, observers=recorders, reconnect=Backoff()) as unopened:
+        await _record(unopened, recorders, every, options)
+
+
+def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Recorder]:
+    """Return what is to be written."""
     recorders: list[Recorder] = []
     if output is not None:
         recorders.append(Recorder(output, overwrite=force))
     if bag is not None:
+        if output is not None and Path(output).resolve().parent == Path(bag).resolve():
+            raise ConfigurationError(f"--output {output}: it would be in the bag's own folder")
         recorders.append(BagRecorder(bag, overwrite=force))
     if not recorders:
         raise click.UsageError("Missing option '-o' / '--output', or '--bag'.")
-    with options.camera(url, observers=recorders, reconnect=Backoff()) as unopened:
-        await _record(unopened, recorders, every, options)
+    return recorders
 
 
 async def _record(
@@ -103,6 +112,9 @@ async def _record(
                 # its frames, which would tell, are its agent's
                 dialect = camera.capabilities.dialect
                 _describe(recorders, camera.name, dialect=dialect, endian=camera.endian)
+                # what its agent knows of them, where it was not said here
+                read = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
+                _describe(recorders, camera.name, **{name: on for name, on in read.items() if on})
             elif every is None and not camera.capabilities.unasked_results:
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some triggered "

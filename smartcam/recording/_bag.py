@@ -121,7 +121,7 @@ def mcap_of(folder: Path) -> Path:
 
 def _is_of_bag(folder: Path, path: Path) -> bool:
     """Return whether a file may be a bag's own: other recordings are not taken for one."""
-    own = re.fullmatch(re.escape(folder.resolve().name) + r"(_\d+)?\.mcap", path.name)
+    own = re.fullmatch(re.escape(folder.resolve().name) + r"_\d+\.mcap", path.name)
     return (own is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
 
 

@@ -146,7 +146,12 @@ class BagConversion:
             )
         y_down = camera.facts.get("y_down") == "True" if self.y_down is None else self.y_down
         spec = self._spec(camera)
-        reading = Interpretation(spec, lenient=False, y_down=y_down, calibration=self.calibration)
+        reading = Interpretation(
+            spec,
+            lenient=camera.facts.get("lenient") == "True",
+            y_down=y_down,
+            calibration=self.calibration,
+        )
         endian = camera.facts.get("endian", "0")
         if endian not in {"0", "1"}:
             raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")

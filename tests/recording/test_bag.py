@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import struct
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,13 +40,14 @@ from smartcam.models import (
     Result,
     Status,
     StatusChanged,
+    jsonable,
 )
 from smartcam.recording import BagCounts, BagRecorder, Recorder, load_recording, write_bag
 from smartcam.recording._bag_messages import ros_name
 from smartcam.recording._bag_recording import BagConversion
 from smartcam.recording._form import nanoseconds as recorded_time
 from tests.recording.bagkit import nanoseconds, on, read, read_by_rosbags, read_raw
-from tests.recording.recordingkit import COUNTER, URL, at, container, containers, write
+from tests.recording.recordingkit import COUNTER, URL, at, container, containers, session, write
 
 if TYPE_CHECKING:
     from smartcam.recording import Recording
@@ -405,8 +407,6 @@ def test_bag_keeps_the_frame_that_a_calibration_gave(tmp_path: Path) -> None:
 def test_bag_value_that_is_nearly_a_localization_is_none(
     tmp_path: Path, broken: dict[str, Any]
 ) -> None:
-    from smartcam.models import jsonable
-
     good: dict[str, Any] = jsonable(part())
     recording = write(tmp_path / "run.mcap", [result(1, [good]), result(2, [{**good, **broken}])])
     assert write_bag(recording, tmp_path / "bag").localizations == 1
@@ -432,6 +432,27 @@ async def test_bag_interpreted_again_is_what_the_client_would_have_had(tmp_path:
         [pose.position.y for pose in poses] for poses in up
     ]
     assert [len(poses) for poses in made] == [len(poses) for poses in live]
+
+
+@pytest.mark.parametrize(
+    ("facts", "given", "y"),
+    [
+        ({}, None, 0.25),
+        ({"y_down": True}, None, -0.25),
+        ({"y_down": True}, False, 0.25),
+        ({}, True, -0.25),
+    ],
+)
+def test_bag_takes_the_axis_as_it_was_recorded(
+    tmp_path: Path, facts: dict[str, Any], given: bool | None, y: float
+) -> None:
+    raw = struct.pack("<50sfifff", b"bolt", 0.5, 0, 0.5, 0.25, 0.0)
+    items = [*session(), result(1, None, raw)]
+    recording = write(tmp_path / "run.mcap", items, **facts)
+    counts = write_bag(recording, tmp_path / "bag", interpret_as="localizations", y_down=given)
+    assert counts.localizations == 1, [one.message for one in read(tmp_path / "bag")]
+    (array,) = on("/left/localizations", read(tmp_path / "bag"))
+    assert [pose.position.y for pose in array.message.poses] == [y]
 
 
 def _folder(path: Path) -> Path:
@@ -471,8 +492,6 @@ async def test_bag_with_a_calibration_is_in_the_robots_frame(tmp_path: Path) -> 
 
 
 def test_bag_reads_again_in_the_byte_order_that_was_told(tmp_path: Path) -> None:
-    from tests.recording.recordingkit import session
-
     items = [*session(endian=1), result(1, None, b"\0\0\1\2")]
     write_bag(write(tmp_path / "run.mcap", items), tmp_path / "bag", interpret_as="n: int32")
     (one,) = on("/left/results", read(tmp_path / "bag"))

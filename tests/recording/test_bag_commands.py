@@ -133,6 +133,8 @@ def test_record_wants_a_place_and_one_that_can_be(tmp_path: Path) -> None:
         file = ["record", url, "-o", str(tmp_path / "run.mcap"), "--timeout", "1"]
         done = run(*file, "--bag", str(tmp_path / "none/bag"))
         done.failed(2, f"bag {tmp_path / 'none/bag'}: No such file or directory")
+        done = run(*file, "--bag", str(tmp_path))
+        done.failed(2, "run.mcap: it would be in the bag's own folder")
         done = run(*file, "--bag", str(tmp_path / "bag"))
         done.failed(3, "no session with bvs://")
     assert list(tmp_path.iterdir()) == []
