@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from smartcam.ros2._type_definitions import NUMBERS, Field
+from smartcam.ros2._type_definitions import NUMBERS, MessageField
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -173,7 +173,7 @@ class _Encoder(_Writer):
         for field in kind.fields:
             self.field(kind, field, f"{value}.{field.attribute}")
 
-    def field(self, kind: MessageType, field: Field, value: str) -> None:
+    def field(self, kind: MessageType, field: MessageField, value: str) -> None:
         if field.shape:
             self.many(kind, field, value)
         elif field.nested:
@@ -192,7 +192,7 @@ class _Encoder(_Writer):
             flag = code == "?"
             self.fixed("B" if flag else code, _SIZES[code], f"F[{value}]" if flag else value)
 
-    def many(self, kind: MessageType, field: Field, value: str) -> None:
+    def many(self, kind: MessageType, field: MessageField, value: str) -> None:
         array = field.shape == "array"
         least = field.size if array else 0
         name = self.name()
@@ -314,7 +314,7 @@ class _Decoder(_Writer):
         parts = [self.field(kind, field) for field in kind.fields]
         return f"{self.name(kind.cls, 'C')}({', '.join(parts)})"
 
-    def field(self, kind: MessageType, field: Field) -> str:
+    def field(self, kind: MessageType, field: MessageField) -> str:
         if field.shape:
             return self.many(kind, field)
         if field.nested:
@@ -332,7 +332,7 @@ class _Decoder(_Writer):
         self.fixed("B" if flag else code, _SIZES[code], name)
         return f"F[{name}]" if flag else name
 
-    def many(self, kind: MessageType, field: Field) -> str:
+    def many(self, kind: MessageType, field: MessageField) -> str:
         array = field.shape == "array"
         name, count = self.name(), self.name()
         if field.type in NUMBERS:

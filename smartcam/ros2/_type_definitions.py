@@ -31,7 +31,7 @@ _FIELD: Final = re.compile(
 _OLD_NAMES: Final = {"Header": "std_msgs/msg/Header"}
 
 
-class Field(NamedTuple):
+class MessageField(NamedTuple):
     """One field: ``shape`` is "" (one value), "array" (of ``size``) or "sequence" (up to ``size``).
 
     Attributes:
@@ -62,20 +62,34 @@ class Field(NamedTuple):
         """Say its type as a ``.msg`` does."""
         limit = f"<={self.limit}" if self.limit else ""
         bound = "<=" if self.shape == "sequence" and self.size else ""
-        return self.type + limit + (f"[{bound}{self.size or ''}]" if self.shape else "")
+        return (
+            self.type.replace("/msg/", "/")
+            + limit
+            + (f"[{bound}{self.size or ''}]" if self.shape else "")
+        )
 
 
-EMPTY: Final = Field("structure_needs_at_least_one_member", "uint8")
+EMPTY: Final = MessageField("structure_needs_at_least_one_member", "uint8")
 """What a message without fields has in its description and its bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """A message's fields and constants."""
+    """A message's fields and constants.
+
+    Attributes:
+        kinds: the types of its constants.
+    """
 
     name: str
-    fields: tuple[Field, ...]
+    fields: tuple[MessageField, ...]
     constants: dict[str, Any]
+    kinds: dict[str, str]
+
+    def text(self) -> str:
+        """Return its fields and constants as a ``.msg`` has them, without defaults."""
+        constants = (f"{self.kinds[name]} {name}={one}\n" for name, one in self.constants.items())
+        return "".join((*constants, *(f"{field} {field.name}\n" for field in self.fields)))
 
     def needs(self) -> set[str]:
         """Return the messages that are in it."""
@@ -104,8 +118,9 @@ def parse_message(name: str, text: str) -> Definition:
         ConfigurationError: its text is no message.
     """
     package = name.partition("/")[0]
-    fields: dict[str, Field] = {}
+    fields: dict[str, MessageField] = {}
     constants: dict[str, Any] = {}
+    kinds: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         said = line.strip()
         if not said or said.startswith("#"):
@@ -115,12 +130,12 @@ def parse_message(name: str, text: str) -> Definition:
             if field.name in fields or field.name in constants:
                 raise ValueError(f"there are two {field.name}")
             if constant:
-                constants[field.name] = field.default
+                constants[field.name], kinds[field.name] = field.default, field.type
             else:
                 fields[field.name] = field
         except (ValueError, SyntaxError) as exc:
             raise ConfigurationError(f"{name}, line {number}: {said!r:.80}: {exc}") from exc
-    return Definition(name, tuple(fields.values()), constants)
+    return Definition(name, tuple(fields.values()), constants, kinds)
 
 
 def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
@@ -135,7 +150,7 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
     return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
 
 
-def _parse_line(package: str, line: str) -> tuple[Field, bool]:
+def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
     matched = _FIELD.fullmatch(line) or _FIELD.fullmatch(line.partition("#")[0].strip())
     if matched is None:
         raise ValueError("expected a type and a name")
@@ -147,7 +162,7 @@ def _parse_line(package: str, line: str) -> tuple[Field, bool]:
     if bound and not size:
         raise ValueError("expected how many after <=")
     shape = "" if size is None else "array" if size and not bound else "sequence"
-    field = Field(matched["name"], kind, shape, int(size or 0), limit)
+    field = MessageField(matched["name"], kind, shape, int(size or 0), limit)
     if shape == "array" and not field.size:
         raise ValueError("an array of none")
     value = matched["constant"] if matched["constant"] is not None else matched["default"]
@@ -172,7 +187,7 @@ def _full_name(package: str, said: str) -> str:
     return said
 
 
-def _value(field: Field, text: str | None, *, whole: bool) -> Any:
+def _value(field: MessageField, text: str | None, *, whole: bool) -> Any:
     """Return a constant or default; a constant's text is the ``whole`` rest of its line."""
     if text is None or not (text := text.strip()) or (not whole and text.startswith("#")):
         return None
@@ -191,7 +206,7 @@ def _value(field: Field, text: str | None, *, whole: bool) -> Any:
     return _fitting(field, values) if field.shape else _fitting(field, values)[0]
 
 
-def _fitting(field: Field, values: list[Any]) -> list[Any]:
+def _fitting(field: MessageField, values: list[Any]) -> list[Any]:
     if field.nested:
         raise ValueError("a message has no default")
     most = field.size or len(values)

@@ -10,7 +10,7 @@ import hashlib
 import json
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.ros2._type_definitions import EMPTY, Definition, Field
+from smartcam.ros2._type_definitions import EMPTY, Definition, MessageField
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +27,7 @@ _BOUNDED_STRING: Final = 21
 _ARRAY, _BOUNDED, _SEQUENCE = 48, 96, 144
 
 
-def _field(field: Field) -> dict[str, Any]:
+def _field(field: MessageField) -> dict[str, Any]:
     number = _NESTED if field.nested else _IDS[field.type]
     if field.limit:
         number = _BOUNDED_STRING
@@ -65,9 +65,9 @@ def description(definition: Definition, find: Callable[[str], Definition]) -> di
     }
 
 
-def type_hash(definition: Definition, find: Callable[[str], Definition]) -> str:
+def hash_of_description(described: dict[str, Any]) -> str:
     """Return the hash of a message or service, ``RIHS01_`` and 64 digits."""
-    text = json.dumps(description(definition, find))
+    text = json.dumps(described)
     return f"RIHS01_{hashlib.sha256(text.encode()).hexdigest()}"
 
 
@@ -76,10 +76,11 @@ def event_of(name: str) -> Definition:
     return Definition(
         f"{name}_Event",
         (
-            Field("info", "service_msgs/msg/ServiceEventInfo"),
-            Field("request", f"{name}_Request", "sequence", 1),
-            Field("response", f"{name}_Response", "sequence", 1),
+            MessageField("info", "service_msgs/msg/ServiceEventInfo"),
+            MessageField("request", f"{name}_Request", "sequence", 1),
+            MessageField("response", f"{name}_Response", "sequence", 1),
         ),
+        {},
         {},
     )
 
@@ -87,5 +88,5 @@ def event_of(name: str) -> Definition:
 def service_of(name: str) -> Definition:
     """Return a service as its hash sees it."""
     parts = ("request", "response", "event")
-    fields = tuple(Field(f"{part}_message", f"{name}_{part.title()}") for part in parts)
-    return Definition(name, fields, {})
+    fields = tuple(MessageField(f"{part}_message", f"{name}_{part.title()}") for part in parts)
+    return Definition(name, fields, {}, {})

@@ -7,7 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.ros2._type_definitions import EMPTY, OTHER_NAMES, Definition, Field
+from smartcam.ros2._type_definitions import EMPTY, OTHER_NAMES, Definition, MessageField
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -76,15 +76,17 @@ def read_stored(name: str, said: Any) -> Definition:
             if isinstance(default, str):
                 default = constants.get(default)
             fields.append(_field(one, kind)._replace(default=default))
-    return Definition(name, tuple(fields), constants)
+    kinds: dict[str, str] = {one: str(OTHER_NAMES.get(kind, kind)) for one, kind, _ in said[0]}
+    return Definition(name, tuple(fields), constants, kinds)
 
 
-def _field(name: str, said: Any) -> Field:
+def _field(name: str, said: Any) -> MessageField:
     shape, size = "", 0
     if said[0] in (_ARRAY, _SEQUENCE):
         shape = "array" if said[0] == _ARRAY else "sequence"
         said, size = said[1]
     if said[0] == _NAME:
-        return Field(name, said[1], shape, size)
+        return MessageField(name, said[1], shape, size)
+    kind: str
     kind, limit = said[1]
-    return Field(name, OTHER_NAMES.get(kind, kind), shape, size, limit)
+    return MessageField(name, OTHER_NAMES.get(kind, kind), shape, size, limit)

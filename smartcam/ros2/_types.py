@@ -14,14 +14,27 @@ from smartcam.ros2._definitions import MESSAGES, SERVICES
 from smartcam.ros2._type_codec import HEAD, MisfitError, decoder, encoder
 from smartcam.ros2._type_definitions import (
     Definition,
-    Field,
+    MessageField,
     parse_message,
     parse_service,
     split_name,
 )
-from smartcam.ros2._type_hash import NOT_SUPPORTED, event_of, service_of, type_hash
+from smartcam.ros2._type_hash import (
+    NOT_SUPPORTED,
+    description,
+    event_of,
+    hash_of_description,
+    service_of,
+)
 from smartcam.ros2._type_stores import LACKING, WITHOUT_HASHES, read_stored, stored
-from smartcam.ros2._type_values import check, filled, message_class
+from smartcam.ros2._type_values import (
+    LocatedError,
+    check,
+    filled,
+    message_class,
+    rule_of,
+    zero_maker,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,19 +70,21 @@ class MessageType:
         fields: name, type, shape, bounds and default of each field.
         constants: by name; attributes of ``cls``, too.
         nested: the types of the messages within by name.
-        cls: the class of its messages, made with all fields in their order.
+        cls: the class of its messages, made with all fields in their order and looked at when they
+            are encoded: the fastest way.
     """
 
     def __init__(
-        self, definition: Definition, nested: Mapping[str, MessageType], get_hash: Callable[[], str]
+        self, definition: Definition, nested: Mapping[str, MessageType], types: RosTypes
     ) -> None:
         self.name = definition.name
         self.dds = dds_name(definition.name)
-        self.fields: tuple[Field, ...] = definition.fields
+        self.fields: tuple[MessageField, ...] = definition.fields
         self.constants = dict(definition.constants)
         self.nested = nested
         self.cls: type[RosMessage] = message_class(definition)
-        self._get_hash = get_hash
+        self._definition = definition
+        self._types = types
 
     def __repr__(self) -> str:
         return f"<MessageType {self.name}>"
@@ -77,7 +92,33 @@ class MessageType:
     @functools.cached_property
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
-        return self._get_hash()
+        return self._types.hash_of(self._definition)
+
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(self._definition, self._types.definition)
+
+    @functools.cached_property
+    def text(self) -> str:
+        """Its definition and those of all messages within, as recordings have it (``ros2msg``)."""
+        within = description(self._definition, self._types.definition)
+        parts = [self._definition.text()]
+        for one in within["referenced_type_descriptions"]:
+            name: str = one["type_name"]
+            head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
+            parts.append(head + self._types.definition(name).text())
+        return "".join(parts)
+
+    @functools.cached_property
+    def zero(self) -> Callable[[], RosMessage]:
+        """The function that makes a message of defaults and zeros."""
+        return zero_maker(self)
+
+    @functools.cached_property
+    def rules(self) -> dict[str, tuple[MessageField, Callable[[Any], Any]]]:
+        """Each field by its name in Python, and what a value for it has to stand."""
+        return {field.attribute: (field, rule_of(self, field)) for field in self.fields}
 
     @functools.cached_property
     def _encode(self) -> Callable[[Any], bytes]:
@@ -95,7 +136,7 @@ class MessageType:
         Raises:
             RosMessageError: there is no such field, or a value does not fit.
         """
-        return filled(self, fields)
+        return self._filled(fields)
 
     def encode(self, message: Any) -> bytes:
         """Return a message, or a mapping of its fields, in CDR: little-endian, with encapsulation.
@@ -104,15 +145,27 @@ class MessageType:
             RosMessageError: it is of another type, or a field does not fit.
         """
         if isinstance(message, Mapping):
-            message = filled(self, message)
+            message = self._filled(message)
         elif getattr(message, "__msgtype__", None) != self.name:
             got = getattr(message, "__msgtype__", type(message).__name__)
             raise RosMessageError(f"{self.name}: expected a message of this type, got {got}")
         try:
             return self._encode(message)
         except _MISFITS as exc:
+            raise RosMessageError(f"{self.name}: {self._reason(message) or exc}") from exc
+
+    def _filled(self, fields: Mapping[str, Any]) -> Any:
+        try:
+            return filled(self, fields)
+        except LocatedError as exc:
+            raise RosMessageError(f"{self.name}: {exc}") from exc
+
+    def _reason(self, message: Any) -> str:
+        try:
             check(self, message)
-            raise RosMessageError(f"{self.name}: a field does not fit: {exc}") from exc
+        except LocatedError as exc:
+            return str(exc)
+        return ""
 
     def decode(self, data: bytes | bytearray | memoryview) -> Any:
         """Return the message of CDR, little- or big-endian.
@@ -157,14 +210,12 @@ class ServiceType:
         response: the type of its responses.
     """
 
-    def __init__(
-        self, name: str, request: MessageType, response: MessageType, get_hash: Callable[[], str]
-    ) -> None:
+    def __init__(self, name: str, types: RosTypes) -> None:
         self.name = name
         self.dds = dds_name(name)
-        self.request = request
-        self.response = response
-        self._get_hash = get_hash
+        self.request = types.message_of(f"{name}_Request")
+        self.response = types.message_of(f"{name}_Response")
+        self._types = types
 
     def __repr__(self) -> str:
         return f"<ServiceType {self.name}>"
@@ -172,7 +223,21 @@ class ServiceType:
     @functools.cached_property
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
-        return self._get_hash()
+        return self._types.hash_of(service_of(self.name))
+
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(service_of(self.name), self._types.definition)
+
+    @functools.cached_property
+    def event(self) -> MessageType:
+        """What introspection publishes.
+
+        Raises:
+            ConfigurationError: the distribution has no introspection.
+        """
+        return self._types.message_of(f"{self.name}_Event")
 
 
 class RosTypes:
@@ -235,12 +300,7 @@ class RosTypes:
             if (made := self._services.get(name)) is None:
                 for definition in (*parse_service(name, text), event_of(name)):
                     self._definitions[definition.name] = definition
-                made = self._services[name] = ServiceType(
-                    name,
-                    self.message_of(f"{name}_Request"),
-                    self.message_of(f"{name}_Response"),
-                    functools.partial(self._hash, service_of(name)),
-                )
+                made = self._services[name] = ServiceType(name, self)
         return made
 
     def add(self, name: str, text: str) -> None:
@@ -290,6 +350,7 @@ class RosTypes:
         return made
 
     def message_of(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
+        """Return a message's type; for this module, as what follows."""
         if (made := self._messages.get(name)) is not None:
             return made
         if self._shared is not None and name not in self._added and name not in self._definitions:
@@ -302,8 +363,7 @@ class RosTypes:
                 nested = {
                     one: self.message_of(one, (*within, name)) for one in sorted(definition.needs())
                 }
-                get_hash = functools.partial(self._hash, definition)
-                made = self._messages[name] = MessageType(definition, nested, get_hash)
+                made = self._messages[name] = MessageType(definition, nested, self)
         return made
 
     def _service_text(self, name: str) -> str | None:
@@ -311,10 +371,11 @@ class RosTypes:
             return self._added[name]
         return None if name in LACKING.get(self.distribution, ()) else SERVICES.get(name)
 
-    def _hash(self, definition: Definition) -> str:
+    def hash_of(self, definition: Definition) -> str:
+        """Return a type's hash."""
         if self.distribution in WITHOUT_HASHES:
             return NOT_SUPPORTED
-        return type_hash(definition, self.definition)
+        return hash_of_description(description(definition, self.definition))
 
     def _unknown(self, name: str) -> ConfigurationError:
         close = did_you_mean(name, self.names())

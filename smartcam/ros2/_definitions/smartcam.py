@@ -16,13 +16,14 @@ geometry_msgs/PoseStamped pose  # in metres, in the frame that its header names
     "smartcam_msgs/msg/Result": """\
 # One result of a camera, as it came and as it was read.
 
-std_msgs/Header header     # when the camera sent it; the camera's frame
+std_msgs/Header header           # when it came, and the frame of its poses
 string camera_name
-uint32 application_id      # which application on the camera it is from; 0 is not known
-uint64 result_id           # counts the results of this camera
-string interpreter         # how it was read, empty where it was not
-string json                # what was read, as JSON; empty where it was not
-uint8[] data               # the camera's bytes
+uint32 application_id            # which application on the camera it is from; 0 is not known
+uint64 result_id                 # counts the results of this camera; 0 is not known
+string error                     # why it could not be read; empty when it could
+Localization[] localizations     # what was read, where that is localizations
+string json                      # what else was read, as JSON
+uint8[] data                     # the camera's bytes; none where it could not be read
 """,
     "smartcam_msgs/msg/CameraStatus": """\
 # What a camera says of itself, sent when it changes.
@@ -93,6 +94,19 @@ float64 timeout            # longest wait in seconds; 0 is as usual
 ---
 string error               # empty when it worked
 string[] strings
+""",
+    "smartcam_msgs/srv/TriggerResults": """\
+# Triggers, and returns what comes, however it is read.
+
+uint32 application_id       # which application, switched back afterwards; 0 is the active one
+uint8[] input               # input data for this inspection; none is sent where it is empty
+bool refuse_when_busy       # fail at once where the camera takes no trigger
+uint32 results_per_trigger  # how many results the application sends; 0 is one
+string interpret_as         # how to read them; empty is as usual
+float64 timeout             # longest wait in seconds; 0 is as usual
+---
+string error                # empty when it worked
+Result[] results
 """,
     "smartcam_msgs/srv/TriggerLocalization": """\
 # Triggers, and reads the result as localizations.
