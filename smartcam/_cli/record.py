@@ -31,6 +31,7 @@ from smartcam.fleet import FleetCamera
 from smartcam.recording import BagRecorder, Recorder, load_recording, write_pcap
 from smartcam.recording import replay as replay_camera
 from smartcam.recording._bag_recording import BagConversion
+from smartcam.ros2._camera_reading import in_pixels, own_interpreter
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -114,6 +115,8 @@ async def _record(
                 _describe(recorders, camera.name, dialect=dialect, endian=camera.endian)
                 # what its agent knows of them, where it was not said here
                 read = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
+                if in_pixels(own_interpreter(camera, camera.active_application)):
+                    read["pixels"] = True
                 _describe(recorders, camera.name, **{name: on for name, on in read.items() if on})
             elif every is None and not camera.capabilities.unasked_results:
                 raise UnsupportedError(
@@ -320,7 +323,7 @@ async def bag(
     if counts.unread:
         click.echo(
             f"smartcam: note: {counts.unread} of {counts.results} results could not be read: "
-            "/diagnostics says why",
+            "their messages say why",
             err=True,
         )
     _show_bag(output, counts, options)

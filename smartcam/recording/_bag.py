@@ -23,10 +23,10 @@ from smartcam.recording._form import load_extra
 from smartcam.recording._recorder import CHUNK, opened
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
-    from smartcam.recording._bag_types import BagTypes
+    from smartcam.ros2._qos import QoS
+    from smartcam.ros2._types import RosTypes
 
 VERSION = 8
 """Of the form of ``metadata.yaml``."""
@@ -36,7 +36,8 @@ METADATA = "metadata.yaml"
 _HALF = f"{METADATA}.tmp"
 
 _FOREVER = {"sec": 9_223_372_036, "nsec": 854_775_807}
-_RELIABLE, _KEEP_LAST, _TRANSIENT_LOCAL, _VOLATILE, _AUTOMATIC = 1, 1, 1, 2, 1  # rmw/types.h
+_RELIABLE, _BEST_EFFORT, _KEEP_LAST, _TRANSIENT_LOCAL, _VOLATILE, _AUTOMATIC = 1, 2, 1, 1, 2, 1
+"""``rmw/types.h``"""
 
 
 class Topic(NamedTuple):
@@ -45,12 +46,12 @@ class Topic(NamedTuple):
     Attributes:
         name: with a slash in front.
         type: of its messages.
-        latched: who comes late gets the last message, too.
+        qos: that its node offers.
     """
 
     name: str
     type: str
-    latched: bool = False
+    qos: QoS
 
 
 @dataclass(slots=True)
@@ -148,7 +149,7 @@ class BagWriter:
 
     folder: Path
     stream: IO[bytes]
-    types: BagTypes
+    types: RosTypes
     _schemas: dict[str, int] = field(init=False, default_factory=dict[str, int])
     _channels: dict[Topic, _BagChannel] = field(
         init=False, default_factory=dict[Topic, _BagChannel]
@@ -173,19 +174,19 @@ class BagWriter:
         self._write_metadata_record()
         self.flush()
 
-    def add(self, topic: Topic, at: int, fields: Mapping[str, Any]) -> None:
+    def add(self, topic: Topic, at: int, message: Any) -> None:
         """Write a message; it is on the disk after the next :meth:`flush`.
 
         Args:
             topic: where to.
             at: when it came, nanoseconds since 1970, UTC.
-            fields: its fields.
+            message: it, or a mapping of its fields.
 
         Raises:
             RosMessageError: the fields make no message of the topic's type.
             OSError: the disk fails.
         """
-        data = self.types[topic.type].encode(fields)
+        data = self.types.message(topic.type).encode(message)
         channel = self._channels.get(topic)
         if channel is None:
             channel = self._channels[topic] = self._new_channel(topic)
@@ -220,12 +221,12 @@ class BagWriter:
             self.stream.close()
 
     def _new_channel(self, topic: Topic) -> _BagChannel:
-        kind = self.types[topic.type]
+        kind = self.types.message(topic.type)
         if kind.name not in self._schemas:
             self._schemas[kind.name] = self._writer.register_schema(
-                kind.name, "ros2msg", kind.definition.encode()
+                kind.name, "ros2msg", kind.text.encode()
             )
-        qos = self._text([_qos(latched=topic.latched)]).strip()
+        qos = self._text([_policies(topic.qos)]).strip()
         number: int = self._writer.register_channel(
             topic.name,
             "cdr",
@@ -294,13 +295,13 @@ def load_yaml() -> Any:
         ) from exc
 
 
-def _qos(*, latched: bool) -> dict[str, Any]:
-    """Return a topic's offered policies: reliable, the last five; latched, the last one."""
+def _policies(qos: QoS) -> dict[str, Any]:
+    """Return a topic's offered policies."""
     return {
         "history": _KEEP_LAST,
-        "depth": 1 if latched else 5,
-        "reliability": _RELIABLE,
-        "durability": _TRANSIENT_LOCAL if latched else _VOLATILE,
+        "depth": qos.kept,
+        "reliability": _RELIABLE if qos.reliable else _BEST_EFFORT,
+        "durability": _TRANSIENT_LOCAL if qos.latched else _VOLATILE,
         "deadline": dict(_FOREVER),
         "lifespan": dict(_FOREVER),
         "liveliness": _AUTOMATIC,

@@ -26,37 +26,31 @@ from smartcam.models import (
 from smartcam.observers import TraceEntry
 from smartcam.recording._bag import Topic
 from smartcam.recording._bag_messages import (
-    DETECTIONS,
     DIAGNOSTICS,
-    ERROR,
-    OK,
-    POSE_ARRAY,
-    RESULT,
-    STALE,
     STATUS,
-    WARN,
-    detections,
     diagnostics,
-    localizations,
-    parts_of,
-    result_fields,
-    ros_name,
+    health,
     status_fields,
 )
+from smartcam.recording._bag_specs import Specs
 from smartcam.recording._form import RecordedError, nanoseconds
+from smartcam.ros2._camera_status import OK, WARN
+from smartcam.ros2._messages import DETECTIONS, POSES, RESULT, ResultMessages, utf8
+from smartcam.ros2._names import as_name
+from smartcam.ros2._qos import DEFAULT, DRIVER, LATCHED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-_DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS)
+    from smartcam.ros2._types import RosTypes
+
+_DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
 
 _CONTAINERS = 64
 """Containers that are kept until what became of them is told: many came in one burst."""
 
 UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
 """Errors that say why a container could not be read."""
-
-_FAULTS = Status.OVERHEAT | Status.SYSTEM_ERROR
 
 
 class BagCounts(NamedTuple):
@@ -65,7 +59,7 @@ class BagCounts(NamedTuple):
     Attributes:
         messages: all of them.
         results: results, each on the topic ``results``; those that could not be read, too.
-        unread: of these, the ones that could not be read; ``/diagnostics`` says why.
+        unread: of these, the ones that could not be read; their messages say why.
         localizations: of these, the ones that are localizations, which two more topics have.
         errors: other errors, on ``/diagnostics``.
     """
@@ -78,11 +72,11 @@ class BagCounts(NamedTuple):
 
 
 class BagMessage(NamedTuple):
-    """A message for a bag: where, when (nanoseconds since 1970, UTC), and its fields."""
+    """A message for a bag: where, when (nanoseconds since 1970, UTC), and the message or fields."""
 
     topic: Topic
     at: int
-    fields: Mapping[str, Any]
+    message: Any
 
 
 class ReadResult(NamedTuple):
@@ -101,9 +95,11 @@ class BagItems:
     """Makes messages of items, in order; knows the state of each camera.
 
     Args:
+        types: of the messages.
         read: what each result goes through; default as it is.
     """
 
+    _types: RosTypes
     _read: Callable[[Result], ReadResult] = ReadResult
     _cameras: dict[str, _BagCamera] = field(init=False, default_factory=dict[str, "_BagCamera"])
 
@@ -111,10 +107,13 @@ class BagItems:
         self.counts: BagCounts = BagCounts()
         self._titles: set[str] = set()
 
-    def describe(self, facts: Mapping[str, str]) -> None:
+    def describe(self, facts: Mapping[str, Any]) -> None:
         """Take facts about a camera, as a recorder is told them."""
-        camera = self._of(facts["camera"])
-        camera.spec = facts.get("interpret_as", camera.spec)
+        if {"interpret_as", "pixels"} & facts.keys():
+            camera = self._of(facts["camera"])
+            camera.facts.update(facts)
+            pixels = camera.facts.get("pixels") == "True"
+            camera.specs = Specs(camera.facts.get("interpret_as", ""), pixels=pixels)
 
     def messages(self, item: object) -> Iterator[BagMessage]:
         """Yield what an item comes to; nothing of frames, which ROS has no message for."""
@@ -142,27 +141,35 @@ class BagItems:
     def _of(self, name: str) -> _BagCamera:
         known = self._cameras.get(name)
         if known is None:
-            base = title = ros_name(name)
+            base = title = topic_of_camera(name)
             number = 2
             while title in self._titles:
                 title, number = f"{base}_{number}", number + 1
             self._titles.add(title)
-            known = self._cameras[name] = _BagCamera(name, title)
+            known = self._cameras[name] = _BagCamera(
+                name, title, ResultMessages(self._types, name, name)
+            )
         return known
 
     def _result(self, camera: _BagCamera, result: Result, error: str) -> Iterator[BagMessage]:
-        at, stamp = nanoseconds(result.received_at), result.received_at
-        parts = None if error else camera.parts(result)
+        at, made = nanoseconds(result.received_at), camera.make
+        if result.application < 0:  # it does not say whose it is
+            result = result._replace(application=0)
+        parts = None if error else camera.specs.parts(result)
+        frames = {one.pose.header.frame_id for one in parts or ()}
         self._count(results=1, unread=bool(error), localizations=parts is not None)
-        how = "" if error else camera.interpreter(result)
-        yield BagMessage(camera.results, at, result_fields(result, camera.name, stamp, how))
-        if error:  # its message has no field for that
-            facts = {"application_id": result.application, "result_id": result.number}
-            yield camera.warning(stamp, error, **facts)
-        if parts is not None:
-            frame = parts[0].pose.header.frame_id if parts else camera.name
-            yield BagMessage(camera.localizations, at, localizations(parts, frame, stamp))
-            yield BagMessage(camera.detections, at, detections(parts, frame, stamp))
+        if error:
+            message = made.result(result._replace(value=result.raw), None)
+            message.error = utf8(error)
+        else:
+            message = made.result(result, parts)
+        yield BagMessage(camera.results, at, message)
+        if len(frames) > 1:  # each of its own; an array has one
+            text = f"result {result.number}: poses in several frames: {', '.join(sorted(frames))}"
+            yield camera.warning(result.received_at, text)
+        elif parts is not None:
+            yield BagMessage(camera.localizations, at, made.poses(result, parts))
+            yield BagMessage(camera.detections, at, made.detections(result, parts))
 
     def _error(self, camera: _BagCamera, item: RecordedError) -> Iterator[BagMessage]:
         text = f"{item.error}: {item.text}"
@@ -170,7 +177,7 @@ class BagItems:
             self._count(errors=1)
             yield camera.warning(item.at, text, triggered_at=item.triggered_at)
             return
-        application, raw, at = camera.unread() or (-1, b"", item.at)
+        application, raw, at = camera.unread() or (0, b"", item.at)
         result = Result(item.camera, application, None, 0, item.triggered_at, at, None, raw, None)
         found = self._read(result) if raw else ReadResult(result)
         yield from self._result(camera, found.result, found.error if found.again else text)
@@ -186,20 +193,21 @@ class _BagCamera:
 
     name: str
     title: str  # for topics
+    make: ResultMessages
     url: str = ""
     connected: bool = False
     status: Status | None = None
     application: int | None = None
     why: str = ""  # it is not connected
-    spec: str = ""  # how its results are read, as far as is known
+    facts: dict[str, Any] = field(default_factory=dict[str, Any])  # that were told
+    specs: Specs = field(default_factory=Specs)  # how its results are read
 
     def __post_init__(self) -> None:
-        self.results = Topic(f"/{self.title}/results", RESULT)
-        self.localizations = Topic(f"/{self.title}/localizations", POSE_ARRAY)
-        self.detections = Topic(f"/{self.title}/detections", DETECTIONS)
-        self._status = Topic(f"/{self.title}/status", STATUS, latched=True)
+        self.results = Topic(f"/{self.title}/results", RESULT, DRIVER)
+        self.localizations = Topic(f"/{self.title}/localizations", POSES, DRIVER)
+        self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
+        self._status = Topic(f"/{self.title}/status", STATUS, LATCHED)
         self._told: object = None  # of the last diagnostics
-        self._locating: set[int] = set()  # applications whose results are localizations
         self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
@@ -220,23 +228,16 @@ class _BagCamera:
     def state(self, at: datetime) -> Iterator[BagMessage]:
         """Yield the state for its topic, and for the diagnostics what is new to them."""
         when = nanoseconds(at)
-        yield BagMessage(
-            self._status,
-            when,
-            status_fields(
-                self.name,
-                at,
-                connected=self.connected,
-                status=self.status,
-                application=self.application,
-                error=self.why,
-            ),
+        level, text = health(self.status, connected=self.connected, why=self.why)
+        fields = status_fields(
+            self.name,
+            at,
+            connected=self.connected,
+            status=self.status,
+            application=self.application,
         )
-        level, text = OK, "connected"
-        if not self.connected:
-            level, text = (ERROR, f"not connected: {self.why}") if self.why else (STALE, "starting")
-        elif self.status is not None and self.status & _FAULTS:
-            level, text = ERROR, " ".join((self.status & _FAULTS).names)
+        error = "" if level == OK else text
+        yield BagMessage(self._status, when, {**fields, "error": utf8(error)})
         if (level, text, self.application) != self._told:
             self._told = (level, text, self.application)
             told = diagnostics(self.title, self.url, at, level, text, application=self.application)
@@ -247,23 +248,7 @@ class _BagCamera:
         told = diagnostics(self.title, self.url, at, WARN, text, **values)
         return BagMessage(_DIAGNOSTICS, nanoseconds(at), told)
 
-    # ------------------------------------------------------------------ results
-
-    def parts(self, result: Result) -> list[Localization] | None:
-        """Return a result's localizations; None where it has none, and where [] may be anything."""
-        parts = parts_of(result.value)
-        if parts:
-            self._locating.add(result.application)
-        known = result.application in self._locating or self.spec.startswith("localizations")
-        return parts if known else None
-
-    def interpreter(self, result: Result) -> str:
-        """Return how a result was read, "" where its value is nothing but its bytes."""
-        value = result.value
-        if value is None or isinstance(value, bytes) or value_is_hex(value, result.raw):
-            return ""
-        known = "localizations" if result.application in self._locating else "unknown"
-        return self.spec or known
+    # ------------------------------------------------------------------ containers
 
     def see_frame(self, entry: TraceEntry) -> None:
         """Keep a container until it is told what became of it."""
@@ -291,9 +276,9 @@ class _BagCamera:
         return known
 
 
-def value_is_hex(value: object, raw: bytes) -> bool:
-    """Return whether a recorded value is the bytes as a recording shows them."""
-    return isinstance(value, str) and value == raw.hex()
+def topic_of_camera(name: str) -> str:
+    """Return a camera's name as its topics have it, which is its node's name, too."""
+    return "/".join(part for part in as_name(name).split("/") if part) or "camera"
 
 
 def parts_from_json(value: object) -> list[Localization] | None:

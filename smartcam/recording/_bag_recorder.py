@@ -8,15 +8,19 @@ from typing import TYPE_CHECKING
 from smartcam.exceptions import RosMessageError
 from smartcam.recording._bag import BagWriter, load_yaml, make_folder, remove_folder
 from smartcam.recording._bag_items import BagCounts, BagItems
-from smartcam.recording._bag_types import BagTypes
 from smartcam.recording._form import load_extra
 from smartcam.recording._recorder import Description, Recorder
+from smartcam.ros2._types import RosTypes
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.observers import TraceEntry
     from smartcam.recording._form import Item
+
+
+DISTRIBUTION = "jazzy"
+"""Whose message definitions a bag has; those that it uses are the same in the ones after it."""
 
 
 def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
@@ -26,7 +30,7 @@ def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
         ConfigurationError: it cannot be made.
         MissingExtraError: a library is not installed.
     """
-    types = BagTypes()
+    types = RosTypes(DISTRIBUTION)
     load_extra("mcap.writer")
     load_yaml()
     return BagWriter(folder, make_folder(folder, overwrite=overwrite), types)
@@ -78,7 +82,7 @@ class _BagFile:
     _writer: BagWriter
 
     def __post_init__(self) -> None:
-        self.items = BagItems()
+        self.items = BagItems(self._writer.types)
         self.start, self.flush = self._writer.start, self._writer.flush
         self.finish, self.close = self._writer.finish, self._writer.close
 

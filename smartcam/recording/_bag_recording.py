@@ -20,7 +20,8 @@ from smartcam.protocols._bvs import BVS
 from smartcam.protocols.messages import ResultContainer
 from smartcam.recording._bag import remove_folder
 from smartcam.recording._bag_items import BagCounts, BagItems, ReadResult, parts_from_json
-from smartcam.recording._bag_recorder import open_bag
+from smartcam.recording._bag_recorder import DISTRIBUTION, open_bag
+from smartcam.ros2._types import RosTypes
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -94,9 +95,9 @@ class BagConversion:
         )
         again = self.interpret_as is not None or self.calibration is not None
         self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
-        self._items = BagItems(self._read)
+        self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
         for one in chosen:
-            said = {"interpret_as": str(self._spec(one))} if again else one.facts
+            said = {"interpret_as": self._spec(one)} if again else one.facts
             self._items.describe({**said, "camera": one.name})
 
     @property
@@ -165,6 +166,8 @@ class BagConversion:
         """Return a result as it goes into the bag."""
         if self._readers:
             return self._readers[result.camera].read(result)
+        if result.value == result.raw.hex():  # as bytes stand in a recording
+            return ReadResult(result._replace(value=result.raw))
         parts = parts_from_json(result.value)
         return ReadResult(result if parts is None else result._replace(value=parts))
 

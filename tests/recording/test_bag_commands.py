@@ -79,7 +79,7 @@ def test_bag_command_tells_what_could_not_be_read(recorded: Path, tmp_path: Path
     assert done.code == 0
     assert done.err == (
         f"smartcam: note: {told['unread']} of {told['results']} results could not be read: "
-        "/diagnostics says why\n"
+        "their messages say why\n"
     )
     (again,) = run(*command, "--interpret-as", "localizations", "--force").done().lines
     assert (again["unread"], again["localizations"]) == (0, told["results"])
