@@ -30,8 +30,8 @@ class Specs:
                 said = ast.literal_eval(said)
             except (ValueError, SyntaxError, MemoryError, RecursionError):
                 said = ""
-        by_application: dict[Any, Any] = said if hasattr(said, "items") else {None: said}
-        self._known = {key: _resolved(one) for key, one in by_application.items()}
+        specs: Any = said if hasattr(said, "items") else {None: said}
+        self._known = {key: _resolved(one) for key, one in specs.items()}
         self._pixels = pixels
         self._with_parts: set[int] = set()  # applications that gave some
 

@@ -47,6 +47,7 @@ from smartcam.recording._bag_items import topic_of_camera
 from smartcam.recording._bag_recording import BagConversion
 from smartcam.recording._form import nanoseconds as recorded_time
 from smartcam.ros2._camera_status import TROUBLES
+from smartcam.ros2._type_stores import stored
 from tests.recording.bagkit import nanoseconds, on, read, read_by_rosbags, read_raw
 from tests.recording.recordingkit import COUNTER, URL, at, container, containers, session, write
 
@@ -611,6 +612,7 @@ def test_bag_without_a_library_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
+    stored.cache_clear()
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\['):
         BagRecorder(tmp_path / "bag").open()
     assert list(tmp_path.iterdir()) == []
