@@ -25,8 +25,8 @@ from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, ap
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.probe import probe
 from smartcam._cli.record import bag, pcap, record, replay
-from smartcam._cli.running import JsonErrors
 from smartcam._cli.ros2 import ros2
+from smartcam._cli.running import JsonErrors
 from smartcam._cli.serve import serve
 from smartcam._cli.sheet import sheet
 from smartcam._cli.terminal import counting
