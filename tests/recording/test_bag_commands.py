@@ -85,6 +85,7 @@ def test_bag_command_tells_what_could_not_be_read(recorded: Path, tmp_path: Path
     assert (again["unread"], again["localizations"]) == (0, told["results"])
 
 
+@pytest.mark.long
 def test_bag_command_with_a_calibration_wants_what_it_was_made_with(
     recorded: Path, tmp_path: Path
 ) -> None:
