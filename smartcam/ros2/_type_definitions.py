@@ -111,6 +111,12 @@ def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
     return matched[1], matched[2], matched[3]
 
 
+def dds_name(name: str) -> str:
+    """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
+    package, kind, own = name.split("/")
+    return f"{package}::{kind}::dds_::{own}_"
+
+
 def parse_message(name: str, text: str) -> Definition:
     """Return what a ``.msg`` says.
 
@@ -148,6 +154,13 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
     if len(parts) != 2:
         raise ConfigurationError(f"{name}: expected one line --- between request and response")
     return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
+
+
+def bare(said: Any) -> Any:
+    """Return the fields of a message, or of a service's two, without defaults."""
+    if isinstance(said, tuple):
+        return [bare(one) for one in said]
+    return [one._replace(default=None) for one in said.fields]
 
 
 def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:

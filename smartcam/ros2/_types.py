@@ -15,6 +15,8 @@ from smartcam.ros2._type_codec import HEAD, MisfitError, decoder, encoder
 from smartcam.ros2._type_definitions import (
     Definition,
     MessageField,
+    bare,
+    dds_name,
     parse_message,
     parse_service,
     split_name,
@@ -53,12 +55,6 @@ _MISFITS: Final = (
     AttributeError,
 )
 """What the written functions raise where a message or its bytes do not fit."""
-
-
-def dds_name(name: str) -> str:
-    """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
-    package, kind, own = name.split("/")
-    return f"{package}::{kind}::dds_::{own}_"
 
 
 class MessageType:
@@ -154,6 +150,13 @@ class MessageType:
         except _MISFITS as exc:
             raise RosMessageError(f"{self.name}: {self._reason(message) or exc}") from exc
 
+    def _flat(self, data: object) -> memoryview:
+        """Return bytes of other kinds of buffers, one after the other."""
+        if not isinstance(data, bytearray | memoryview):
+            raise RosMessageError(f"{self.name}: expected bytes, got {type(data).__name__}")
+        view = memoryview(data)
+        return view.cast("B") if view.c_contiguous else memoryview(view.tobytes())
+
     def _filled(self, fields: Mapping[str, Any]) -> Any:
         try:
             return filled(self, fields)
@@ -176,7 +179,7 @@ class MessageType:
             RosMessageError: the bytes are no such message, or too few, or too many.
         """
         if not isinstance(data, bytes):
-            data = _flat(self.name, data)
+            data = self._flat(data)
         order = _ORDERS.get(bytes(data[:2]))
         if order is None or len(data) < len(HEAD):
             raise RosMessageError(
@@ -321,7 +324,7 @@ class RosTypes:
                     there: Any = parse(name, self._service_text(name) or "")
                 else:
                     there = self.definition(name)
-                if _fields(there) != _fields(said):
+                if bare(there) != bare(said):
                     raise ConfigurationError(
                         f"{name}: {self.distribution} has it with other fields, expected the same"
                     )
@@ -392,17 +395,3 @@ class _Shared(RosTypes):
 @functools.cache
 def _shared(distribution: str) -> _Shared:
     return _Shared(distribution)
-
-
-def _flat(name: str, data: object) -> memoryview:
-    """Return bytes of other kinds of buffers, one after the other."""
-    if not isinstance(data, bytearray | memoryview):
-        raise RosMessageError(f"{name}: expected bytes, got {type(data).__name__}")
-    view = memoryview(data)
-    return view.cast("B") if view.c_contiguous else memoryview(view.tobytes())
-
-
-def _fields(said: Any) -> Any:
-    if isinstance(said, tuple):
-        return [_fields(one) for one in said]
-    return [one._replace(default=None) for one in said.fields]
