@@ -16,7 +16,6 @@ from smartcam.models import Status
 from smartcam.ros2._lifecycle import (
     STATES,
     TRANSITIONS,
-    UNCONFIGURED,
     Lifecycle,
     LifecycleTransition,
 )
@@ -152,8 +151,7 @@ class CameraLifecycle(Lifecycle):
         while True:
             try:
                 await self._camera.wait_connected(PATIENCE)
-                if self.state is UNCONFIGURED:
-                    await self.configure()
+                await self.configure()
                 await self.activate()
             except (LinkError, ResponseTimeoutError) as exc:
                 why = str(exc)

@@ -184,24 +184,29 @@ class Lifecycle:
         """A transition that was asked for begins."""
 
     async def configure(self) -> None:
-        """From Unconfigured to Inactive; as :meth:`change`."""
-        await self.change("configure")
+        """Have it configured: from Unconfigured to Inactive, else nothing; as :meth:`change`."""
+        await self._have("configure", INACTIVE, ACTIVE)
 
     async def activate(self) -> None:
-        """From Inactive to Active; as :meth:`change`."""
-        await self.change("activate")
+        """Have it active: from Inactive to Active, else nothing; as :meth:`change`."""
+        await self._have("activate", ACTIVE)
 
     async def deactivate(self) -> None:
-        """From Active to Inactive; as :meth:`change`."""
-        await self.change("deactivate")
+        """Have it not active: from Active to Inactive, else nothing; as :meth:`change`."""
+        await self._have("deactivate", INACTIVE, UNCONFIGURED)
 
     async def cleanup(self) -> None:
-        """From Inactive to Unconfigured; as :meth:`change`."""
-        await self.change("cleanup")
+        """Have it not configured: from Inactive to Unconfigured, else nothing; as `change`."""
+        await self._have("cleanup", UNCONFIGURED)
 
     async def shutdown(self) -> None:
-        """To Finalized, for good; as :meth:`change`."""
-        await self.change("shutdown")
+        """Have it Finalized, for good; as :meth:`change`."""
+        await self._have("shutdown", FINALIZED)
+
+    async def _have(self, label: str, *enough: LifecycleState) -> None:
+        await self.settled()
+        if self.closed or self.state not in enough:
+            await self.change(label)
 
     async def close(self) -> None:
         """Give up what is under way, and be Finalized. Idempotent."""

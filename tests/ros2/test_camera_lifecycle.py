@@ -157,8 +157,8 @@ async def test_one_transition_at_a_time() -> None:
         running -= 1
 
     life = Lifecycle("/cam3", {"configure": work, "cleanup": work}, 5.0)
-    tasks = [asyncio.create_task(life.configure()) for _ in range(3)]
-    cleanup = asyncio.create_task(life.cleanup())
+    tasks = [asyncio.create_task(life.change("configure")) for _ in range(3)]
+    cleanup = asyncio.create_task(life.change("cleanup"))
     await asyncio.sleep(1.0)
     assert life.state.label == "configuring"
     gate.set()
@@ -167,6 +167,39 @@ async def test_one_transition_at_a_time() -> None:
     assert all(isinstance(one, RosError) for one in outcomes[1:3])
     assert outcomes[3] is None
     assert life.state.label == "unconfigured"
+
+
+@pytest.mark.parametrize("state", WAYS)
+async def test_what_is_so_already_is_no_transition(state: str) -> None:
+    """The methods say what is to be had, where services say what is to be done."""
+    had = {
+        "unconfigured": {"cleanup", "deactivate"},
+        "inactive": {"configure", "deactivate"},
+        "active": {"configure", "activate"},
+        "finalized": {"shutdown"},
+    }
+    for label in LABELS[:5]:
+        life = await _in_state(state)
+        steps: list[Any] = []
+        life.listen(steps.append)
+        method = getattr(life, label)
+        if label in had[state]:
+            await method()
+            assert (life.state.label, steps) == (state, [])
+        elif (state, label) in GOALS:
+            await method()
+            assert life.state.label == GOALS[state, label]
+        else:
+            with pytest.raises(RosError, match=label):
+                await method()
+
+
+async def test_who_asks_while_it_starts_by_itself_waits_for_it() -> None:
+    async with away(8, autostart=True) as one:
+        await until(lambda: one.state == "configuring" or one.camera.connected)
+        await one.seen.lifecycle.configure()
+        await one.seen.lifecycle.activate()
+        assert one.state == "active"
 
 
 async def test_who_gives_up_does_not_end_a_transition() -> None:

@@ -158,6 +158,45 @@ async def test_closing_in_the_middle_of_a_transition() -> None:
         await until(lambda: not one.viewer.graph.of_node(FULL))
 
 
+@pytest.mark.long
+@pytest.mark.real_time
+async def test_nodes_come_and_go_while_others_call_and_listen() -> None:
+    """What stands on the engine's threads ends whatever they are doing."""
+    place = free_place()
+    status = "smartcam_msgs/msg/CameraStatus"
+    async with (
+        box() as emulated,
+        smartcam.connect(emulated.url, name=NAME, reconnect=FAST) as camera,
+        Node("viewer", listen=place, domain=7) as viewer,
+        Node("anchor", connect=place, domain=7) as anchor,
+    ):
+        state = viewer.client(f"{FULL}/get_state", f"{LIFE}GetState")
+        answers = 0
+
+        async def ask() -> None:
+            nonlocal answers
+            while True:
+                with contextlib.suppress(SmartCamError):
+                    await state.call(timeout=1.0)
+                    answers += 1
+
+        asking = [asyncio.create_task(ask()) for _ in range(4)]
+        for number in range(60):
+            node = Node("cam3", namespace="/line1", context=anchor.context)
+            async with CameraNode(camera, node) as made:
+                statuses = viewer.subscribe(f"{FULL}/status", status, qos=LATCHED)
+                assert (await soon(anext(statuses))).connected
+                statuses.close()
+                await until(lambda made=made: made.lifecycle.active)
+                await asyncio.sleep(0.01 * (number % 7))
+            await until(lambda: not viewer.graph.of_node(FULL))
+        for task in asking:
+            task.cancel()
+        await asyncio.wait(asking)
+        assert answers > 60
+        assert viewer.graph.nodes() == ["/anchor", "/viewer"]
+
+
 # ---------------------------------------------------------------------- parameters
 
 
