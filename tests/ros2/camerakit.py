@@ -87,14 +87,14 @@ class PaperNode:
         self.missing: set[str] = set()
         """Types that it does not have."""
 
-    def publisher(self, topic: str, type: str, *, qos: QoS) -> PaperPublisher:  # noqa: A002
+    def publisher(self, topic: str, type: str, *, qos: QoS) -> PaperPublisher:
         name = resolve(topic, self.namespace, self.name, "topic")
         if type in self.missing:
             raise ConfigurationError(f"no {type}")
         made = self.publishers[name] = PaperPublisher(self, name, type, qos)
         return made
 
-    def serve(self, service: str, type: str, handler: Any) -> Any:  # noqa: A002
+    def serve(self, service: str, type: str, handler: Any) -> Any:
         name = resolve(service, self.namespace, self.name, "service")
         self.handlers[name] = (self.types.service(type), handler)
         return SimpleNamespace(close=lambda: self.handlers.pop(name))

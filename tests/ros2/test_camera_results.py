@@ -12,10 +12,11 @@ import pytest
 
 import smartcam
 from smartcam import Camera
+from smartcam._client.supervisor import TAKEN_WITHIN
 from smartcam._zenoh import with_ports
 from smartcam.exceptions import ConfigurationError, RosError
 from smartcam.ros2 import Node, QoS
-from smartcam.ros2._camera_results import CameraResults
+from smartcam.ros2._camera_results import MOST_WAITING, CameraResults
 from smartcam.ros2._messages import DETECTIONS, POSES, RESULT
 from smartcam.ros2._qos import DRIVER
 from tests.client.clientkit import FAST
@@ -90,15 +91,16 @@ async def test_topics_are_a_drivers() -> None:
         assert all(one.closed for one in node.publishers.values())
 
 
-async def test_a_thousand_results_come_once_and_in_order_whoever_triggered() -> None:
+@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.long)])
+async def test_results_come_once_and_in_order_whoever_triggered(count: int) -> None:
     async with published(box=PartsCamera(active=RUNNING)) as (_, camera, node, results):
         direct = camera.results()
-        await until(lambda: results.taken >= 1000)
+        await until(lambda: results.taken >= count)
         await results.close()
-        wanted = [(await anext(direct)).value[0].feature_id for _ in range(1000)]
+        wanted = [(await anext(direct)).value[0].feature_id for _ in range(count)]
         for topic in TOPICS:
             assert len(node.said(topic)) == results.taken
-        said = node.said("results")[:1000]
+        said = node.said("results")[:count]
         assert [one.localizations[0].feature_id for one in said] == wanted
         assert [one.result_id for one in said] == sorted({one.result_id for one in said})
         stamps = [(one.header.stamp.sec, one.header.stamp.nanosec) for one in said]
@@ -107,22 +109,21 @@ async def test_a_thousand_results_come_once_and_in_order_whoever_triggered() -> 
 
 
 async def test_reconnects_lose_nothing_that_came_and_repeat_nothing() -> None:
-    async with published(box=PartsCamera(active=RUNNING), reconnect=FAST) as it:
-        _, camera, node, results = it
+    box = PartsCamera(active=RUNNING, rate=2.0)
+    async with published(box=box, reconnect=FAST) as (_, camera, node, results):
         direct = camera.results()
-        for turn in range(1, 6):
-            await until(lambda turn=turn: results.taken >= 20 * turn)
+        for turn in range(1, 4):
+            await asyncio.sleep(TAKEN_WITHIN + 1)
             inside(camera)._connection.require_link().abort(ConnectionResetError("pulled"))
             await until(lambda turn=turn: camera.statistics().sessions > turn)
-        await until(lambda: results.taken >= 150)
-        await results.close()
-        direct.close()
-        said = [one.localizations[0].feature_id for one in node.said("results")]
-        numbers = [int(one.removeprefix("run")) for one in said]
-        assert numbers == sorted(set(numbers))
-        assert results.taken == direct.statistics().offered - direct.statistics().queued or (
-            results.taken <= direct.statistics().offered
-        )
+        await asyncio.sleep(5)
+        await camera.stop()
+        await until(lambda: results.taken == camera.statistics().received)
+        wanted = [(await anext(direct)).number for _ in range(results.taken)]
+        assert [one.result_id for one in node.said("results")] == wanted
+        assert len(wanted) == len(node.said("localizations")) > 60
+        runs = [one.localizations[0].feature_id for one in node.said("results")]
+        assert len({*runs}) == len(runs)
 
 
 async def test_values_of_other_kinds_are_results_without_poses() -> None:
@@ -277,12 +278,12 @@ async def test_slow_reader_of_nothing_harms_nobody() -> None:
     async with published(box=PartsCamera(active=RUNNING)) as (_, camera, _, results):
         assert results._stream is not None
         await until(lambda: results.taken > 10)
-        for _ in range(3000):
+        for _ in range(2 * MOST_WAITING):
             for stream in inside(camera)._listeners.results:
                 stream.offer(smartcam.InterpretationError("late"), 0.0)
-        assert results.dropped >= 3000 - 1024
+        assert results.dropped >= MOST_WAITING
         (account,) = camera.statistics().subscribers
-        assert account.queued <= 1024
+        assert account.queued <= MOST_WAITING
 
 
 # ---------------------------------------------------------------------- a topic of one's choice
@@ -291,7 +292,7 @@ async def test_slow_reader_of_nothing_harms_nobody() -> None:
 async def test_topic_of_choice_has_a_delay_and_a_queue() -> None:
     async with published() as (_, camera, node, results):
         loop = asyncio.get_running_loop()
-        results.publish_on("outputs", 10.0, 2)
+        results.publish_on("outputs", 0.5, 2)
         began = loop.time()
         for _ in range(5):
             await camera.trigger()
@@ -300,7 +301,7 @@ async def test_topic_of_choice_has_a_delay_and_a_queue() -> None:
         assert (said.type.name, said.qos) == (RESULT, QoS(depth=2))
         assert [one.result_id for one in said.messages] == [1]
         await until(lambda: len(said.messages) == 3)
-        assert loop.time() - began >= 20.0
+        assert loop.time() - began >= 1.0
         assert [one.result_id for one in said.messages] == [1, 4, 5]
         assert results.dropped == 2
         assert len(node.said("results")) == 5
@@ -367,38 +368,49 @@ async def test_results_of_other_programs_are_published_once() -> None:
 
 
 @pytest.mark.real_time
-async def test_another_node_hears_each_result_once_over_tcp() -> None:
+@pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.long)])
+async def test_another_node_hears_each_result_once_over_tcp(count: int) -> None:
     (place,) = with_ports(["tcp/127.0.0.1:0"])
-    box = PartsCamera(active=RUNNING, rate=1000.0)
     async with (
         asyncio.timeout(60),
         Node("cam3", namespace="/line1", listen=place) as node,
         Node("viewer", connect=place) as viewer,
-        published(node, box) as (_, camera, _, results),
+        published(node) as (_, camera, _, results),
     ):
         kinds = dict(zip(TOPICS, (RESULT, POSES, DETECTIONS), strict=True))
         heard = {
-            topic: viewer.subscribe(f"/line1/cam3/{topic}", kind, qos=QoS(depth=5000))
-            for topic, kind in kinds.items()
+            topic: viewer.subscribe(f"/line1/cam3/{topic}", kind) for topic, kind in kinds.items()
         }
         await until(lambda: all(one.heard for one in results._publishers.values()))
-        direct = camera.results(max_queue=5000)
-        wanted = [await anext(direct) for _ in range(300)]
-        first = wanted[0].number
-        said = {topic: await _first(one, wanted[0]) for topic, one in heard.items()}
-        for topic, one in heard.items():
-            said[topic] += [await anext(one) for _ in range(299)]
-        assert [one.result_id for one in said["results"]] == [*range(first, first + 300)]
-        xs = [one.value[0].pose.position.x for one in wanted]
-        assert [one.poses[0].position.x for one in said["localizations"]] == xs
-        assert [one.detections[0].bbox.center.position.x for one in said["detections"]] == xs
+        for number in range(1, count + 1):
+            got = await camera.trigger()
+            said, poses, found = [await anext(one) for one in heard.values()]
+            assert (said.result_id, bytes(said.data)) == (number, got.raw)
+            xs = [one.pose.position.x for one in got.value]
+            assert [one.position.x for one in poses.poses] == xs
+            assert [one.bbox.center.position.x for one in found.detections] == xs
+        assert all(one.statistics().queued == 0 for one in heard.values())
+        assert camera.statistics().received == results.taken == count
 
 
-async def _first(heard: Any, wanted: Any) -> list[Any]:
-    """Return the message of a result, the first that counts, in a list."""
-    stamp = wanted.received_at.microsecond * 1000
-    async for message in heard:
-        moment = message.header.stamp
-        if (moment.sec, moment.nanosec) == (int(wanted.received_at.timestamp()), stamp):
-            return [message]
-    raise AssertionError("it never came")
+@pytest.mark.real_time
+@pytest.mark.long
+async def test_results_at_once_reach_another_node() -> None:
+    """The engine drops what it gets faster than the link takes it, so there is a pause."""
+    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    async with (
+        asyncio.timeout(60),
+        Node("cam3", namespace="/line1", listen=place) as node,
+        Node("viewer", connect=place) as viewer,
+        published(node) as (_, camera, _, results),
+    ):
+        heard = viewer.subscribe("/line1/cam3/results", RESULT, qos=QoS(depth=1000))
+        await until(lambda: results.heard)
+        got = await camera.trigger()
+        await until(lambda: results.taken == 1)
+        await anext(heard)
+        for number in range(1000):
+            for stream in inside(camera)._listeners.results:
+                stream.offer(got._replace(number=number), 0.0)
+        said = [(await anext(heard)).result_id for _ in range(1000)]
+        assert said == [*range(1000)]
