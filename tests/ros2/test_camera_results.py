@@ -280,7 +280,9 @@ async def test_slow_reader_of_nothing_harms_nobody() -> None:
         await until(lambda: results.taken > 10)
         for _ in range(2 * MOST_WAITING):
             for stream in inside(camera)._listeners.results:
-                stream.offer(smartcam.InterpretationError("late"), 0.0)
+                stream.offer(
+                    smartcam.InterpretationError("late"), asyncio.get_running_loop().time()
+                )
         assert results.dropped >= MOST_WAITING
         (account,) = camera.statistics().subscribers
         assert account.queued <= MOST_WAITING
@@ -411,6 +413,6 @@ async def test_results_at_once_reach_another_node() -> None:
         await anext(heard)
         for number in range(1000):
             for stream in inside(camera)._listeners.results:
-                stream.offer(got._replace(number=number), 0.0)
+                stream.offer(got._replace(number=number), asyncio.get_running_loop().time())
         said = [(await anext(heard)).result_id for _ in range(1000)]
         assert said == [*range(1000)]
