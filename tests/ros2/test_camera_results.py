@@ -188,7 +188,7 @@ async def test_what_a_calibration_refuses_is_no_camera_pose() -> None:
         def to_robot(self, parts: Any) -> Any:
             raise smartcam.CalibrationError("outside")
 
-    options = {"interpret_as": "localizations", "calibration": Refuses()}
+    options: dict[str, Any] = {"interpret_as": "localizations", "calibration": Refuses()}
     async with published(**options) as (_, camera, node, results):
         with pytest.raises(smartcam.InterpretationError):
             await camera.trigger()
@@ -205,7 +205,7 @@ async def test_calibrated_results_are_in_the_robots_frame() -> None:
             header = parts[0].pose.header._replace(frame_id="base_link")
             return [one._replace(pose=one.pose._replace(header=header)) for one in parts]
 
-    options = {"interpret_as": READ_AS[PIXELS], "calibration": Robot()}
+    options: dict[str, Any] = {"interpret_as": READ_AS[PIXELS], "calibration": Robot()}
     async with published(box=PartsCamera(active=PIXELS), **options) as (_, camera, node, results):
         await camera.trigger()
         await until(lambda: results.taken == 1)
@@ -262,7 +262,7 @@ async def test_publisher_that_fails_is_told_and_the_next_result_comes(
         broken = node.publishers["/line1/cam3/localizations"]
         for error in (RosError("closed"), ValueError("a bug")):
 
-            def publish(_: Any, error: Exception = error) -> None:
+            def publish(message: Any, error: Exception = error) -> None:
                 raise error
 
             broken.publish = publish  # type: ignore[method-assign]
