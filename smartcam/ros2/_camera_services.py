@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from smartcam.camera import Camera
     from smartcam.ros2._camera_results import CameraResults
+    from smartcam.settings import Address
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
@@ -43,8 +44,7 @@ class CameraServices:
         node: its node.
         results: of the camera, which are published.
         life: the node's life cycle.
-        device_url: where the camera itself is, for a fleet's, whose own address is the fleet's.
-        publish_status: publish the status on a topic, none for an empty text; None: that cannot be.
+        address: where the camera itself is, for a fleet's, whose own address is the fleet's.
     """
 
     def __init__(
@@ -54,13 +54,10 @@ class CameraServices:
         results: CameraResults,
         life: ManagedCamera,
         *,
-        device_url: Callable[[], str | None] | None = None,
-        publish_status: Callable[[str], None] | None = None,
+        address: Address | None = None,
     ) -> None:
         self._camera, self._node, self._results = camera, node, results
-        self._thesis = ThesisServices(
-            camera, node, results, life, device_url=device_url, publish_status=publish_status
-        )
+        self._thesis = ThesisServices(camera, node, results, life, address=address)
         self._std: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
             "trigger": ("Trigger", self._trigger),
             "start": ("Trigger", self._start),
@@ -93,6 +90,7 @@ class CameraServices:
     async def close(self) -> None:
         """Serve no more; calls under way are given up. Idempotent, bounded."""
         served = self._withdraw()
+        await self._thesis.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 for one in served:

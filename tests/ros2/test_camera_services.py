@@ -19,6 +19,8 @@ from smartcam.ros2 import Node
 from smartcam.ros2._camera_results import CameraResults
 from smartcam.ros2._camera_services import CameraServices
 from smartcam.ros2._messages import RESULT
+from smartcam.ros2._qos import LATCHED
+from smartcam.settings import parse_address
 from tests.fleet.fleetkit import Plant, until
 from tests.ros2.camerakit import (
     BOTH,
@@ -52,7 +54,7 @@ async def parts(
 
 @contextlib.asynccontextmanager
 async def served(
-    box: PartsCamera | None = None, life: Any = None, more: Any = None, **options: Any
+    box: PartsCamera | None = None, life: Any = None, **options: Any
 ) -> AsyncIterator[tuple[PartsCamera, Camera[Any], PaperNode]]:
     """A camera that is served on paper."""
     options.setdefault("interpret_as", READ_AS)
@@ -60,7 +62,7 @@ async def served(
     async with (
         made,
         smartcam.connect(made.url, name="line1/cam3", **options) as camera,
-        parts(camera, node, life, **(more or {})),
+        parts(camera, node, life),
     ):
         yield made, camera, node
 
@@ -374,7 +376,7 @@ async def test_what_the_life_cycle_refuses_is_told(caplog: pytest.LogCaptureFixt
         ({"camera_model_name": "no such"}, "no such"),
         ({"interpret_as": "50ByteStrings"}, "how its results are read"),
         ({"interpret_as": "no such"}, "no such"),
-        ({"topic_status": "/status"}, "expected an empty text"),
+        ({"topic_status": "no topic"}, "no topic"),
     ],
 )
 async def test_setup_that_means_something_else(fields: dict[str, str], text: str) -> None:
@@ -386,13 +388,37 @@ async def test_setup_that_means_something_else(fields: dict[str, str], text: str
 
 
 async def test_setup_knows_where_the_camera_is() -> None:
-    topics: list[str] = []
-    async with served(more={"publish_status": topics.append}) as (box, _, node):
-        place = {"con_address": "127.0.0.1", "port": str(box.port), "topic_status": "/status"}
+    async with served() as (box, _, node):
+        place = {"con_address": "127.0.0.1", "port": str(box.port)}
         assert (await node.call("SmartcameraSetup", **place)).error == ""
         assert (await node.call("SmartcameraSetup", con_address=box.url)).error == ""
+
+
+async def test_setup_has_the_status_published() -> None:
+    async with served(reconnect=None) as (box, _, node):
+        reply = await node.call("SmartcameraSetup", topic_status="status")
+        assert reply.error == ""
+        status = node.publishers["/line1/status"]
+        assert (status.type.name, status.qos) == ("smartcam_msgs/msg/CameraStatus", LATCHED)
+        await until(lambda: status.messages)
+        await node.call("stop")
+        await until(lambda: not status.messages[-1].running)
+        assert status.messages[0].running
+        await node.call("SmartcameraSetup", topic_status="/line1/status")
+        assert not status.closed
+        await box.stop()
+        await until(lambda: not status.messages[-1].connected)
+        assert status.messages[-1].error
         await node.call("SmartcameraStop")
-        assert topics == ["/status", "", ""]
+        assert status.closed
+
+
+async def test_status_topic_moves_and_the_nodes_own_needs_nothing() -> None:
+    async with served() as (_, _, node):
+        for topic in ("a", "b", "/line1/cam3/status"):
+            assert (await node.call("SmartcameraSetup", topic_status=topic)).error == ""
+        assert [node.publishers[f"/line1/{one}"].closed for one in "ab"] == [True, True]
+        assert "/line1/cam3/status" not in node.publishers
 
 
 # ---------------------------------------------------------------------- a fleet's, and over TCP
@@ -401,7 +427,7 @@ async def test_setup_knows_where_the_camera_is() -> None:
 async def test_camera_of_a_fleet_is_served_as_any() -> None:
     async with Plant() as plant, plant.cameras(2) as (own, other):
         node, box = PaperNode("cam1"), plant.box
-        async with parts(own, node, device_url=lambda: box.url):
+        async with parts(own, node, address=parse_address(box.url)):
             reply = await node.call("trigger_results")
             assert [json.loads(one.json) for one in reply.results] == [{"run": 1, "token": 0}]
             place = {"con_address": "127.0.0.1", "port": str(box.port)}
