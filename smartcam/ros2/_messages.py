@@ -196,7 +196,7 @@ class ResultMessages:
         return self._cls.Result(
             self.header(result.received_at, frame_id),
             self._camera,
-            result.application,
+            max(result.application, 0),  # -1 where a camera does not say it
             result.number,
             error,
             self.localizations(parts or ()),

@@ -16,7 +16,7 @@ from smartcam._client.supervisor import TAKEN_WITHIN
 from smartcam._zenoh import with_ports
 from smartcam.exceptions import ConfigurationError, RosError
 from smartcam.ros2 import Node, QoS
-from smartcam.ros2._camera_results import MOST_WAITING, CameraResults
+from smartcam.ros2._camera_results import CameraResults
 from smartcam.ros2._messages import DETECTIONS, POSES, RESULT
 from smartcam.ros2._qos import DRIVER
 from tests.client.clientkit import FAST
@@ -273,19 +273,17 @@ async def test_publisher_that_fails_is_told_and_the_next_result_comes(
     assert "a result was not published" in caplog.text
 
 
-async def test_slow_reader_of_nothing_harms_nobody() -> None:
-    """Results wait in a queue with a bound while the loop has no turn for them."""
-    async with published(box=PartsCamera(active=RUNNING)) as (_, camera, _, results):
-        assert results._stream is not None
-        await until(lambda: results.taken > 10)
-        for _ in range(2 * MOST_WAITING):
-            for stream in inside(camera)._listeners.results:
-                stream.offer(
-                    smartcam.InterpretationError("late"), asyncio.get_running_loop().time()
-                )
-        assert results.dropped >= MOST_WAITING
-        (account,) = camera.statistics().subscribers
-        assert account.queued <= MOST_WAITING
+async def test_results_that_wait_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("smartcam.ros2._camera_results.MOST_WAITING", 8)
+    async with published() as (_, camera, node, results):
+        got = await camera.trigger()
+        await until(lambda: results.taken == 1)
+        (stream,) = inside(camera)._listeners.results
+        for number in range(20):  # in one turn of the loop
+            stream.offer(got._replace(number=number), asyncio.get_running_loop().time())
+        await until(lambda: results.taken == 9)
+        said = [one.result_id for one in node.said("results")]
+        assert (said, results.dropped) == ([1, *range(12, 20)], 12)
 
 
 # ---------------------------------------------------------------------- a topic of one's choice

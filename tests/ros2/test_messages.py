@@ -136,6 +136,11 @@ def test_result_has_what_came() -> None:
     assert got.localizations[0].feature_id == "part"
 
 
+def test_result_of_no_known_application_says_0() -> None:
+    got = read(RESULT, messages().result(result(None, application=-1), None))
+    assert (got.application_id, got.error) == (0, "")
+
+
 @pytest.mark.parametrize(
     "value",
     [["one", "zwölf"], {"x": 1.5, "ok": True}, [], "text", None, 3],
