@@ -48,8 +48,8 @@ class CameraResults:
 
     A header's stamp is when a result arrived, by the clock of the machine that has the session (of
     a camera of a fleet: its agent's); no protocol of these cameras says when it was made. Results
-    that arrived together have the same one. Its ``frame_id`` is the camera's, or the robot's where a
-    calibration brought it there.
+    that arrived together have the same one. Its ``frame_id`` is the camera's, or the robot's where
+    a calibration brought it there.
 
     What cannot be read has only a message on ``~/results``, with its ``error``. Localizations in
     pixels stand there as JSON, and nowhere else: the other topics have metres.
