@@ -1,191 +1,139 @@
-"""A node that only notes what is published and served, on the loop's time; and emulated cameras."""
+"""What tests of a camera's node share: a camera that numbers its parts, and a node of paper."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from collections.abc import Awaitable, Callable
+from types import SimpleNamespace
+from typing import Any
 
-import smartcam
-from smartcam.backoff import Backoff
-from smartcam.emulator import Application, EmulatedCamera
-from smartcam.exceptions import RosError
-from smartcam.ros2._camera_node import CameraNode, CameraNodeOptions
+from smartcam.emulator import Application, EmulatedCamera, Run
+from smartcam.emulator._application import LOCALIZATIONS
+from smartcam.exceptions import ConfigurationError, RosError
+from smartcam.ros2._names import full_name, resolve
+from smartcam.ros2._qos import QoS
 from smartcam.ros2._types import RosTypes
 
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+PARTS, TEXTS, RUNNING, BROKEN, PIXELS, BOTH = 1, 2, 3, 4, 5, 6
+"""Applications of :class:`PartsCamera`."""
 
-NAME = "line1/cam3"
-FAST = Backoff(initial=0.01, maximum=0.05, jitter=0.0)
-COUNTER, OTHER = 11, 12
-
-TYPES = RosTypes()
-
-
-class Published(NamedTuple):
-    """A message, and when it was published."""
-
-    at: float
-    message: Any
+READ_AS: dict[int, Any] = {
+    PARTS: "localizations",
+    TEXTS: "strings50",
+    RUNNING: "localizations",
+    BROKEN: "localizations",
+    PIXELS: "localizations: (x: real32 px, y: real32 px)*",
+    BOTH: "localizations",
+}
 
 
-class NotedPublisher:
-    """Notes what is published, as who hears it would read it."""
+class PartsCamera(EmulatedCamera):
+    """An emulated camera whose parts say which run found them: two each time.
 
-    def __init__(self, node: NotedNode, topic: str, kind: str, qos: Any) -> None:
-        self.node, self.topic, self.qos = node, topic, qos
-        self.type = TYPES.message(kind)
-        self.heard = True
-        self.fails = False
-        self.closed = False
-        self.said: list[Published] = []
+    Args:
+        time: seconds of a run, and of a switch.
+        rate: runs in a second of application 3, which runs by itself.
+        **options: as an emulated camera has them.
+    """
 
-    def publish(self, message: Any = None, /, **fields: Any) -> None:
-        if self.closed or self.fails:
-            raise RosError(f"{self.topic}: this publisher is closed")
-        data = self.type.encode(fields if message is None else message)
-        self.said.append(Published(asyncio.get_running_loop().time(), self.type.decode(data)))
+    def __init__(self, *, time: float = 0.001, rate: float = 500.0, **options: Any) -> None:
+        self.runs = 0
+        common: dict[str, Any] = {"load_time": time, "layout": LOCALIZATIONS}
+        found = {**common, "generator": self._found}
+        texts = [{"text": "one"}, {"text": "two"}]
+        made: list[Any] = [
+            {**found, "id": PARTS, "processing_time": time},
+            {**common, "id": TEXTS, "layout": "(text: string[50])*", "constant": texts},
+            {**found, "id": RUNNING, "rate": rate},
+            {**common, "id": BROKEN, "layout": "text: string[9]", "constant": {"text": "no part"}},
+            {**common, "id": PIXELS, "layout": "(x: real32, y: real32)*", "constant": [[320, 240]]},
+            {**common, "id": BOTH, "constant": []},
+        ]
+        options.setdefault("running", True)
+        super().__init__([Application(**one) for one in made], builtins=False, **options)
+        self.runs = 0  # an application tries its values when it is made
 
-    def publish_encoded(self, data: bytes) -> None:
-        self.publish(self.type.decode(data))
+    def _found(self, run: Run) -> list[dict[str, Any]]:
+        self.runs += 1
+        one = {"feature_id": f"run{self.runs}", "quality": 0.5, "photo_index": 0}
+        first = {**one, "x": 0.001 * self.runs, "y": -0.25, "theta": 0.5}
+        return [first, {**first, "photo_index": 1, "x": -0.125}]
+
+
+class PaperPublisher:
+    """Keeps what is published, as who hears it would read it."""
+
+    def __init__(self, node: PaperNode, name: str, kind: str, qos: QoS) -> None:
+        self.name, self.qos, self.heard, self.closed = name, qos, True, False
+        self.type = node.types.message(kind)
+        self.messages: list[Any] = []
+
+    def publish(self, message: Any) -> None:
+        assert not self.closed
+        self.messages.append(self.type.decode(self.type.encode(message)))
 
     def close(self) -> None:
         self.closed = True
 
 
-class NotedService:
-    """A service that is called without a wire."""
+class PaperNode:
+    """What the parts of a camera's node use of one, in memory."""
 
-    def __init__(self, kind: str, handler: Callable[[Any], Awaitable[Any]]) -> None:
-        self.type = TYPES.service(kind)
-        self.handler = handler
-        self.closed = False
+    def __init__(self, name: str = "cam3", namespace: str = "/line1") -> None:
+        self.name, self.namespace = name, namespace
+        self.full_name = full_name(namespace, name)
+        self.types = RosTypes()
+        self.publishers: dict[str, PaperPublisher] = {}
+        self.handlers: dict[str, tuple[Any, Callable[[Any], Awaitable[Any]]]] = {}
+        self.missing: set[str] = set()
+        """Types that it does not have."""
 
-    async def call(self, **fields: Any) -> Any:
-        request = self.type.request.decode(self.type.request.encode(fields))
-        reply = await self.handler(request)
-        return self.type.response.decode(self.type.response.encode(reply))
-
-    def close(self) -> None:
-        self.closed = True
-
-
-class NotedNode:
-    """As a node of ROS 2, or of ROS 1 without what that does not have."""
-
-    def __init__(self, *, ros1: bool = False, parameters: Any = None) -> None:
-        self.name, self.namespace, self.full_name = "cam3", "/line1", f"/{NAME}"
-        self.types = TYPES
-        self.graph: object = None if ros1 else object()
-        self.parameters = parameters
-        self.topics: dict[str, NotedPublisher] = {}
-        self.services: dict[str, NotedService] = {}
-        self.refuses = ""
-        self.open = False
-
-    async def __aenter__(self) -> Self:
-        self.open = True
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.open = False
-
-    def publisher(self, topic: str, type: str, *, qos: Any = None) -> NotedPublisher:
-        if topic == self.refuses:
-            raise RosError(f"{topic}: refused")
-        made = self.topics[topic] = NotedPublisher(self, topic, type, qos)
+    def publisher(self, topic: str, type: str, *, qos: QoS) -> PaperPublisher:
+        name = resolve(topic, self.namespace, self.name, "topic")
+        if type in self.missing:
+            raise ConfigurationError(f"no {type}")
+        made = self.publishers[name] = PaperPublisher(self, name, type, qos)
         return made
 
-    def serve(
-        self, service: str, type: str, handler: Callable[[Any], Awaitable[Any]], **_: Any
-    ) -> NotedService:
-        made = self.services[service] = NotedService(type, handler)
-        return made
+    def serve(self, service: str, type: str, handler: Any) -> Any:
+        name = resolve(service, self.namespace, self.name, "service")
+        self.handlers[name] = (self.types.service(type), handler)
+        return SimpleNamespace(close=lambda: self.handlers.pop(name))
 
-    @property
-    def still_declared(self) -> list[str]:
-        """What was declared and is not closed."""
-        ends: dict[str, Any] = {**self.topics, **self.services}
-        return sorted(name for name, one in ends.items() if not one.closed)
+    def said(self, topic: str) -> list[Any]:
+        """Return the messages of a topic."""
+        return self.publishers[f"{self.full_name}/{topic}"].messages
 
-    def last(self, topic: str) -> Any:
-        """The last message of a topic."""
-        return self.topics[topic].said[-1].message
-
-    def steps(self) -> list[tuple[str, str]]:
-        """The transitions that were told, as states that were left and entered."""
-        said = [one.message for one in self.topics["~/transition_event"].said]
-        return [(one.start_state.label, one.goal_state.label) for one in said]
-
-    async def change(self, label: str = "", number: int = 0) -> bool:
-        """Ask for a transition."""
-        wanted = {"id": number, "label": label}
-        reply = await self.services["~/change_state"].call(transition=wanted)
-        return bool(reply.success)
+    async def call(self, service: str, **fields: Any) -> Any:
+        """Call a service, over bytes both ways."""
+        kind, handler = self.handlers[f"{self.full_name}/{service}"]
+        request = kind.request.decode(kind.request.encode(fields))
+        return kind.response.decode(kind.response.encode(await handler(request)))
 
 
-def box(**options: Any) -> EmulatedCamera:
-    """Return an emulated camera that counts."""
-    counts: list[Any] = [{"n": number} for number in range(1, 100)]
-    options.setdefault("running", True)
-    return EmulatedCamera(
-        [
-            Application(id=COUNTER, layout="n: int32", cycle=counts, load_time=0.05),
-            Application(id=OTHER, layout="n: int32", cycle=counts, load_time=0.05),
-        ],
-        builtins=False,
-        **options,
-    )
+class Life:
+    """A life cycle that goes where it is asked to, unless it is told to fail."""
 
+    def __init__(self, label: str = "unconfigured") -> None:
+        self.state = SimpleNamespace(label=label)
+        self.asked: list[str] = []
+        self.error: Exception | None = None
 
-class Seen(NamedTuple):
-    """An emulated camera, its client, and its node."""
+    def _go(self, what: str, start: str, goal: str) -> None:
+        self.asked.append(what)
+        if self.error is not None:
+            raise self.error
+        if self.state.label != start:
+            raise RosError(f"{what}: it is {self.state.label}")
+        self.state.label = goal
 
-    box: EmulatedCamera
-    camera: Any
-    node: NotedNode
-    seen: CameraNode
+    async def configure(self) -> None:
+        self._go("configure", "unconfigured", "inactive")
 
-    @property
-    def state(self) -> str:
-        return self.seen.lifecycle.state.label
+    async def activate(self) -> None:
+        self._go("activate", "inactive", "active")
 
+    async def deactivate(self) -> None:
+        self._go("deactivate", "active", "inactive")
 
-@contextlib.asynccontextmanager
-async def seen(
-    emulated: EmulatedCamera | None = None,
-    node: NotedNode | None = None,
-    client: dict[str, Any] | None = None,
-    **options: Any,
-) -> AsyncIterator[Seen]:
-    """Give a camera that is seen in ROS."""
-    node = node or NotedNode()
-    settings = {"name": NAME, "reconnect": FAST, "interpret_as": "n: int32", **(client or {})}
-    async with (
-        emulated or box() as one,
-        smartcam.connect(one.url, **settings) as camera,
-        CameraNode(camera, node, options=CameraNodeOptions(**options)) as made,
-    ):
-        await until(lambda: node.topics["/diagnostics"].said)
-        yield Seen(one, camera, node, made)
-
-
-async def until(true: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait until something is true."""
-    async with asyncio.timeout(seconds):
-        while not true():  # noqa: ASYNC110 - of what nothing tells
-            await asyncio.sleep(0.02)
-
-
-@contextlib.asynccontextmanager
-async def away(seconds: float, **options: Any) -> AsyncIterator[Seen]:
-    """Give a camera that is seen in ROS while it is away, for so long."""
-    node, retry = NotedNode(), Backoff(initial=5.0, maximum=5.0, jitter=0.0)
-    settings: dict[str, Any] = {"name": NAME, "reconnect": retry, "connect_timeout": 2.0}
-    async with box() as emulated, smartcam.connect(emulated.url, **settings) as camera:
-        emulated.inject({"kind": "refuse", "seconds": seconds}, {"kind": "close"})
-        await until(lambda: not camera.connected)
-        async with CameraNode(camera, node, options=CameraNodeOptions(**options)) as made:
-            await until(lambda: node.topics["/diagnostics"].said)
-            yield Seen(emulated, camera, node, made)
+    async def cleanup(self) -> None:
+        self._go("cleanup", "inactive", "unconfigured")

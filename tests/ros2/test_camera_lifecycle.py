@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import smartcam
 from smartcam.exceptions import CommandRejectedError, RosError, SmartCamError
 from smartcam.ros2._lifecycle import PRIVATE, STATES, TRANSITIONS, Lifecycle
-from tests.ros2.camerakit import COUNTER, OTHER, TYPES, NotedNode, away, box, seen, until
+from tests.ros2.nodekit import COUNTER, OTHER, TYPES, NotedNode, away, box, seen, until
 
 WAYS = {
     "unconfigured": [],

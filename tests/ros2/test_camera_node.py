@@ -18,7 +18,7 @@ from smartcam.ros2._parameters import RosParameters
 from smartcam.ros2._qos import LATCHED
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import Plant
-from tests.ros2.camerakit import COUNTER, FAST, NAME, OTHER, NotedNode, away, box, seen, until
+from tests.ros2.nodekit import COUNTER, FAST, NAME, OTHER, NotedNode, away, box, seen, until
 from tests.ros2.roskit import free_place, soon
 
 FULL = f"/{NAME}"

@@ -12,7 +12,7 @@ import smartcam
 from smartcam.ros2._camera_node import CameraNode, CameraNodeOptions
 from smartcam.ros2._camera_status import ERROR, OK, STALE, WARN, status_fields
 from smartcam.ros2._qos import LATCHED
-from tests.ros2.camerakit import COUNTER, NAME, OTHER, NotedNode, Seen, away, box, seen, until
+from tests.ros2.nodekit import COUNTER, NAME, OTHER, NotedNode, Seen, away, box, seen, until
 from tests.timed_loop import spend
 
 DIAGNOSTICS, STATUS = "/diagnostics", "~/status"
@@ -126,7 +126,7 @@ async def test_nothing_is_made_where_nobody_hears() -> None:
 
 async def test_a_camera_that_goes_and_comes_back() -> None:
     async with seen() as one:
-        before = _statuses(one)[0]
+        before, since = _statuses(one)[0], _values(one)["connected since"]
         one.box.inject({"kind": "refuse", "seconds": 5}, {"kind": "close"})
         await until(lambda: not _statuses(one)[-1].connected)
         gone = _statuses(one)[-1]
@@ -140,6 +140,7 @@ async def test_a_camera_that_goes_and_comes_back() -> None:
         assert (back.status, back.error) == (before.status, "")
         await _until_diagnosed(one, OK)
         assert _values(one)["reconnects"] == "1"
+        assert _values(one)["connected since"] > since
         assert _values(one)["last error"] != ""
 
 
