@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-STATUS = "smartcam_msgs/msg/CameraStatus"
+STATUS_TYPE = "smartcam_msgs/msg/CameraStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 MOST_EVENTS = 64
@@ -158,7 +158,7 @@ class CameraStatus:
 
     def start(self) -> None:
         """Say how the camera is, and go on doing so."""
-        self._status = self._node.publisher("~/status", STATUS, qos=LATCHED)
+        self._status = self._node.publisher("~/status", STATUS_TYPE, qos=LATCHED)
         self._ends.append(self._status)
         self._diagnostics = self._node.publisher("/diagnostics", DIAGNOSTICS, qos=DEFAULT)
         self._ends.append(self._diagnostics)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple
 
 import pytest
@@ -158,6 +158,10 @@ async def test_closing_in_the_middle_of_a_transition() -> None:
         await until(lambda: not one.viewer.graph.of_node(FULL))
 
 
+def _is_active(made: CameraNode) -> Callable[[], bool]:
+    return lambda: made.lifecycle.active
+
+
 @pytest.mark.long
 @pytest.mark.real_time
 async def test_nodes_come_and_go_while_others_call_and_listen() -> None:
@@ -187,7 +191,7 @@ async def test_nodes_come_and_go_while_others_call_and_listen() -> None:
                 statuses = viewer.subscribe(f"{FULL}/status", status, qos=LATCHED)
                 assert (await soon(anext(statuses))).connected
                 statuses.close()
-                await until(lambda made=made: made.lifecycle.active)
+                await until(_is_active(made))
                 await asyncio.sleep(0.01 * (number % 7))
             await until(lambda: not viewer.graph.of_node(FULL))
         for task in asking:
