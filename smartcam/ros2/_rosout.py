@@ -61,6 +61,7 @@ class RosOut:
         self._node, self._logger = node, logger
         self._waiting: collections.deque[dict[str, Any]] = collections.deque(maxlen=MOST_WAITING)
         self._handed = 0  # to the publisher
+        self._lock = threading.Lock()
         self._woken = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._publisher: RosPublisher | None = None
@@ -92,7 +93,7 @@ class RosOut:
         self._publisher = None
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
-                while publisher.published + publisher.dropped < self._handed:
+                while publisher.published + publisher.dropped < self._handed:  # noqa: ASYNC110
                     await asyncio.sleep(LOOK_AGAIN)  # a thread says them
         except TimeoutError:
             pass  # the network does not take them
@@ -101,9 +102,10 @@ class RosOut:
 
     def _take(self, record: logging.LogRecord) -> None:
         """Take a record in; in the thread that logs."""
-        if len(self._waiting) == MOST_WAITING:
-            self.dropped += 1
-        self._waiting.append(self._said(record))
+        said = self._said(record)
+        with self._lock:  # for no longer than this
+            self.dropped += len(self._waiting) == MOST_WAITING
+            self._waiting.append(said)
         if not self._woken and self._loop is not None:
             self._woken = True
             with contextlib.suppress(RuntimeError):  # the loop is closed, and so is all
