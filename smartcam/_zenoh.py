@@ -31,11 +31,14 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 RUNTIME = (
-    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
+    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(worker_threads:2),"
     "app:(worker_threads:1))"
 )
-"""Zenoh's threads: one for everything, which halves the CPU time of a call; its callbacks here only
-put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
+"""Zenoh's threads: one for what comes and goes, which halves the CPU time of a call; its callbacks
+here only put what comes into a queue. Its inner tasks have two of their own: where a session of a
+router is freed, or a latched publisher is closed, the binding waits for such a task and lets no
+thread of Python run meanwhile, also not the one that is to call back. The variable ZENOH_RUNTIME
+goes before it."""
 
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
@@ -421,7 +424,7 @@ class _LoopBell:
 
     def ring(self) -> None:
         """Have the loop call; once, however often it is rung before."""
-        with contextlib.suppress(ValueError):  # it is closed, and nobody hears any more
+        with contextlib.suppress(ValueError, OSError):  # closed: nobody hears any more
             self._file.write(_ONE)
 
     def _hear(self) -> None:
