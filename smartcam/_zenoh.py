@@ -240,6 +240,8 @@ class ZenohSession:
             opening.add_done_callback(_close_late)
             raise
         self._end_lingering()
+        self._waiting.clear()
+        self._bytes, self._woken = 0, False
         self._bell = _LoopBell.on(loop, self._drain)
         return self
 

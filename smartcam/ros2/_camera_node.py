@@ -16,6 +16,7 @@ from smartcam.ros2._camera_parameters import CameraParameters
 from smartcam.ros2._camera_results import CameraResults
 from smartcam.ros2._camera_services import CameraServices
 from smartcam.ros2._camera_status import CameraStatus
+from smartcam.ros2._rosout import RosOut
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -84,6 +85,7 @@ PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
     lambda one: one.status,
     lambda one: one.results,
     lambda one: one.services,
+    lambda one: one.rosout(),
     lambda one: one.lifecycle,
 )
 """What a node is made of, in the order in which it starts; the life cycle is the last, so that what
@@ -130,13 +132,27 @@ class CameraNode(Server):
         self.status = CameraStatus(camera, node, options, lambda: self.lifecycle.state.label)
         self.results = CameraResults(camera, node, frame_id=self.frame_id)
         self.results.active = False
-        self.services = CameraServices(camera, node, self.results, self.lifecycle)
+        settings = options.settings or camera.settings
+        self.services = CameraServices(
+            camera, node, self.results, self.lifecycle, address=settings.address
+        )
         self.lifecycle.listen(self._on_transition)
 
     @property
     def frame_id(self) -> str:
         """The frame of what it sees."""
         return self.options.frame_id or self.camera.name
+
+    def rosout(self) -> RosOut | None:
+        """Return what has the camera's warnings in ``/rosout``; None in ROS 1."""
+        if self.node.parameters is None:
+            return None
+        begins = (f"{self.camera.name} ", f"{self.camera.name}:")
+
+        def wanted(record: logging.LogRecord) -> bool:
+            return record.getMessage().startswith(begins)
+
+        return RosOut(self.node, logging.getLogger("smartcam"), wanted=wanted)
 
     def _on_transition(self, _: object) -> None:
         self.results.active = self.lifecycle.active
