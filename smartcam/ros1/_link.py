@@ -1,0 +1,225 @@
+"""The WebSocket to a rosbridge, made again whenever it is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import json
+import logging
+import socket
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import urlsplit
+
+from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.ros1._json_messages import Part, Raw
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import aiohttp
+
+    from smartcam.backoff import Backoff
+    from smartcam.ros1._outbox import Outbox
+
+logger: logging.Logger = logging.getLogger("smartcam.ros1")
+
+CONNECT_TIMEOUT = 10.0
+"""Seconds until a bridge has answered the handshake."""
+STALLED = 10.0
+"""Seconds that a bridge may take to read one message."""
+HEARTBEAT = 10.0
+"""Seconds of silence after which it is asked whether it is there; half of them to answer."""
+LIVED = 5.0
+"""Seconds that a link must have lived for the next try to come at once."""
+LARGEST = 8 << 20
+"""Bytes of a message from a bridge; a longer one ends the link."""
+
+
+class Listener(Protocol):
+    """What hears of a link."""
+
+    def came(self) -> None:
+        """Hear that there is a bridge: say what is to be advertised."""
+
+    def heard(self, operation: dict[str, Any]) -> None:
+        """Hear an operation; never waits."""
+
+    async def lost(self) -> None:
+        """Hear that the bridge is gone."""
+
+
+def checked_url(url: str) -> str:
+    """Return a bridge's URL.
+
+    Raises:
+        ConfigurationError: there can be no bridge.
+    """
+    example = "ws://192.168.0.5:9090"
+    try:
+        parts = urlsplit(url)
+        usable = parts.scheme in {"ws", "wss"} and parts.hostname and parts.port != 0
+    except ValueError:
+        usable = False
+    if not usable:
+        raise ConfigurationError(f"no rosbridge: expected a URL such as {example}, got {url!r:.80}")
+    return url
+
+
+def _aiohttp() -> Any:
+    try:
+        import aiohttp
+    except ImportError as exc:
+        raise MissingExtraError(
+            'a rosbridge needs aiohttp: pip install "smartcam[web]"', extra="web"
+        ) from exc
+    return aiohttp
+
+
+def link_errors() -> tuple[type[Exception], ...]:
+    """Return what a link that cannot be had, or breaks, raises."""
+    return OSError, TimeoutError, _aiohttp().ClientError
+
+
+@contextlib.asynccontextmanager
+async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
+    """Have a WebSocket to a bridge; what it has not read at the end is thrown away.
+
+    Raises:
+        OSError, aiohttp.ClientError, TimeoutError: there is none.
+    """
+    aiohttp = _aiohttp()
+    timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=1.0)
+    async with aiohttp.ClientSession() as session:
+        async with asyncio.timeout(CONNECT_TIMEOUT):
+            web = await session.ws_connect(
+                url, timeout=timeout, heartbeat=HEARTBEAT, max_msg_size=LARGEST
+            )
+        try:
+            yield web
+            await web.close()
+        finally:
+            peer = web.get_extra_info("socket")
+            if peer is not None:
+                with contextlib.suppress(OSError):
+                    peer.shutdown(socket.SHUT_RDWR)  # or what waits would be kept for it
+
+
+def text_of(parts: tuple[Part, ...]) -> str:
+    """Return the text of a short operation."""
+    return "".join(
+        base64.b64encode(one.data).decode() if isinstance(one, Raw) else one for one in parts
+    )
+
+
+async def long_text_of(parts: tuple[Part, ...]) -> str:
+    """Return the text of an operation; the loop has its turns with a long one."""
+    pieces: list[str] = []
+    for part in parts:
+        if isinstance(part, str):
+            pieces.append(part)
+            continue
+        for number, chunk in enumerate(part.chunks()):
+            if number:
+                await asyncio.sleep(0)
+            pieces.append(base64.b64encode(chunk).decode("ascii"))
+    return "".join(pieces)
+
+
+class BridgeLink:
+    """A link that :meth:`run` keeps.
+
+    Attributes:
+        connected: whether there is a bridge now.
+        failure: why there is none; "" where nothing has been tried.
+    """
+
+    def __init__(self, url: str, outbox: Outbox, listener: Listener, backoff: Backoff) -> None:
+        self.url = checked_url(url)
+        self.failure = ""
+        self.changed = asyncio.Condition()
+        self.connected = False
+        self._outbox, self._listener, self._backoff = outbox, listener, backoff
+
+    async def run(self) -> None:
+        """Keep a link until this is cancelled."""
+        clock, short_lived = asyncio.get_running_loop().time, 0
+        errors = link_errors()
+        while True:
+            for delay in self._backoff.delays(short_lived=short_lived):
+                began = clock()
+                try:
+                    await self._once()
+                    reason = "it closed the link"
+                except errors as exc:
+                    reason = str(exc) or type(exc).__name__
+                if await self._tell_lost(reason):
+                    short_lived = 0 if clock() - began > LIVED else short_lived + 1
+                    await asyncio.sleep(delay)
+                    break
+                await asyncio.sleep(delay)
+            else:
+                return
+
+    async def _once(self) -> None:
+        """Have one link, until it is lost."""
+        async with web_socket(self.url) as web:
+            logger.info("%s: connected", self.url)
+            try:
+                async with asyncio.TaskGroup() as group:
+                    reading = group.create_task(self._read(web))
+                    writing = group.create_task(self._write(web))
+                    self._listener.came()
+                    await self._set(connected=True)
+                    await asyncio.wait((reading, writing), return_when=asyncio.FIRST_COMPLETED)
+                    reading.cancel()
+                    writing.cancel()
+            except* Exception as group_error:
+                raise group_error.exceptions[0] from None
+
+    async def _set(self, *, connected: bool, failure: str = "") -> None:
+        async with self.changed:
+            self.connected, self.failure = connected, failure
+            self.changed.notify_all()
+
+    async def _tell_lost(self, reason: str) -> bool:
+        """Say that there is no link; return whether there was one."""
+        was, said_before = self.connected, self.failure
+        await self._set(connected=False, failure=f"{self.url}: {reason}")
+        self._outbox.clear()
+        await self._listener.lost()
+        level = logging.DEBUG if said_before == self.failure else logging.WARNING
+        logger.log(level, "%s: no rosbridge: %s", self.url, reason)
+        return was
+
+    async def _write(self, web: aiohttp.ClientWebSocketResponse) -> None:
+        while True:
+            text = await long_text_of(await self._outbox.take())
+            try:
+                async with asyncio.timeout(STALLED):
+                    await web.send_str(text)
+            except TimeoutError:
+                raise TimeoutError(f"it did not read a message within {STALLED:g} s") from None
+
+    async def _read(self, web: aiohttp.ClientWebSocketResponse) -> None:
+        kinds = _aiohttp().WSMsgType
+        while True:
+            message = await web.receive()
+            if message.type is kinds.TEXT:
+                self._hear(message.data)
+            elif message.type is kinds.ERROR:
+                raise ConnectionError(str(web.exception() or message.data))
+            elif message.type in {kinds.CLOSE, kinds.CLOSING, kinds.CLOSED}:
+                return
+            else:
+                logger.warning("%s: expected text, got binary: is it in BSON mode?", self.url)
+
+    def _hear(self, text: str) -> None:
+        try:
+            operation = json.loads(text)
+            if not isinstance(operation, dict) or not isinstance(operation.get("op"), str):
+                raise ValueError("no object with an op")
+        except (ValueError, RecursionError) as exc:
+            logger.warning("%s: not rosbridge: %.80r (%s)", self.url, text, exc)
+            return
+        self._listener.heard(operation)
