@@ -1,0 +1,184 @@
+"""What the messages and services of ROS are made of: texts of ``.msg`` and ``.srv`` become fields."""
+
+from __future__ import annotations
+
+import ast
+import keyword
+import re
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from smartcam.exceptions import ConfigurationError
+
+INTEGERS: Final = {
+    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "byte": "B",
+}  # fmt: skip
+"""The code of ``struct`` and numpy for each."""
+
+NUMBERS: Final = {**INTEGERS, "float32": "f", "float64": "d", "bool": "?"}
+BASES: Final = frozenset({*NUMBERS, "string"})
+_OTHER_NAMES: Final = {"char": "uint8", "octet": "byte"}
+
+_PART = r"[a-z](?:_?[a-z0-9]+)*"
+NAME: Final = re.compile(rf"({_PART})/(msg|srv)/([A-Z][A-Za-z0-9]*)")
+_FIELD: Final = re.compile(
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=(?P<limit>\d+))?"
+    r"(?:\[(?P<bound><=)?(?P<size>\d*)\])?\s+"
+    r"(?P<name>[A-Za-z]\w*)\s*(?:=(?P<constant>.*)|\s(?P<default>.*))?"
+)
+_OLD_NAMES: Final = {"Header": "std_msgs/msg/Header"}
+
+
+class Field(NamedTuple):
+    """One field: ``shape`` is "" (one value), "array" (of ``size``) or "sequence" (up to ``size``).
+
+    Attributes:
+        type: a basic type, or a message's full name.
+        limit: the most bytes of a string; 0 is any.
+        size: 0 is any for a sequence.
+        default: what it is when nothing is said; None is zero.
+    """
+
+    name: str
+    type: str
+    shape: str = ""
+    size: int = 0
+    limit: int = 0
+    default: Any = None
+
+    @property
+    def attribute(self) -> str:
+        """Its name in Python."""
+        return f"{self.name}_" if keyword.iskeyword(self.name) else self.name
+
+    @property
+    def nested(self) -> bool:
+        """Whether it is of messages."""
+        return self.type not in BASES
+
+    def __str__(self) -> str:
+        """Say its type as a ``.msg`` does."""
+        limit = f"<={self.limit}" if self.limit else ""
+        bound = "<=" if self.shape == "sequence" and self.size else ""
+        return self.type + limit + (f"[{bound}{self.size or ''}]" if self.shape else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """A message's fields and constants."""
+
+    name: str
+    fields: tuple[Field, ...]
+    constants: dict[str, Any]
+
+    def needs(self) -> set[str]:
+        """Return the messages that are in it."""
+        return {field.type for field in self.fields if field.nested}
+
+
+def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
+    """Return package, kind and name of a type.
+
+    Raises:
+        ConfigurationError: it is no name of a type, or not of this kind.
+    """
+    matched = NAME.fullmatch(name) if isinstance(name, str) else None
+    if matched is None or kind not in ("", matched[2]):
+        example = "std_srvs/srv/Trigger" if kind == "srv" else "std_msgs/msg/String"
+        raise ConfigurationError(f"no ROS type: expected a name such as {example}, got {name!r:.80}")
+    return matched[1], matched[2], matched[3]
+
+
+def parse_message(name: str, text: str) -> Definition:
+    """Return what a ``.msg`` says.
+
+    Raises:
+        ConfigurationError: its text is no message.
+    """
+    package = name.partition("/")[0]
+    fields: dict[str, Field] = {}
+    constants: dict[str, Any] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        said = line.strip()
+        if not said or said.startswith("#"):
+            continue
+        try:
+            field, constant = _parse_line(package, said)
+            if field.name in fields or field.name in constants:
+                raise ValueError(f"there are two {field.name}")
+            if constant:
+                constants[field.name] = field.default
+            else:
+                fields[field.name] = field
+        except (ValueError, SyntaxError) as exc:
+            raise ConfigurationError(f"{name}, line {number}: {said!r:.80}: {exc}") from exc
+    return Definition(name, tuple(fields.values()), constants)
+
+
+def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
+    """Return request and response of a ``.srv``.
+
+    Raises:
+        ConfigurationError: its text is no service.
+    """
+    parts = re.split(r"(?m)^---\s*$", text)
+    if len(parts) != 2:  # noqa: PLR2004
+        raise ConfigurationError(f"{name}: expected one line --- between request and response")
+    return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
+
+
+def _parse_line(package: str, line: str) -> tuple[Field, bool]:
+    matched = _FIELD.fullmatch(line) or _FIELD.fullmatch(line.partition("#")[0].strip())
+    if matched is None:
+        raise ValueError("expected a type and a name")
+    kind = _full_name(package, matched["type"])
+    limit = int(matched["limit"] or 0)
+    if limit and kind != "string":
+        raise ValueError("only a string is bounded by <=")
+    size, bound = matched["size"], matched["bound"]
+    if bound and not size:
+        raise ValueError("expected how many after <=")
+    shape = "" if size is None else "array" if size and not bound else "sequence"
+    field = Field(matched["name"], kind, shape, int(size or 0), limit)
+    if shape == "array" and not field.size:
+        raise ValueError("an array of none")
+    value = matched["constant"] if matched["constant"] is not None else matched["default"]
+    constant = matched["constant"] is not None
+    if constant and (shape or kind not in BASES):
+        raise ValueError("a constant is of one basic value")
+    return field._replace(default=_value(field, value, whole=constant)), constant
+
+
+def _full_name(package: str, said: str) -> str:
+    said = _OTHER_NAMES.get(said, said)
+    if said in ("wstring", "float128"):
+        raise ValueError(f"{said} is not supported")
+    if said in BASES:
+        return said
+    if "/" not in said:
+        said = _OLD_NAMES.get(said, f"{package}/msg/{said}")
+    elif "/msg/" not in said:
+        said = said.replace("/", "/msg/", 1)
+    if NAME.fullmatch(said) is None:
+        raise ValueError(f"{said} is no type")
+    return said
+
+
+def _value(field: Field, text: str | None, *, whole: bool) -> Any:
+    """Return a constant or default; a constant's text is the ``whole`` rest of its line."""
+    if text is None or not (text := text.strip()) or (not whole and text.startswith("#")):
+        return None
+    if field.type == "string" and not field.shape:
+        quoted = re.match(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"", text)
+        if quoted is None:
+            return text if whole else text.partition("#")[0].strip()
+        return ast.literal_eval(quoted[0])
+    if field.type != "string":
+        text = text.partition("#")[0].strip()
+        text = re.sub(r"(?i)\btrue\b", "True", re.sub(r"(?i)\bfalse\b", "False", text))
+    value = ast.literal_eval(text)
+    one = float if field.type.startswith("float") else bool if field.type == "bool" else None
+    if field.shape:
+        return [one(x) for x in value] if one else list(value)
+    return one(value) if one else value

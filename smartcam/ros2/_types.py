@@ -1,0 +1,332 @@
+"""Messages and services of a distribution of ROS 2: their fields, bytes and hashes."""
+
+from __future__ import annotations
+
+import functools
+import struct
+import threading
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError, RosMessageError
+from smartcam.ros2._definitions import MESSAGES, SERVICES
+from smartcam.ros2._type_codec import HEAD, Misfit, decoder, encoder
+from smartcam.ros2._type_definitions import (
+    Definition,
+    Field,
+    parse_message,
+    parse_service,
+    split_name,
+)
+from smartcam.ros2._type_hash import NOT_SUPPORTED, event_of, service_of, type_hash
+from smartcam.ros2._type_stores import WITHOUT_HASHES, read_stored, stored
+from smartcam.ros2._type_values import check, filled, message_class
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.ros2._type_values import RosMessage
+
+_ORDERS: Final = {b"\0\1": "<", b"\0\0": ">"}
+_MISFITS: Final = (
+    Misfit,
+    struct.error,
+    KeyError,
+    IndexError,
+    TypeError,
+    ValueError,
+    OverflowError,
+    AttributeError,
+)
+"""What the written functions raise where a message or its bytes do not fit."""
+
+
+def dds_name(name: str) -> str:
+    """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
+    package, kind, own = name.split("/")
+    return f"{package}::{kind}::dds_::{own}_"
+
+
+class MessageType:
+    """A type of message; made by ``RosTypes.message`` and ``RosTypes.service``.
+
+    Attributes:
+        name: such as ``std_msgs/msg/String``.
+        dds: its name in keys, ``std_msgs::msg::dds_::String_``.
+        fields: name, type, shape, bounds and default of each field.
+        constants: by name; attributes of ``cls``, too.
+        nested: the types of the messages within by name.
+        cls: the class of its messages, made with all fields in their order.
+    """
+
+    def __init__(
+        self, definition: Definition, nested: Mapping[str, MessageType], get_hash: Callable[[], str]
+    ) -> None:
+        self.name = definition.name
+        self.dds = dds_name(definition.name)
+        self.fields: tuple[Field, ...] = definition.fields
+        self.constants = dict(definition.constants)
+        self.nested = nested
+        self.cls: type[RosMessage] = message_class(definition)
+        self._get_hash = get_hash
+
+    def __repr__(self) -> str:
+        return f"<MessageType {self.name}>"
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
+        return self._get_hash()
+
+    @functools.cached_property
+    def _encode(self) -> Callable[[Any], bytes]:
+        return encoder(self)
+
+    @functools.cached_property
+    def _decoders(self) -> dict[str, Callable[[Any], tuple[Any, int]]]:
+        return {}
+
+    def new(self, /, **fields: Any) -> Any:
+        """Return a message of these fields; those not said have their default, or zero.
+
+        A message within may be given as a mapping of its fields.
+
+        Raises:
+            RosMessageError: there is no such field, or a value does not fit.
+        """
+        return filled(self, fields)
+
+    def encode(self, message: Any) -> bytes:
+        """Return a message, or a mapping of its fields, in CDR: little-endian, with encapsulation.
+
+        Raises:
+            RosMessageError: it is of another type, or a field does not fit.
+        """
+        if isinstance(message, Mapping):
+            message = filled(self, message)
+        elif getattr(message, "__msgtype__", None) != self.name:
+            got = getattr(message, "__msgtype__", type(message).__name__)
+            raise RosMessageError(f"{self.name}: expected a message of this type, got {got}")
+        try:
+            return self._encode(message)
+        except _MISFITS as exc:
+            check(self, message)
+            raise RosMessageError(f"{self.name}: a field does not fit: {exc}") from exc
+
+    def decode(self, data: bytes | bytearray | memoryview) -> Any:
+        """Return the message of CDR, little- or big-endian.
+
+        Sequences of numbers are views of ``data``, read only where that is bytes.
+
+        Raises:
+            RosMessageError: the bytes are no such message, or too few, or too many.
+        """
+        order = _ORDERS.get(bytes(data[:2]))
+        if order is None or len(data) < len(HEAD):
+            raise RosMessageError(
+                f"{self.name}: expected CDR with its encapsulation 00 01 or 00 00, got "
+                f"{len(data)} bytes: {bytes(data[:4]).hex(' ') or 'none'}"
+            )
+        decode = self._decoders.get(order)
+        if decode is None:
+            decode = self._decoders[order] = decoder(self, order)
+        try:
+            message, end = decode(data)
+        except _MISFITS as exc:
+            raise RosMessageError(
+                f"{self.name}: {len(data)} bytes are no such message: {exc}"
+            ) from exc
+        left = len(data) - end
+        if left and (left > 3 or len(data) % 4 or any(data[end:])):  # noqa: PLR2004
+            raise RosMessageError(
+                f"{self.name}: expected {end} bytes, got {len(data)}: {left} follow the message"
+            )
+        return message
+
+
+class ServiceType:
+    """A type of service; made by ``RosTypes.service``.
+
+    Attributes:
+        name: such as ``std_srvs/srv/Trigger``.
+        dds: its name in keys, ``std_srvs::srv::dds_::Trigger_``.
+        request: the type of its requests.
+        response: the type of its responses.
+    """
+
+    def __init__(
+        self, name: str, request: MessageType, response: MessageType, get_hash: Callable[[], str]
+    ) -> None:
+        self.name = name
+        self.dds = dds_name(name)
+        self.request = request
+        self.response = response
+        self._get_hash = get_hash
+
+    def __repr__(self) -> str:
+        return f"<ServiceType {self.name}>"
+
+    @functools.cached_property
+    def hash(self) -> str:
+        """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
+        return self._get_hash()
+
+
+class RosTypes:
+    """The messages and services of a distribution of ROS 2, and those that are added.
+
+    Every object of the same distribution shares the distribution's own types; types added are in
+    the object that they were added to. It may be used from any thread.
+
+    Args:
+        distribution: ``humble``, ``jazzy``, ``kilted``, ``lyrical`` or ``rolling``.
+
+    Raises:
+        ConfigurationError: there is no such distribution.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    def __init__(self, distribution: str = "jazzy") -> None:
+        self.distribution = distribution
+        self._stored = stored(distribution)
+        self._shared = None if isinstance(self, _Shared) else _shared(distribution)
+        self._lock = threading.RLock()
+        self._definitions: dict[str, Definition] = {}
+        self._added: dict[str, str] = {}
+        self._messages: dict[str, MessageType] = {}
+        self._services: dict[str, ServiceType] = {}
+
+    def __repr__(self) -> str:
+        return f"<RosTypes {self.distribution}>"
+
+    def names(self) -> list[str]:
+        """Return the names of all messages and services, sorted."""
+        return sorted({*self._stored, *MESSAGES, *SERVICES, *self._added})
+
+    def message(self, name: str) -> MessageType:
+        """Return a type of message, such as ``std_msgs/msg/String``.
+
+        Raises:
+            ConfigurationError: there is none of this name, or one within it is not known.
+        """
+        if (made := self._messages.get(name)) is not None:
+            return made
+        split_name(name, "msg")
+        return self._message(name)
+
+    def service(self, name: str) -> ServiceType:
+        """Return a type of service, such as ``std_srvs/srv/Trigger``.
+
+        Raises:
+            ConfigurationError: there is none of this name, or a message within it is not known.
+        """
+        if (made := self._services.get(name)) is not None:
+            return made
+        split_name(name, "srv")
+        if self._shared is not None and name not in self._added:
+            return self._shared.service(name)
+        text = self._added.get(name) or SERVICES.get(name)
+        if text is None:
+            raise self._unknown(name)
+        with self._lock:
+            if (made := self._services.get(name)) is None:
+                for definition in (*parse_service(name, text), event_of(name)):
+                    self._definitions[definition.name] = definition
+                made = self._services[name] = ServiceType(
+                    name,
+                    self._message(f"{name}_Request"),
+                    self._message(f"{name}_Response"),
+                    functools.partial(self._hash, service_of(name)),
+                )
+        return made
+
+    def add(self, name: str, text: str) -> None:
+        """Add a message (``pkg/msg/Name``) or service (``pkg/srv/Name``) by the text of its file.
+
+        What is there already may be added again with the same fields.
+
+        Raises:
+            ConfigurationError: the text is none of a message or service, or another type has its
+                name.
+        """
+        _, kind, _ = split_name(name)
+        parse = parse_service if kind == "srv" else parse_message
+        said = parse(name, text)
+        with self._lock:
+            if name in self.names():
+                if kind == "srv":
+                    there: Any = parse(name, self._added.get(name) or SERVICES[name])
+                else:
+                    there = self.definition(name)
+                if _fields(there) != _fields(said):
+                    raise ConfigurationError(
+                        f"{name}: {self.distribution} has it with other fields, expected the same"
+                    )
+                return
+            self._added[name] = text
+
+    def definition(self, name: str) -> Definition:
+        """Return the fields of a message.
+
+        Raises:
+            ConfigurationError: it is not known.
+        """
+        made = self._definitions.get(name)
+        if made is None:
+            if name in self._added:
+                made = parse_message(name, self._added[name])
+            elif self._shared is not None:
+                return self._shared.definition(name)
+            elif name in self._stored:
+                made = read_stored(name, self._stored[name])
+            elif name in MESSAGES:
+                made = parse_message(name, MESSAGES[name])
+            else:
+                raise self._unknown(name)
+            self._definitions[name] = made
+        return made
+
+    def _message(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
+        if (made := self._messages.get(name)) is not None:
+            return made
+        if self._shared is not None and name not in self._added and name not in self._definitions:
+            return self._shared._message(name)
+        if name in within:
+            raise ConfigurationError(f"{name} has itself within: {' > '.join((*within, name))}")
+        with self._lock:
+            if (made := self._messages.get(name)) is None:
+                definition = self.definition(name)
+                nested = {
+                    one: self._message(one, (*within, name)) for one in sorted(definition.needs())
+                }
+                get_hash = functools.partial(self._hash, definition)
+                made = self._messages[name] = MessageType(definition, nested, get_hash)
+        return made
+
+    def _hash(self, definition: Definition) -> str:
+        if self.distribution in WITHOUT_HASHES:
+            return NOT_SUPPORTED
+        return type_hash(definition, self.definition)
+
+    def _unknown(self, name: str) -> ConfigurationError:
+        close = did_you_mean(name, self.names())
+        return ConfigurationError(
+            f"{name}: no such type in {self.distribution}, expected a name of it or add() first"
+            f"{close}"
+        )
+
+
+class _Shared(RosTypes):
+    """What a distribution has itself; nothing is added to it."""
+
+
+@functools.cache
+def _shared(distribution: str) -> _Shared:
+    return _Shared(distribution)
+
+
+def _fields(said: Any) -> Any:
+    if isinstance(said, tuple):
+        return [_fields(one) for one in said]
+    return [one._replace(default=None) for one in said.fields]
