@@ -55,7 +55,7 @@ class RosbridgeService:
 
     # ------------------------------------------------------------------ for the node
 
-    async def advertise(self) -> None:
+    def advertise(self) -> None:
         """Advertise it."""
         self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
         self.ready = True
@@ -114,7 +114,7 @@ class RosbridgeService:
         # moment, which is an error for its callers.
         self._respond(identity, None, result=False)
         await self.withdraw()
-        await self.advertise()
+        self.advertise()
 
     def _respond(self, identity: Any, values: Any, *, result: bool) -> None:
         said = {"op": "service_response", "result": result}

@@ -91,10 +91,13 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
     aiohttp = _aiohttp()
     timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=1.0)
     async with aiohttp.ClientSession() as session:
-        async with asyncio.timeout(CONNECT_TIMEOUT):
-            web = await session.ws_connect(
-                url, timeout=timeout, heartbeat=HEARTBEAT, max_msg_size=LARGEST
-            )
+        try:
+            async with asyncio.timeout(CONNECT_TIMEOUT):
+                web = await session.ws_connect(
+                    url, timeout=timeout, heartbeat=HEARTBEAT, max_msg_size=LARGEST
+                )
+        except TimeoutError:
+            raise TimeoutError(f"no answer within {CONNECT_TIMEOUT:g} s") from None
         try:
             yield web
             await web.close()
@@ -105,14 +108,7 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
                     peer.shutdown(socket.SHUT_RDWR)  # or what waits would be kept for it
 
 
-def text_of(parts: tuple[Part, ...]) -> str:
-    """Return the text of a short operation."""
-    return "".join(
-        base64.b64encode(one.data).decode() if isinstance(one, Raw) else one for one in parts
-    )
-
-
-async def long_text_of(parts: tuple[Part, ...]) -> str:
+async def text_of(parts: tuple[Part, ...]) -> str:
     """Return the text of an operation; the loop has its turns with a long one."""
     pieces: list[str] = []
     for part in parts:
@@ -142,17 +138,12 @@ class BridgeLink:
         self._outbox, self._listener, self._backoff = outbox, listener, backoff
 
     async def run(self) -> None:
-        """Keep a link until this is cancelled."""
+        """Keep a link until this is cancelled, or the tries are over."""
         clock, short_lived = asyncio.get_running_loop().time, 0
-        errors = link_errors()
         while True:
             for delay in self._backoff.delays(short_lived=short_lived):
                 began = clock()
-                try:
-                    await self._once()
-                    reason = "it closed the link"
-                except errors as exc:
-                    reason = str(exc) or type(exc).__name__
+                reason = await self._try()
                 if await self._tell_lost(reason):
                     short_lived = 0 if clock() - began > LIVED else short_lived + 1
                     await asyncio.sleep(delay)
@@ -161,21 +152,29 @@ class BridgeLink:
             else:
                 return
 
-    async def _once(self) -> None:
-        """Have one link, until it is lost."""
-        async with web_socket(self.url) as web:
-            logger.info("%s: connected", self.url)
-            try:
-                async with asyncio.TaskGroup() as group:
-                    reading = group.create_task(self._read(web))
-                    writing = group.create_task(self._write(web))
-                    self._listener.came()
-                    await self._set(connected=True)
-                    await asyncio.wait((reading, writing), return_when=asyncio.FIRST_COMPLETED)
-                    reading.cancel()
-                    writing.cancel()
-            except* Exception as group_error:
-                raise group_error.exceptions[0] from None
+    async def _try(self) -> str:
+        """Have one link until it is lost; return why."""
+        try:
+            async with web_socket(self.url) as web:
+                logger.info("%s: connected", self.url)
+                await self._set(connected=True)
+                self._listener.came()
+                await self._carry(web)
+        except link_errors() as exc:
+            return str(exc) or type(exc).__name__
+        return "it closed the link"
+
+    async def _carry(self, web: aiohttp.ClientWebSocketResponse) -> None:
+        """Read and write until one of them ends."""
+        tasks = [asyncio.create_task(self._read(web)), asyncio.create_task(self._write(web))]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        for task in done:
+            task.result()
 
     async def _set(self, *, connected: bool, failure: str = "") -> None:
         async with self.changed:
@@ -194,7 +193,7 @@ class BridgeLink:
 
     async def _write(self, web: aiohttp.ClientWebSocketResponse) -> None:
         while True:
-            text = await long_text_of(await self._outbox.take())
+            text = await text_of(await self._outbox.take())
             try:
                 async with asyncio.timeout(STALLED):
                     await web.send_str(text)
@@ -207,6 +206,7 @@ class BridgeLink:
             message = await web.receive()
             if message.type is kinds.TEXT:
                 self._hear(message.data)
+                await self._outbox.room()
             elif message.type is kinds.ERROR:
                 raise ConnectionError(str(web.exception() or message.data))
             elif message.type in {kinds.CLOSE, kinds.CLOSING, kinds.CLOSED}:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from smartcam.ros1._json_messages import Part
 
+MOST_OPERATIONS = 256
+"""That wait before nothing more is read of the bridge."""
 MOST_BYTES = 32 << 20
 """That the messages of a topic may have together while they wait."""
 
@@ -73,12 +75,16 @@ class Outbox:
         self._operations: collections.deque[tuple[Part, ...]] = collections.deque()
         self._lanes: collections.deque[Lane] = collections.deque()
         self._ready = asyncio.Event()
-        self._empty = asyncio.Event()
+        self._room = asyncio.Event()
+        self._room.set()
+        self._flushed = asyncio.Event()
 
     def say(self, parts: tuple[Part, ...]) -> None:
-        """Have an operation wait. Who says it bounds how many there are."""
+        """Have an operation wait."""
         self._operations.append(parts)
-        self._ready.set()
+        self.wake()
+        if len(self._operations) >= MOST_OPERATIONS:
+            self._room.clear()
 
     def add(self, lane: Lane) -> None:
         """Send what waits there, too."""
@@ -89,8 +95,9 @@ class Outbox:
         self._lanes.remove(lane)
 
     def wake(self) -> None:
-        """Say that something waits in a lane."""
+        """Say that something waits."""
         self._ready.set()
+        self._flushed.clear()
 
     def clear(self) -> None:
         """Forget all that waits."""
@@ -98,11 +105,21 @@ class Outbox:
         for lane in self._lanes:
             lane.clear()
         self._ready.clear()
+        self._room.set()
+
+    async def room(self) -> None:
+        """Wait while more operations wait than should."""
+        await self._room.wait()
+
+    async def flushed(self) -> None:
+        """Wait until everything was taken, and who took it came back for more."""
+        await self._flushed.wait()
 
     async def take(self) -> tuple[Part, ...]:
         """Return what is next, wait for it."""
         while True:
             if self._operations:
+                self._room.set()
                 return self._operations.popleft()
             for _ in range(len(self._lanes)):
                 lane = self._lanes[0]
@@ -111,12 +128,5 @@ class Outbox:
                     lane.sent += 1
                     return lane.take()
             self._ready.clear()
-            self._empty.set()
+            self._flushed.set()
             await self._ready.wait()
-            self._empty.clear()
-
-    async def flushed(self) -> None:
-        """Wait until everything has been taken, and who took it came back for more."""
-        if self._ready.is_set():
-            self._empty.clear()
-        await self._empty.wait()

@@ -17,7 +17,7 @@ from smartcam.ros1._retiring import retire
 from smartcam.ros2._types import RosTypes
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine
+    from collections.abc import Awaitable, Callable, Coroutine, Iterable
     from typing import Self
 
     from smartcam.ros1._json_messages import Part
@@ -119,6 +119,7 @@ class RosbridgeNode:
         self._services: dict[str, RosbridgeService] = {}
         self._running: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()  # that live as long as a link
+        self._new: list[RosbridgeService] = []  # that are to be advertised
         self._heard: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "status": self._told,
@@ -213,8 +214,7 @@ class RosbridgeNode:
         kind, name = self.types.service(type), self.resolve(service)
         self._check(name, kind.name, self._services)
         served = self._services[name] = RosbridgeService(self, name, kind, handler)
-        if self.connected:
-            self._start(served.advertise())
+        self._advertise([served])
         return served
 
     def resolve(self, name: str) -> str:
@@ -273,12 +273,24 @@ class RosbridgeNode:
             self._outbox.say(encoded(publisher.advertisement()))
             publisher.lane.say_again()
         self._outbox.wake()
-        self._start(self._advertise_services())
+        self._advertise(self._services.values())
 
-    async def _advertise_services(self) -> None:
-        await retire(self._link.url, [*self._services])
-        for service in self._services.values():
-            self._start(service.advertise())
+    def _advertise(self, services: Iterable[RosbridgeService]) -> None:
+        """Have services advertised, all at once that are new in this turn of the loop."""
+        if self.connected:
+            begun = bool(self._new)
+            self._new += services
+            if not begun and self._new:
+                self._start(self._advertise_new())
+
+    async def _advertise_new(self) -> None:
+        while self._new:
+            await asyncio.sleep(0)
+            new, self._new = self._new, []
+            await retire(self._link.url, [one.service for one in new])
+            for service in new:
+                if self._services.get(service.service) is service:
+                    service.advertise()
 
     def heard(self, operation: dict[str, Any]) -> None:
         """Do what the bridge says."""
@@ -290,6 +302,7 @@ class RosbridgeNode:
 
     async def lost(self) -> None:
         """End what was under way for a bridge that is gone."""
+        self._new.clear()
         for service in self._services.values():
             service.ready = False
         tasks = [*self._tasks]
