@@ -16,7 +16,7 @@ from typing import Any, cast
 
 from benchmarks.peers import wire
 from benchmarks.peers.control import resident, serve_control
-from smartcam.fleet._zenoh import RUNTIME, with_ports
+from smartcam._zenoh import RUNTIME, with_ports
 
 __all__ = ["BATCH", "RESULTS", "Zenoh", "asking"]
 

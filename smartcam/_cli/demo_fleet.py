@@ -39,8 +39,9 @@ SOON = 0.3
 
 async def demo(options: Options) -> None:
     """Start agents, share a camera, reserve it, trigger all, end agents."""
+    from smartcam._zenoh import BusLink, with_ports
     from smartcam.fleet import open
-    from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
+    from smartcam.fleet._zenoh import ZenohEnd
 
     ZenohEnd(BusLink())  # without the engine it ends here
     say = Steps(options)

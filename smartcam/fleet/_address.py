@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 from smartcam._suggestions import did_you_mean
+from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._zenoh import BusLink
 from smartcam.settings import FLEET_SCHEMES, Address, masked
 
 if TYPE_CHECKING:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from smartcam._server import Server
+from smartcam._zenoh import BusLink, with_ports
 from smartcam.camera import DEFAULT_MAX_QUEUE
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
@@ -15,7 +16,7 @@ from smartcam.fleet._agent import Agent
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
-from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
+from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
 from smartcam.streams import Subscribers, Subscription

@@ -265,7 +265,9 @@ def read_numbers(data: Any, start: int, count: int, kind: np.dtype[Any], most: i
     if most and count > most:
         raise Misfit(f"expected up to {most} numbers, got {count}")
     if count * kind.itemsize > len(data) - start:
-        raise Misfit(f"{count} numbers of {kind} at {start}, where {len(data) - start} bytes are left")
+        raise Misfit(
+            f"{count} numbers of {kind} at {start}, where {len(data) - start} bytes are left"
+        )
     if not count:
         return np.zeros(0, kind.newbyteorder("="))
     return own_numbers(np.frombuffer(data, kind, count, start))

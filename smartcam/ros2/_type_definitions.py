@@ -86,7 +86,9 @@ def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
     matched = NAME.fullmatch(name) if isinstance(name, str) else None
     if matched is None or kind not in ("", matched[2]):
         example = "std_srvs/srv/Trigger" if kind == "srv" else "std_msgs/msg/String"
-        raise ConfigurationError(f"no ROS type: expected a name such as {example}, got {name!r:.80}")
+        raise ConfigurationError(
+            f"no ROS type: expected a name such as {example}, got {name!r:.80}"
+        )
     return matched[1], matched[2], matched[3]
 
 

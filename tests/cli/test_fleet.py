@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from smartcam.fleet import _zenoh
+from smartcam import _zenoh
 from smartcam.recording import load_recording
 from tests.cli.commandline import DISCONNECT, SESSION, Peer, closed_port, each, emulators, run
 from tests.cli.test_calibrate import ABOUT, TOUCHES, as_lines, calibrating
@@ -333,7 +333,7 @@ def test_serve_port_in_use_exits_3(tmp_path: Path) -> None:
 def test_without_the_extra_everything_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_zenoh, "_engine", _zenoh._engine.__wrapped__)
+    monkeypatch.setattr(_zenoh, "engine", _zenoh.engine.__wrapped__)
     monkeypatch.setitem(sys.modules, "zenoh", None)
     path = tmp_path / "one.yaml"
     path.write_text("cameras: {a: {emulated: {}, application: 21}}\n", encoding="utf-8")

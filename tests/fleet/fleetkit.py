@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, Self
 
 from smartcam import Backoff
+from smartcam._zenoh import BusLink, with_ports
 from smartcam.emulator import Application, EmulatedCamera, Run
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._bus import Bus, MemoryBus, MemoryEnd
@@ -15,7 +16,7 @@ from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._program import Program
-from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
+from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
 

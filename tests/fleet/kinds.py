@@ -6,12 +6,13 @@ from collections.abc import Iterable
 from typing import Any
 
 from smartcam import Camera, SmartCamera
+from smartcam._zenoh import BusLink, with_ports
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._bus import Bus, MemoryBus
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._program import Program
-from smartcam.fleet._zenoh import BusLink, ZenohEnd, with_ports
+from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.observers import Observer
 from smartcam.settings import Address, CameraSettings
 

@@ -15,10 +15,11 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import smartcam
+from smartcam._zenoh import BusLink
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import Keys
-from smartcam.fleet._zenoh import BusLink, ZenohEnd
+from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FAST, FLEET, NAME, PATIENCE
 

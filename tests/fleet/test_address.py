@@ -9,9 +9,9 @@ import pytest
 
 import smartcam
 import smartcam.fleet
+from smartcam._zenoh import engine
 from smartcam.exceptions import ConfigurationError, MissingExtraError, UnsupportedError
 from smartcam.fleet._address import FleetAddress, check_name, check_pattern
-from smartcam.fleet._zenoh import _engine
 from smartcam.settings import parse_address
 from tests.test_exports import newly_imported
 
@@ -152,11 +152,11 @@ def test_camera_is_called_by_its_name() -> None:
 
 def test_without_zenoh_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zenoh", None)
-    _engine.cache_clear()
+    engine.cache_clear()
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\[fleet\]"') as caught:
         smartcam.connect("fleet://localhost/line1/cam3")
     assert caught.value.extra == "fleet"
-    _engine.cache_clear()
+    engine.cache_clear()
 
 
 def test_engine_is_imported_for_fleet_urls_only() -> None:

@@ -17,9 +17,9 @@ from smartcam import (
     FrameSourceError,
     UnsupportedError,
 )
+from smartcam._zenoh import with_ports
 from smartcam.camera import FrameEncoding
 from smartcam.fleet import FleetFile, FleetFrame, FleetServer
-from smartcam.fleet._zenoh import with_ports
 from smartcam.frames._synthetic import read_stamp
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import PATIENCE

@@ -19,9 +19,11 @@ from typing import Any
 import pytest
 
 import smartcam
+from smartcam import _zenoh
+from smartcam._zenoh import BusLink, with_ports
 from smartcam.exceptions import ConnectFailedError, ConnectionLostError
-from smartcam.fleet import FleetCamera, _zenoh
-from smartcam.fleet._zenoh import LONG, BusLink, ZenohEnd, with_ports
+from smartcam.fleet import FleetCamera
+from smartcam.fleet._zenoh import LONG, ZenohEnd
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant

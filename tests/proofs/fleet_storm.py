@@ -28,8 +28,8 @@ from typing import Any, Self
 
 import smartcam
 from smartcam import Camera
+from smartcam._zenoh import LEASE
 from smartcam.exceptions import SmartCamError
-from smartcam.fleet._zenoh import LEASE
 from tests.fleet.fleetkit import FAST, LAYOUT, PATIENCE, NumberedCamera, Plant
 from tests.fleet.lossy_bus import LossyBus, chance_of
 from tests.proofs.books import TRIGGER_OUTCOMES, aligned

@@ -1,0 +1,507 @@
+"""A session of Zenoh, whose binding calls back in threads of its own, for one event loop.
+
+What comes is put into one queue, and a burst wakes the event loop once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import functools
+import io
+import json
+import logging
+import os
+import re
+import socket
+import struct
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError, ConnectFailedError, MissingExtraError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from typing import Self
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+RUNTIME = (
+    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
+    "app:(worker_threads:1))"
+)
+"""Zenoh's threads: one for everything, which halves the CPU time of a call; its callbacks here only
+put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
+
+LEASE = 5.0
+"""Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
+
+INTERNET = (socket.AF_INET, socket.AF_INET6)
+
+MOST_WAITING = 1 << 26
+"""Bytes that wait for the event loop, or for the thread that says what is long; what comes beyond
+is dropped, and results are asked for again later."""
+
+REPLIERS = 4
+"""Threads that answer queries: who asks and does not read holds up one of them."""
+
+MOST_REPLYING = 4096
+"""Queries whose answers wait for these threads; one beyond gets none."""
+
+TURN = 64
+"""Callbacks in one turn of the event loop."""
+
+CLOSE_TIMEOUT = 5.0
+
+_ONE = (1).to_bytes(8, sys.byteorder)
+
+
+@dataclass(frozen=True)
+class BusLink:
+    """How an end comes to the bus.
+
+    Attributes:
+        listen: endpoints to listen on, such as ``tcp/127.0.0.1:7447``.
+        connect: endpoints to connect to; with several, whichever answers.
+        certificates: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, for TLS.
+    """
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    certificates: str | None = None
+
+    @property
+    def place(self) -> str:
+        """Return where it is, for texts."""
+        return ", ".join(self.listen or self.connect)
+
+    def settings(self, timeout: float) -> dict[str, Any]:
+        """Return the engine's settings by their paths."""
+        found: dict[str, Any] = {
+            # who connects only is a client of a router, which whoever listens is
+            "mode": "router" if self.listen else "client",
+            "listen/endpoints": list(self.listen),
+            "connect/endpoints": list(self.connect),
+            "connect/timeout_ms": 0,  # one try; later ones are made without end
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
+            "connect/exit_on_failure": not self.listen,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "scouting/delay": 0,
+            "transport/shared_memory/enabled": False,
+            "transport/link/tx/lease": int(1e3 * LEASE),
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/unicast/open_timeout": max(1, int(1e3 * timeout)),
+        }
+        for queue in ("data", "interactive_high", "data_low"):
+            found[f"transport/link/tx/queue/size/{queue}"] = 16
+        if self.certificates is not None:
+            tls = f"{self.certificates.rstrip('/')}/"
+            found |= {
+                "transport/link/tls/root_ca_certificate": f"{tls}ca.pem",
+                "transport/link/tls/enable_mtls": True,
+                "transport/link/tls/connect_certificate": f"{tls}cert.pem",
+                "transport/link/tls/connect_private_key": f"{tls}key.pem",
+                "transport/link/tls/listen_certificate": f"{tls}cert.pem",
+                "transport/link/tls/listen_private_key": f"{tls}key.pem",
+                "transport/link/tls/verify_name_on_connect": True,
+            }
+        return found
+
+
+def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
+    """Return endpoints to listen on, with a free port where one has port 0."""
+    return tuple(
+        f"{one.removesuffix(':0')}:{_free_port(one)}" if one.endswith(":0") else one
+        for one in endpoints
+    )
+
+
+def _free_port(endpoint: str) -> int:
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as found:
+        found.bind((host, 0))
+        return int(found.getsockname()[1])
+
+
+def _end_lingering(ports: frozenset[int]) -> None:
+    """Have the engine close its connections without waiting.
+
+    It closes one that is cut off in the thread that serves all others, which would wait there 10 s
+    for an answer to what was sent last.
+    """
+    try:
+        numbers = [int(name) for name in os.listdir("/dev/fd")]  # noqa: PTH208 - names are enough
+    except OSError:
+        return  # Windows, where nothing waits
+    for number in numbers:
+        try:
+            found = socket.socket(fileno=number)
+        except OSError:
+            continue  # a file, or closed by now
+        try:
+            if found.family in INTERNET and ports & {
+                found.getsockname()[1],
+                found.getpeername()[1],
+            }:
+                found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+        except OSError:
+            pass  # it has no other end
+        finally:
+            found.detach()
+
+
+@functools.cache
+def engine() -> Any:
+    """Return Zenoh.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
+    try:
+        import zenoh
+    except ImportError as exc:
+        raise MissingExtraError(
+            'a fleet over the network needs Zenoh, which is not installed: pip install "'
+            'smartcam[fleet]"',
+            extra="fleet",
+        ) from exc
+    return zenoh
+
+
+class ZenohSession:
+    """A session for one event loop, in which its callbacks run.
+
+    Args:
+        link: how it comes there.
+        more: further settings of the engine, by their paths.
+        what: it is called in texts.
+    """
+
+    def __init__(
+        self,
+        link: BusLink,
+        more: Mapping[str, Any] | None = None,
+        what: str = "the fleet's bus",
+    ) -> None:
+        self._link, self._more, self._what = link, dict(more or {}), what
+        self._zenoh = engine()
+        self._session: Any = None
+        self._declared: set[ZenohDeclared] = set()
+        self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
+        self._waiting = collections.deque()
+        self._bytes = 0
+        self._woken = False
+        self._bell: _LoopBell | None = None
+        self._lock = threading.Lock()
+        self._told_dropped = False
+        self._repliers: ThreadPoolExecutor | None = None
+        self._replying = 0
+        self._look: asyncio.TimerHandle | None = None  # for connections that linger
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self, timeout: float) -> Self:
+        """Open it.
+
+        Raises:
+            ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds.
+            ConfigurationError: the engine refuses a setting.
+        """
+        self._loop = loop = asyncio.get_running_loop()
+        zenoh = self._zenoh
+        config = zenoh.Config()
+        for path, value in {**self._link.settings(timeout), **self._more}.items():
+            try:
+                config.insert_json5(path, json.dumps(value))
+            except zenoh.ZError as exc:
+                raise ConfigurationError(
+                    f"{self._what}: the engine refuses {path}: {value!r}"
+                ) from exc
+        opening = loop.run_in_executor(None, zenoh.open, config)
+        try:
+            async with asyncio.timeout(timeout):
+                self._session = await asyncio.shield(opening)
+        except TimeoutError as exc:
+            opening.add_done_callback(_close_late)
+            raise self._failed(f"no answer within {timeout:g} s") from exc
+        except zenoh.ZError as exc:
+            raise self._failed(_reason(exc)) from exc
+        except asyncio.CancelledError:
+            opening.add_done_callback(_close_late)
+            raise
+        self._end_lingering()
+        self._bell = _LoopBell.on(loop, self._drain)
+        return self
+
+    def _end_lingering(self) -> None:
+        """Look at the connections now, and again before a new one can be cut off for its lease."""
+        self._look = self._loop.call_later(LEASE / 2, self._end_lingering)
+        endpoints = (*self._link.listen, *self._link.connect)
+        ports = frozenset(int(one.rpartition(":")[2]) for one in endpoints)
+        self._loop.run_in_executor(None, _end_lingering, ports)
+
+    def _failed(self, why: str) -> ConnectFailedError:
+        doing = "listen on" if self._link.listen else "reach"
+        text = f"{self._what}: cannot {doing} {self._link.place}: {why}"
+        return ConnectFailedError(text, attempts=(why,))
+
+    async def close(self) -> None:
+        """Close it; what was declared is gone with it. Idempotent."""
+        session, self._session = self._session, None
+        if self._look is not None:
+            self._look.cancel()
+        self._waiting.clear()
+        self._bytes = 0
+        bell, self._bell = self._bell, None
+        if bell is not None:
+            bell.close()
+        if session is None:
+            return
+        for one in tuple(self._declared):
+            one.close()
+        closing = self._loop.run_in_executor(None, _end, session, self._threads())
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await asyncio.shield(closing)
+
+    def _threads(self) -> list[ThreadPoolExecutor]:
+        """Return those of whoever stands on it; what they have to say yet is said first."""
+        repliers, self._repliers = self._repliers, None
+        return [] if repliers is None else [repliers]
+
+    # ------------------------------------------------------------------ to the loop
+
+    def in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
+        """Have something called in the event loop, in order; for any thread."""
+        with self._lock:
+            self._waiting.append((call, arguments, size))
+            self._bytes += size
+            if self._woken:
+                return
+            self._woken = True
+        self._wake()
+
+    def _wake(self) -> None:
+        bell = self._bell
+        if bell is not None:
+            bell.ring()
+            return
+        with contextlib.suppress(RuntimeError):  # the loop is closed, and nobody hears any more
+            self._loop.call_soon_threadsafe(self._drain)
+
+    def _drain(self) -> None:
+        waiting = self._waiting
+        for _ in range(TURN):
+            try:
+                call, arguments, size = waiting.popleft()
+            except IndexError:
+                break
+            with self._lock:
+                self._bytes -= size
+            try:
+                call(*arguments)
+            except Exception:
+                logger.exception("%s ! what came from the bus was not taken", self._link.place)
+        with self._lock:
+            self._woken = bool(waiting)
+        if self._woken:
+            self._loop.call_soon(self._drain)
+
+    def full(self, size: int) -> bool:
+        """Whether the loop is so far behind that what can be asked for again is dropped."""
+        if self._bytes + size <= MOST_WAITING:
+            return False
+        if not self._told_dropped:
+            self._told_dropped = True
+            logger.warning(
+                "%s ! this program does not read: %d bytes wait; more is dropped",
+                self._link.place,
+                self._bytes,
+            )
+        return True
+
+    def reply(self, query: Any, replies: list[tuple[str, bytes]], **how: Any) -> None:
+        """Answer a query, and end it; never waits.
+
+        The engine may wait for who has asked, as that one has said in the query; so threads do it.
+
+        Args:
+            query: the engine's.
+            replies: keys and what is said under them.
+            **how: the engine's options of a reply.
+        """
+        if replies:
+            self._in_replier(query, _reply, query, replies, how)
+        else:
+            quietly(query.drop)
+
+    def refuse(self, query: Any, why: str) -> None:
+        """Answer a query with an error, and end it; never waits."""
+        self._in_replier(query, _refuse, query, why)
+
+    def _in_replier(self, query: Any, call: Callable[..., None], *arguments: Any) -> None:
+        if self._session is None or self._replying >= MOST_REPLYING:
+            quietly(query.drop)
+            return
+        if self._repliers is None:
+            self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
+        with self._lock:
+            self._replying += 1
+        self._repliers.submit(call, *arguments).add_done_callback(self._replied)
+
+    def _replied(self, _: object) -> None:
+        with self._lock:
+            self._replying -= 1
+
+    def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
+        """Declare something at the engine; it is closed with this end."""
+        made = how(self.session)
+        self._declared.add(one)
+        return made
+
+    def forget(self, one: ZenohDeclared) -> None:
+        """It is closed."""
+        self._declared.discard(one)
+
+    @property
+    def session(self) -> Any:
+        """The engine's session.
+
+        Raises:
+            ConfigurationError: it is not open.
+        """
+        if self._session is None:
+            raise ConfigurationError(f"{self._what} is not open")
+        return self._session
+
+    @property
+    def opened(self) -> bool:
+        """Whether it is open."""
+        return self._session is not None
+
+    @property
+    def engine(self) -> Any:
+        """The module."""
+        return self._zenoh
+
+    def later(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Call something in the event loop; for any thread."""
+        self.in_loop(call, 0, *arguments)
+
+
+class _LoopBell:
+    """Wakes an event loop from any thread; for less than its own ``call_soon_threadsafe``.
+
+    Args:
+        loop: the loop.
+        call: what it calls then.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
+        # a file, as its number may be another's when it is closed, and an object knows that
+        self._file = io.FileIO(os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC), "r+")
+        self._loop, self._call = loop, call
+        loop.add_reader(self._file.fileno(), self._hear)
+
+    @classmethod
+    def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _LoopBell | None:
+        """Return a bell; None where the system or the loop has nothing for it."""
+        if sys.platform != "linux":
+            return None
+        with contextlib.suppress(NotImplementedError, OSError):
+            return cls(loop, call)
+        return None
+
+    def ring(self) -> None:
+        """Have the loop call; once, however often it is rung before."""
+        with contextlib.suppress(ValueError):  # it is closed, and nobody hears any more
+            self._file.write(_ONE)
+
+    def _hear(self) -> None:
+        self._file.read(8)
+        self._call()
+
+    def close(self) -> None:
+        """Wake nobody any more. Idempotent."""
+        if not self._file.closed:
+            self._loop.remove_reader(self._file.fileno())
+            self._file.close()
+
+
+class ZenohDeclared:
+    """Something that is declared at the engine until it is closed, or its session is."""
+
+    def __init__(self, end: ZenohSession) -> None:
+        self._end = end
+        self._closed = False
+        self._it: Any = None
+
+    def of(self, how: Callable[[Any], Any]) -> Self:
+        """Declare what ``how`` makes of the engine's session."""
+        self._it = self._end.declare(self, how)
+        return self
+
+    def call(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Call back, unless it was closed meanwhile."""
+        if not self._closed:
+            call(*arguments)
+
+    def close(self) -> None:
+        """Take it back. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            self._end.forget(self)
+            quietly(self._it.undeclare)
+
+
+def _reply(query: Any, replies: list[tuple[str, bytes]], how: dict[str, Any]) -> None:
+    for key, payload in replies:
+        quietly(query.reply, key, payload, express=True, **how)
+    quietly(query.drop)
+
+
+def _refuse(query: Any, why: str) -> None:
+    quietly(query.reply_err, why.encode())
+    quietly(query.drop)
+
+
+def _end(session: Any, threads: list[ThreadPoolExecutor]) -> None:
+    """Say what is to be said yet, then end the session."""
+    for one in threads:
+        one.shutdown()
+    session.close()
+
+
+def direct(call: Callable[[Any], None]) -> Any:
+    """Have a callback called in the engine's own thread: by default each has a thread."""
+    return engine().handlers.Callback(call, indirect=False)
+
+
+def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
+    """Do something at the engine; a session that ends meanwhile is no error of the caller's."""
+    try:
+        call(*arguments, **named)
+    except engine().ZError as exc:
+        logger.debug("the engine: %s", exc)
+
+
+def _close_late(opening: asyncio.Future[Any]) -> None:
+    """Close a session that came after nobody wanted it any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        threading.Thread(target=opening.result().close, daemon=True).start()
+
+
+def _reason(error: Exception) -> str:
+    """Return what the engine says without its source's places, or the system's own words."""
+    text = str(error).partition(" at /")[0].strip(" .")
+    system = re.search(r": ([^:]+) \(os error \d+\)", text)
+    if system is not None:
+        return system[1]
+    return "nothing there speaks Zenoh" if "Unable to connect" in text else text

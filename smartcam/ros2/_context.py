@@ -1,0 +1,190 @@
+"""What the nodes of a process share: a session of Zenoh, a domain, and its graph."""
+
+from __future__ import annotations
+
+import collections
+import logging
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from smartcam._zenoh import BusLink, ZenohSession, quietly
+from smartcam.exceptions import ConfigurationError
+from smartcam.ros2._graph import OTHER_END, RosGraph
+from smartcam.ros2._names import check_domain
+from smartcam.ros2._types import RosTypes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from smartcam.ros2._tokens import Entity
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+ROUTER = "tcp/localhost:7447"
+"""Where rmw_zenoh's nodes look for a router (``DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5``)."""
+
+MOST_BYTES = 1 << 26
+"""Bytes of long messages that wait to be said; the oldest of a topic go first."""
+
+SETTINGS: Mapping[str, Any] = {
+    # who publishes latched keeps messages by their times
+    "timestamping/enabled": {"router": True, "peer": True, "client": True},
+    # nodes of rmw_zenoh are peers, and learn of each other from their router
+    "scouting/gossip/enabled": True,
+}
+"""Of a session of Zenoh that ROS nodes stand on, as rmw_zenoh's own have them."""
+
+
+class RosContext:
+    """What nodes share, opened by the first of them.
+
+    Args:
+        session: of Zenoh, already open, which stays open; or None for one of its own.
+        connect: endpoints of its own session.
+        listen: endpoints that its own session listens on: it is the router then.
+        domain: None for what the variable ``ROS_DOMAIN_ID`` says, 0 else.
+        distribution: whose messages and type hashes are spoken.
+
+    Raises:
+        ConfigurationError: there is no such domain or distribution.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    def __init__(
+        self,
+        session: ZenohSession | None = None,
+        *,
+        connect: str | Sequence[str] = ROUTER,
+        listen: str | Sequence[str] = (),
+        domain: int | None = None,
+        distribution: str = "jazzy",
+    ) -> None:
+        self.domain: int = check_domain(_environments() if domain is None else domain)
+        self.types: RosTypes = RosTypes(distribution)
+        self._owns = session is None
+        if session is None:
+            heard = _endpoints(listen)
+            link = BusLink(heard, () if heard else _endpoints(connect))
+            session = ZenohSession(link, SETTINGS, what="ROS 2")
+        self.zenoh: ZenohSession = session
+        self.graph: RosGraph = RosGraph(self.domain)
+        self.zid: str = ""
+        self._users = 0
+        self._numbers = 0
+        self._ends: dict[tuple[str, str], list[Entity]] = {}
+        self._lock = threading.Lock()
+        self._thread: ThreadPoolExecutor | None = None
+        self._long: collections.Counter[object] = collections.Counter()
+        self._stop_listening: Callable[[], None] = _nothing
+
+    async def open(self, timeout: float) -> None:
+        """Open the session, if no node has done so.
+
+        Raises:
+            ConnectFailedError: there is no router within ``timeout`` seconds.
+        """
+        self._users += 1
+        if self._users > 1:
+            return
+        try:
+            if self._owns:
+                await self.zenoh.open(timeout)
+            self.zid = str(self.zenoh.session.info.zid())
+            self.graph.open(self.zenoh)
+        except BaseException:
+            self._users -= 1
+            raise
+        self._stop_listening = self.graph.listen(self._compare)
+
+    async def close(self) -> None:
+        """A node is done; the last one closes the session, if it is the context's own."""
+        self._users -= 1
+        if self._users:
+            return
+        self._stop_listening()
+        self._stop_listening = _nothing
+        self.graph.close()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.shutdown(wait=False, cancel_futures=True)
+        if self._owns:
+            await self.zenoh.close()
+
+    def next_id(self) -> int:
+        """Return a number that nothing else in this session has."""
+        self._numbers += 1
+        return self._numbers
+
+    # ------------------------------------------------------------------ who talks past whom
+
+    def add(self, entity: Entity) -> None:
+        """An end of this process is there: say if another talks past it."""
+        self._ends.setdefault((entity.name, entity.kind), []).append(entity)
+        for other in self.graph.ends(entity.name, OTHER_END[entity.kind]):
+            self._differ(entity, other)
+
+    def remove(self, entity: Entity) -> None:
+        """It is gone."""
+        ends = self._ends.get((entity.name, entity.kind), [])
+        if entity in ends:
+            ends.remove(entity)
+        if not ends:
+            self._ends.pop((entity.name, entity.kind), None)
+
+    def _compare(self, other: Entity, present: bool) -> None:
+        if present and other.kind in OTHER_END:
+            for one in self._ends.get((other.name, OTHER_END[other.kind]), ()):
+                self._differ(one, other)
+
+    def _differ(self, one: Entity, other: Entity) -> None:
+        if (one.type, one.hash) != (other.type, other.hash):
+            logger.warning(
+                "%s of %s is %s %s here, but %s of %s has %s %s: they do not hear each other",
+                one.name,
+                one.full_node,
+                one.ros_type,
+                one.hash,
+                other.kind,
+                other.full_node,
+                other.ros_type,
+                other.hash,
+            )
+
+    # ------------------------------------------------------------------ what is long
+
+    def waits(self, owner: object) -> bool:
+        """Whether long messages of an owner wait to be said."""
+        return bool(self._long[owner])
+
+    def say_later(self, owner: object, say: Callable[[], int]) -> None:
+        """Have a thread call ``say``, which waits for room and returns the bytes it has said."""
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "smartcam-ros2")
+        with self._lock:
+            self._long[owner] += 1
+        self._thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner))
+
+    def _said(self, owner: object) -> None:
+        with self._lock:
+            self._long[owner] -= 1
+            if not self._long[owner]:
+                del self._long[owner]
+
+
+def _environments() -> int:
+    text = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if not text:
+        return 0
+    if not text.isdecimal():
+        raise ConfigurationError(f"ROS_DOMAIN_ID is {text!r:.40}: expected a number from 0")
+    return int(text)
+
+
+def _endpoints(given: str | Sequence[str]) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
+def _nothing() -> None:
+    pass

@@ -1,0 +1,330 @@
+"""The ends of topics: who publishes, and who hears.
+
+As ``rmw_publisher_data.cpp`` and ``rmw_subscription_data.cpp`` of rmw_zenoh: what is latched is
+kept by an advanced publisher, and asked for by an advanced subscriber.
+"""
+
+from __future__ import annotations
+
+import collections
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._zenoh import ZenohDeclared, direct, quietly
+from smartcam.exceptions import RosError, RosMessageError
+from smartcam.ros2._attachment import Attachment
+from smartcam.streams import Subscription
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Self
+
+    from smartcam.models import SubscriberStatistics
+    from smartcam.ros2._context import RosContext
+    from smartcam.ros2._tokens import Entity
+    from smartcam.ros2._types import MessageType
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+LONG = 1 << 16
+"""Bytes beyond which a message is said by a thread, which waits until the engine has taken it."""
+
+MOST_WAITING = 1 << 26
+"""Bytes of a topic's messages that wait to be said, or to be read."""
+
+HEARTBEAT = 0.5
+"""Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
+
+
+def said(message: object, fields: dict[str, Any]) -> object:
+    """Return what is to be said: a message, or the fields of one."""
+    if message is not None and fields:
+        raise RosMessageError("expected a message or its fields, got both")
+    return fields if message is None else message
+
+
+class RosEnd:
+    """An end of a topic or a service, with its token, until it is closed.
+
+    Args:
+        context: what its node shares.
+        entity: it in the graph.
+        on_close: is told that it is closed.
+    """
+
+    def __init__(
+        self, context: RosContext, entity: Entity, on_close: Callable[[RosEnd], None]
+    ) -> None:
+        self._context, self.entity, self._on_close = context, entity, on_close
+        self._declared: list[ZenohDeclared] = []
+        self._closed = False
+
+    @property
+    def name(self) -> str:
+        """The absolute name of the topic or service."""
+        return self.entity.name
+
+    def _declare(self, how: Callable[[Any], Any]) -> ZenohDeclared:
+        declared = ZenohDeclared(self._context.zenoh).of(how)
+        self._declared.append(declared)
+        return declared
+
+    def _appear(self) -> None:
+        """Be seen in the graph, when all else is there."""
+        token = self.entity.token
+        self._declare(lambda session: session.liveliness().declare_token(token))
+        self._context.add(self.entity)
+
+    def close(self) -> None:
+        """Be gone. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._context.remove(self.entity)
+        for declared in reversed(self._declared):  # the token first
+            declared.close()
+        self._on_close(self)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+
+class RosPublisher(RosEnd):
+    """Publishes on a topic; made by :meth:`Node.publisher`.
+
+    Attributes:
+        type: of the messages.
+        published: messages that were handed to the engine.
+        dropped: messages for which there was no room, the oldest of those that waited.
+    """
+
+    def __init__(
+        self,
+        context: RosContext,
+        entity: Entity,
+        kind: MessageType,
+        on_close: Callable[[RosEnd], None],
+    ) -> None:
+        super().__init__(context, entity, on_close)
+        self.type: MessageType = kind
+        self.published: int = 0
+        self.dropped: int = 0
+        self._number = 0
+        self._lock = threading.Lock()
+        self._waiting: collections.deque[tuple[bytes, bytes]] = collections.deque()
+        self._bytes = 0
+        self._publisher: Any = None
+        self._patient: Any = None  # waits for room
+        self._declare(self._make)
+        self._appear()
+
+    def _make(self, session: Any) -> Any:
+        zenoh, qos = self._context.zenoh.engine, self.entity.qos
+        drop = zenoh.CongestionControl.DROP
+        block = zenoh.CongestionControl.BLOCK
+        how: dict[str, Any] = {
+            "congestion_control": block if qos.depth is None and qos.reliable else drop,
+            "reliability": zenoh.Reliability.RELIABLE
+            if qos.reliable
+            else zenoh.Reliability.BEST_EFFORT,
+            "express": True,
+        }
+        if qos.latched:
+            import zenoh.ext as more
+
+            misses = more.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT)
+            self._publisher = more.declare_advanced_publisher(
+                session,
+                self.entity.key,
+                cache=more.CacheConfig(max_samples=qos.kept),
+                sample_miss_detection=misses if qos.reliable else None,
+                publisher_detection=True,
+                **how,
+            )
+        else:
+            self._publisher = session.declare_publisher(self.entity.key, **how)
+        return self._publisher
+
+    @property
+    def heard(self) -> bool:
+        """Whether anybody hears it, as far as is known; a latched one counts as heard."""
+        if self._closed:
+            return False
+        return self.entity.qos.latched or bool(self._publisher.matching_status.matching)
+
+    def publish(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message; never waits.
+
+        Args:
+            message: one of the type's own, or a mapping of its fields.
+            **fields: the fields, where no message is given.
+
+        Raises:
+            RosMessageError: it is no message of the type.
+            RosError: the publisher is closed.
+        """
+        self.publish_encoded(self.type.encode(said(message, fields)))
+
+    def publish_encoded(self, data: bytes) -> None:
+        """Publish bytes that are a message of the type already; never waits.
+
+        Raises:
+            RosError: the publisher is closed.
+        """
+        if self._closed:
+            raise RosError(f"{self.name}: this publisher is closed")
+        self._number += 1
+        attachment = Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+        if len(data) <= LONG and not self._context.waits(self):
+            quietly(self._publisher.put, data, attachment=attachment)
+            self.published += 1
+            return
+        with self._lock:
+            self._waiting.append((data, attachment))
+            self._bytes += len(data)
+            while len(self._waiting) > self.entity.qos.kept or self._bytes > MOST_WAITING:
+                if len(self._waiting) == 1:
+                    break
+                self._bytes -= len(self._waiting.popleft()[0])
+                self.dropped += 1
+        self._context.say_later(self, self._say_next)
+
+    def _say_next(self) -> None:
+        """Say the oldest that waits; in the thread for it."""
+        with self._lock:
+            if not self._waiting or self._closed:
+                return
+            data, attachment = self._waiting.popleft()
+            self._bytes -= len(data)
+        self._patiently().put(data, attachment=attachment)
+        self.published += 1
+
+    def _patiently(self) -> Any:
+        """Return what publishes long messages: it waits for room, behind all else."""
+        zenoh = self._context.zenoh.engine
+        if self.entity.qos.latched:
+            return self._publisher  # which has to keep them
+        if self._patient is None:
+            self._patient = self._context.zenoh.session.declare_publisher(
+                self.entity.key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+        return self._patient
+
+    def close(self) -> None:
+        """Be gone; what waits to be said is not said any more. Idempotent."""
+        super().close()
+        with self._lock:
+            self.dropped += len(self._waiting)
+            self._waiting.clear()
+            self._bytes = 0
+            patient, self._patient = self._patient, None
+        if patient is not None:
+            quietly(patient.undeclare)
+
+
+class _Heard(NamedTuple):
+    data: bytes
+    attachment: Attachment
+
+
+class RosSubscription(RosEnd):
+    """Hears a topic; made by :meth:`Node.subscribe`, and read by ``async for``.
+
+    Messages wait in a queue with the depth of its quality of service; the oldest makes room. One
+    that cannot be read is left out, counted and told in the log.
+
+    Attributes:
+        type: of the messages.
+        attachment: number, time and publisher of the message that was read last.
+        rejected: what came and was no message.
+    """
+
+    def __init__(
+        self,
+        context: RosContext,
+        entity: Entity,
+        kind: MessageType,
+        on_close: Callable[[RosEnd], None],
+    ) -> None:
+        super().__init__(context, entity, on_close)
+        self.type: MessageType = kind
+        self.attachment: Attachment | None = None
+        self.rejected: int = 0
+        self._queue = Subscription[_Heard](
+            entity.name,
+            max_queue=entity.qos.kept,
+            overflow="drop_oldest",
+            max_queue_bytes=MOST_WAITING,
+        )
+        self._declare(self._make)
+        self._appear()
+
+    def _make(self, session: Any) -> Any:
+        context = self._context.zenoh
+
+        def on_sample(sample: Any) -> None:
+            data = sample.payload.to_bytes()
+            if context.full(len(data)):
+                return
+            extra = None if sample.attachment is None else sample.attachment.to_bytes()
+            context.in_loop(self._take, len(data), data, extra)
+
+        qos = self.entity.qos
+        if not qos.latched:
+            return session.declare_subscriber(self.entity.key, direct(on_sample))
+        import zenoh.ext as more
+
+        recovery = more.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        return more.declare_advanced_subscriber(
+            session,
+            self.entity.key,
+            direct(on_sample),
+            history=more.HistoryConfig(detect_late_publishers=True, max_samples=qos.kept),
+            recovery=recovery if qos.reliable else None,
+            subscriber_detection=True,
+        )
+
+    def _take(self, data: bytes, extra: bytes | None) -> None:
+        if self._closed:
+            return
+        try:
+            attachment = Attachment.decode(extra)
+        except RosMessageError as exc:
+            self._reject(exc)
+            return
+        self._queue.offer(_Heard(data, attachment), 0.0, len(data))
+
+    def _reject(self, why: RosMessageError) -> None:
+        self.rejected += 1
+        level = logging.DEBUG if self.rejected > 1 else logging.WARNING
+        logger.log(level, "%s ! %s; such messages are left out", self.name, why)
+
+    def statistics(self) -> SubscriberStatistics:
+        """Return the queue's account."""
+        return self._queue.statistics()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Any:
+        while True:
+            heard = await anext(self._queue)
+            try:
+                message = self.type.decode(heard.data)
+            except RosMessageError as exc:
+                self._reject(exc)
+                continue
+            self.attachment = heard.attachment
+            return message
+
+    def close(self) -> None:
+        """Hear no more; iterating ends. Idempotent."""
+        super().close()
+        self._queue.close()
